@@ -1,0 +1,108 @@
+"""Where things are on the bus: key expressions of wire version 1.
+
+    factorbus/v1/map/<map>/in/<client>                  query        an insert
+    factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, stats, export
+    factorbus/v1/map/<map>/out/{delta,keyframe,event}   publication
+    factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
+    factorbus/v1/worker/<id>/job                        query
+    factorbus/v1/worker/<id>/live/<slots>               liveliness token
+    factorbus/v1/admin/{maps,create,drop}               query
+
+Maps sit below `map/`, so that no map name can collide with `worker` or `admin`.
+"""
+
+import re
+
+from factorbus.proto.problems import BadName
+
+PREFIX = "factorbus/v1"
+QUESTIONS = ("estimate", "chi2", "graph", "stats", "export")
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def checked_name(what: str, name: str) -> str:
+    """`name`, if it may stand in a key.  Raises BadName; `what` says whose name it is."""
+    if not _NAME.fullmatch(name):
+        raise BadName(what, name)
+    return name
+
+
+def map_root(name: str) -> str:
+    """Everything of one map lies below this.  Raises BadName."""
+    return f"{PREFIX}/map/{checked_name('map', name)}"
+
+
+def insert_key(map_name: str, client: str) -> str:
+    """Where `client` sends its inserts.  Raises BadName."""
+    return f"{map_root(map_name)}/in/{checked_name('client', client)}"
+
+
+def inserts_of_any_client(map_name: str) -> str:
+    """What the owner of a map answers inserts on."""
+    return f"{map_root(map_name)}/in/*"
+
+
+def client_of(insert_key_expr: str) -> str:
+    """The client that an insert's key names: its last chunk."""
+    return insert_key_expr.rpartition("/")[2]
+
+
+def ask_key(map_name: str, question: str) -> str:
+    """Where `question` is asked."""
+    return f"{map_root(map_name)}/ask/{question}"
+
+
+def any_question(map_name: str) -> str:
+    """What the owner of a map answers questions on."""
+    return f"{map_root(map_name)}/ask/*"
+
+
+def delta_key(map_name: str) -> str:
+    """Where every step's changes are published."""
+    return f"{map_root(map_name)}/out/delta"
+
+
+def keyframe_key(map_name: str) -> str:
+    """Where the whole estimate is published now and then."""
+    return f"{map_root(map_name)}/out/keyframe"
+
+
+def event_key(map_name: str) -> str:
+    """Where things that happen to the map, other than steps, are published."""
+    return f"{map_root(map_name)}/out/event"
+
+
+def service_token(map_name: str, service: str) -> str:
+    """Alive while `service` owns the map and answers for it."""
+    return f"{map_root(map_name)}/live/service/{checked_name('service', service)}"
+
+
+def client_token(map_name: str, client: str) -> str:
+    """Alive while `client` has joined the map."""
+    return f"{map_root(map_name)}/live/client/{checked_name('client', client)}"
+
+
+def job_key(worker: str) -> str:
+    """Where one worker takes its jobs: a key per worker, because the bus does not balance load."""
+    return f"{PREFIX}/worker/{checked_name('worker', worker)}/job"
+
+
+def worker_token(worker: str, slots: int) -> str:
+    """Alive while `worker` takes up to `slots` jobs at a time."""
+    return f"{PREFIX}/worker/{checked_name('worker', worker)}/live/{slots}"
+
+
+def any_worker_token() -> str:
+    """Matches every worker's token."""
+    return f"{PREFIX}/worker/*/live/*"
+
+
+def worker_of(token: str) -> tuple[str, int]:
+    """(worker, slots) of a worker's token."""
+    parts = token.split("/")
+    return parts[-3], int(parts[-1])
+
+
+def admin_key(operation: str) -> str:
+    """Where `operation` (maps, create, drop) on the set of maps is asked for."""
+    return f"{PREFIX}/admin/{operation}"

@@ -1,0 +1,62 @@
+"""The kinds of variables and factors as the wire knows them: names, sizes and what connects to what.
+
+The mathematics of each kind (residual, Jacobians, ⊞) is the solver's; this table is all a client needs to
+build and read messages, and a test holds the two against each other.  A name never changes its meaning.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class VariableKind:
+    """One kind of variable: `size` numbers are stored and sent, `dim` is the size of its tangent space."""
+
+    name: str
+    size: int
+    dim: int
+    values: str
+
+
+@dataclass(frozen=True, slots=True)
+class FactorKind:
+    """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim."""
+
+    name: str
+    connects: tuple[str, ...]
+    size: int
+    dim: int
+    measured: str
+
+    @property
+    def information_size(self) -> int:
+        """Numbers in the upper triangle of the information matrix, row by row."""
+        return self.dim * (self.dim + 1) // 2
+
+
+_POSE2 = "x y (metres), theta (radians)"
+_POSE3 = "x y z (metres), unit quaternion qx qy qz qw"
+
+VARIABLE_KINDS = {
+    kind.name: kind
+    for kind in (
+        VariableKind("se2", 3, 3, _POSE2),
+        VariableKind("se3", 7, 6, _POSE3),
+        VariableKind("point2", 2, 2, "x y (metres)"),
+        VariableKind("point3", 3, 3, "x y z (metres)"),
+    )
+}
+
+FACTOR_KINDS = {
+    kind.name: kind
+    for kind in (
+        FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map"),
+        FactorKind("prior_se3", ("se3",), 7, 6, _POSE3 + ", in the map"),
+        FactorKind("prior_point2", ("point2",), 2, 2, "x y (metres), in the map"),
+        FactorKind("prior_point3", ("point3",), 3, 3, "x y z (metres), in the map"),
+        FactorKind("between_se2", ("se2", "se2"), 3, 3, _POSE2 + ": the second pose in the first one's frame"),
+        FactorKind("between_se3", ("se3", "se3"), 7, 6, _POSE3 + ": the second pose in the first one's frame"),
+        FactorKind("landmark_se2", ("se2", "point2"), 2, 2, "x y (metres): the point in the pose's frame"),
+        FactorKind("landmark_se3", ("se3", "point3"), 3, 3, "x y z (metres): the point in the pose's frame"),
+        FactorKind("bearing_range_se2", ("se2", "point2"), 2, 2, "bearing (radians), range (metres), from the pose"),
+    )
+}

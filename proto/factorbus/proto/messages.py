@@ -1,0 +1,151 @@
+"""The messages of wire version 1 as frozen values.  `codec` turns them into bytes and back; `proto/README.md` explains.
+
+Arrays are columns: one array holds one field of many variables or factors of one kind.  All are C-contiguous,
+little-endian float64 or int64.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from factorbus.proto.arrays import F64, I64
+
+
+@dataclass(frozen=True, slots=True)
+class Variables:
+    """Variables of one kind.
+
+    keys (n,); values (n, kind.size) in the kind's order, or None: the service composes a value from the first
+    factor of the same insert that reaches the variable.  fixed: not estimated (the gauge of a map).
+    """
+
+    kind: str
+    keys: I64
+    values: F64 | None = None
+    fixed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Factors:
+    """Factors of one kind.
+
+    keys (m, arity) in the kind's `connects` order; measured (m, kind.size); information (m, r(r+1)/2): the upper
+    triangle of the information matrix (inverse covariance) row by row, r = kind.dim.
+    """
+
+    kind: str
+    keys: I64
+    measured: F64
+    information: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """New variables and factors that go into a map together or not at all.  Also a whole graph."""
+
+    variables: tuple[Variables, ...] = ()
+    factors: tuple[Factors, ...] = ()
+
+    @property
+    def variable_count(self) -> int:
+        """Number of variables over all kinds."""
+        return sum(len(group.keys) for group in self.variables)
+
+    @property
+    def factor_count(self) -> int:
+        """Number of factors over all kinds."""
+        return sum(len(group.keys) for group in self.factors)
+
+
+@dataclass(frozen=True, slots=True)
+class Insert:
+    """A client's request to add `batch`; with `settle`, iterate until converged afterwards.
+
+    sequence: 1, 2, 3, ... per client and map; the same number again gets the first answer again.
+    epoch: the epoch of the map the client joined, or 0 for "whichever"; another one is refused.
+    """
+
+    sequence: int
+    batch: Batch
+    settle: bool = False
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The answer to an insert: from `revision` on the estimate includes it.
+
+    first_factor: id of the insert's first factor; the others follow in the order of the message.
+    folded: inserts that this step took in together.  report: the step's account of work (see StepReport keys
+    in `proto/README.md`): strategy, because, chi2, iterations, step_ms, ...
+    """
+
+    sequence: int
+    epoch: int
+    revision: int
+    first_factor: int
+    folded: int
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Values of variables at `revision`: all of them (answer to ask/estimate, keyframe) or those asked for."""
+
+    epoch: int
+    revision: int
+    variables: tuple[Variables, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """The variables that changed from `previous` to `revision` (new ones included), bit for bit."""
+
+    epoch: int
+    revision: int
+    previous: int
+    variables: tuple[Variables, ...]
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A whole map at `revision`: variables with present values, factors in the order of their ids per kind."""
+
+    epoch: int
+    revision: int
+    batch: Batch
+
+
+@dataclass(frozen=True, slots=True)
+class Chi2:
+    """The answer to ask/chi2: Σ rᵀ Ω r at `revision`; `batch` is the optimum found from scratch, if asked for.
+
+    worker: who computed the batch optimum ("in-place": the service itself); seconds: how long it took there.
+    """
+
+    epoch: int
+    revision: int
+    chi2: float
+    batch: float | None = None
+    worker: str = ""
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work for one worker: pure function of its payload, so that any worker, or two, may do it."""
+
+    job: str
+    kind: str
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class JobDone:
+    """A worker's answer to `job`."""
+
+    job: str
+    kind: str
+    payload: bytes
+    seconds: float

@@ -1,0 +1,22 @@
+"""What all tests share: where the public data sets are, and how hypothesis behaves."""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile(
+    "factorbus", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
+settings.load_profile("factorbus")
+
+
+@pytest.fixture(scope="session")
+def datasets() -> Path:
+    """The folder of public data sets; skips where there is none."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = Path(os.environ.get("FACTORBUS_DATASETS", cache / "factorbus" / "datasets"))
+    if not (folder / "intel.g2o").is_file():
+        pytest.skip(f"no data sets in {folder}: set FACTORBUS_DATASETS to a folder with intel.g2o and the others")
+    return folder
