@@ -149,3 +149,12 @@ class JobDone:
     kind: str
     payload: bytes
     seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """The payload that answers a job of kind `batch`: the graph optimised from scratch, its χ² and its values."""
+
+    chi2: float
+    iterations: int
+    variables: tuple[Variables, ...]

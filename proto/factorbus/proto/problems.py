@@ -4,6 +4,7 @@
     ├── BadSymbol            bad_symbol           a variable key that cannot be read
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadMessage           bad_message          bytes that are not the message they should be
+    │   └── UnknownKind      unknown_kind         a kind of variable or factor that this version does not know
     ├── TooLarge             too_large            a message, an insert or a map over its limit
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
@@ -59,6 +60,14 @@ class BadMessage(Problem):
 
     def __init__(self, where: str, seen: str, wanted: str) -> None:
         super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
+
+
+class UnknownKind(BadMessage):
+    code = "unknown_kind"
+
+    def __init__(self, where: str, kind: str, known: tuple[str, ...]) -> None:
+        super().__init__(where, f"kind {kind[:64]!r} is not known here", f"one of {', '.join(known)}")
+        self.detail["kind"] = kind[:64]
 
 
 class TooLarge(Problem):

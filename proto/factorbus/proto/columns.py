@@ -1,0 +1,115 @@
+"""Groups of variables and factors as maps of columns, both ways.  Shapes come from the kind and the number of keys."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from factorbus.proto import fields
+from factorbus.proto.fields import F8, I8, Map
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.limits import Limits
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.problems import BadMessage, TooLarge, UnknownKind
+
+
+def variables_to_maps(groups: Sequence[Variables]) -> list[dict[str, Any]]:
+    """What the field `variables` of a message holds."""
+    return [_variables_map(group) for group in groups]
+
+
+def factors_to_maps(groups: Sequence[Factors]) -> list[dict[str, Any]]:
+    """What the field `factors` of a message holds."""
+    return [
+        {
+            "kind": group.kind,
+            "keys": _bytes(group.keys, I8),
+            "measured": _bytes(group.measured, F8),
+            "information": _bytes(group.information, F8),
+        }
+        for group in groups
+    ]
+
+
+def read_batch(message: Map, limits: Limits) -> Batch:
+    """The batch in `message`; every kind has to be known.  Raises BadMessage, UnknownKind, TooLarge."""
+    variables = [_read_variables(i, m, strict=True) for i, m in enumerate(fields.maps("", message, "variables"))]
+    factors = [_read_factors(i, m) for i, m in enumerate(fields.maps("", message, "factors"))]
+    _check_count("variables", variables, limits.max_variables)
+    _check_count("factors", factors, limits.max_factors)
+    return Batch(tuple(variables), tuple(factors))
+
+
+def read_values(message: Map) -> tuple[Variables, ...]:
+    """The variables in `message`, each with values.  Raises BadMessage.
+
+    A kind this version does not know keeps its name and gets its row size from its bytes, so that an older
+    client can follow a newer map.
+    """
+    return tuple(_read_variables(i, m, strict=False) for i, m in enumerate(fields.maps("", message, "variables")))
+
+
+def _check_count(what: str, groups: Sequence[Variables] | Sequence[Factors], limit: int) -> None:
+    count = 0
+    for group in groups:
+        count += len(group.keys)
+    if count > limit:
+        raise TooLarge("the batch", count, limit, what)
+
+
+def _variables_map(group: Variables) -> dict[str, Any]:
+    content: dict[str, Any] = {"kind": group.kind, "keys": _bytes(group.keys, I8)}
+    if group.values is not None:
+        content["values"] = _bytes(group.values, F8)
+    if group.fixed:
+        content["fixed"] = True
+    return content
+
+
+def _bytes(column: Any, dtype: np.dtype) -> bytes:
+    if type(column) is np.ndarray and column.dtype == dtype:
+        return column.tobytes()
+    return np.asarray(column, dtype).tobytes()
+
+
+def _read_variables(index: int, content: Map, strict: bool) -> Variables:
+    def place() -> str:
+        return f"variables[{index}]"
+
+    kind = content.get("kind")
+    known = VARIABLE_KINDS.get(kind) if type(kind) is str else None
+    if known is None and (strict or type(kind) is not str):
+        raise _kind_problem(place(), content, VARIABLE_KINDS)
+    keys = fields.keys(place, content, 0)
+    if strict and content.get("values") is None:
+        values = None
+    else:
+        size = known.size if known else _row_size(content, len(keys))
+        values = fields.rows(place, content, "values", len(keys), size)
+    return Variables(str(kind), keys, values, fields.flag(f"variables[{index}]", content, "fixed"))
+
+
+def _read_factors(index: int, content: Map) -> Factors:
+    def place() -> str:
+        return f"factors[{index}]"
+
+    kind = content.get("kind")
+    known = FACTOR_KINDS.get(kind) if type(kind) is str else None
+    if known is None:
+        raise _kind_problem(place(), content, FACTOR_KINDS)
+    keys = fields.keys(place, content, len(known.connects))
+    measured = fields.rows(place, content, "measured", len(keys), known.size)
+    information = fields.rows(place, content, "information", len(keys), known.information_size)
+    return Factors(known.name, keys, measured, information)
+
+
+def _row_size(content: Map, count: int) -> int:
+    values = content.get("values")
+    return len(values) // (8 * count) if count and type(values) is bytes else 0
+
+
+def _kind_problem(where: str, content: Map, known: dict[str, Any]) -> BadMessage:
+    kind = content.get("kind")
+    if type(kind) is str:
+        return UnknownKind(f"{where}.kind", kind, tuple(known))
+    return BadMessage(f"{where}.kind", "missing" if kind is None else "not a string", f"one of {', '.join(known)}")
