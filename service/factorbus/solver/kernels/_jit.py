@@ -1,0 +1,219 @@
+"""How kernels are compiled: the only file that imports numba, and the only one that chooses flags.
+
+`kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
+                 those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
+`inline_kernel`  melts into the kernels that call it; not callable at a cost worth having from Python.
+
+The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
+numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
+stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder.
+
+FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).
+NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
+"""
+
+import atexit
+import hashlib
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import llvmlite.binding
+import numba
+import numpy as np
+from numba.core import caching, config, event
+from numba.core.compiler_lock import global_compiler_lock
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+DISABLED = bool(getattr(config, "DISABLE_JIT"))  # noqa: B009  (numba sets these when it is imported)
+BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
+
+# Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+_FLAGS: dict[str, Any] = {"nogil": True, "fastmath": _FASTMATH, "error_model": "numpy"}
+_KEPT_FOLDERS = 6
+
+
+def kernel(*signatures: Any) -> Any:
+    """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
+    if len(signatures) == 1 and callable(signatures[0]):
+        return _compiled(signatures[0], ())
+    return lambda function: _compiled(function, signatures)
+
+
+def inline_kernel(function: Callable[..., Any]) -> Any:
+    """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
+    if DISABLED:
+        return function
+    return _ours(numba.njit(forceinline=True, **_FLAGS)(function))
+
+
+def compiled_seconds() -> float:
+    """Seconds spent compiling kernels in this process; 0.0 when all came from disk."""
+    return _COMPILATIONS.duration if _COMPILATIONS.done else 0.0
+
+
+def iter_compile(*kernels: Any) -> Iterator[str]:
+    """Compile (or load) kernels that have signatures, one per turn; gives the name of the one that comes next."""
+    for function in kernels:
+        yield function.__name__
+        if not DISABLED:
+            _compile_declared(function)
+
+
+def cache_folder() -> Path:
+    """The folder where kernels of these sources, flags, versions and processor are kept (made on first use)."""
+    return _FOLDER.path()
+
+
+def sources_hash(folder: Path) -> str:
+    """The name of the cache folder for kernels whose sources are the Python files in `folder`."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        text = path.read_bytes()
+        digest.update(f"{path.name} {len(text)}\n".encode() + text)
+    features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
+    digest.update(
+        repr(
+            (
+                sys.version,
+                platform.machine(),
+                (np.__version__, numba.__version__, llvmlite.__version__),
+                (llvmlite.binding.get_host_cpu_name(), features),
+                sorted((name, value) for name, value in os.environ.items() if name.startswith("NUMBA_")),
+                sorted(_FASTMATH),
+            )
+        ).encode()
+    )
+    return digest.hexdigest()[:20]
+
+
+def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
+    if DISABLED:
+        return function
+    dispatcher = _ours(numba.njit(**_FLAGS)(function))
+    dispatcher._cache = _KernelCache(function)
+    dispatcher.factorbus_signatures = signatures
+    if signatures:
+        dispatcher._compile_for_args = _on_first_call(dispatcher)
+    return dispatcher
+
+
+def _compile_declared(dispatcher: Any) -> None:
+    """Compile (or load) the declared signatures once and close the door to others."""
+    with global_compiler_lock:
+        if dispatcher._can_compile:
+            for signature in dispatcher.factorbus_signatures:
+                dispatcher.compile(signature)
+            dispatcher.disable_compile()
+            del dispatcher._compile_for_args
+
+
+def _on_first_call(dispatcher: Any) -> Callable[..., Any]:
+    """Numba calls what this hook returns with the same arguments: the dispatcher, which then knows or refuses them."""
+
+    def compile_for_args(*_args: Any, **_kwargs: Any) -> Any:
+        _compile_declared(dispatcher)
+        return dispatcher
+
+    return compile_for_args
+
+
+def _ours(dispatcher: Any) -> Any:
+    dispatcher.factorbus = True
+    return dispatcher
+
+
+class _Compilations(event.TimingListener):
+    """Adds up the time of the outermost compilations of our kernels; the compiler lock makes them sequential."""
+
+    def notify(self, event: Any) -> None:
+        if getattr(event.data["dispatcher"], "factorbus", False):
+            super().notify(event)
+
+
+class _Folder:
+    """The cache folder, made when the first kernel is compiled or loaded."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+
+    def path(self) -> Path:
+        if self._path is None:
+            self._path = self._make()
+        return self._path
+
+    def _make(self) -> Path:
+        base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser() / "kernels"
+        path = base / sources_hash(Path(__file__).parent)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=path).close()
+            os.utime(path)
+        except OSError as problem:
+            return _temporary(base, problem)
+        _prune(base, keep=path)
+        return path
+
+
+def _temporary(base: Path, problem: OSError) -> Path:
+    path = Path(tempfile.mkdtemp(prefix="factorbus-kernels-"))
+    atexit.register(shutil.rmtree, path, ignore_errors=True)
+    warnings.warn(
+        f"compiled kernels cannot be kept in {base} ({problem.strerror}): they go to {path} and are compiled again at "
+        "the next start; make the folder writable or set FACTORBUS_CACHE to one that is",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return path
+
+
+def _prune(base: Path, keep: Path) -> None:
+    """Remove all but the folders used last.  A process that still runs from one of them has its code in memory."""
+    folders = [path for path in base.iterdir() if path.is_dir() and path != keep]
+    folders.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in folders[_KEPT_FOLDERS - 1 :]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+class _Locator(caching._CacheLocator):
+    """Places a kernel in the folder above.  The folder's name stands for the sources, so nothing else is stamped."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._name = f"{function.__module__}.{function.__qualname__}"
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        return self._name
+
+    def get_disambiguator(self) -> str:
+        return hashlib.sha256(self._name.encode()).hexdigest()[:8]
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_Locator":
+        return cls(py_func)
+
+
+class _KernelCacheContent(caching.CompileResultCacheImpl):
+    _locator_classes = (_Locator,)
+
+
+class _KernelCache(caching.FunctionCache):
+    _impl_class = _KernelCacheContent
+
+
+_COMPILATIONS = _Compilations()
+_FOLDER = _Folder()
+event.register("numba:compile", _COMPILATIONS)
