@@ -85,8 +85,8 @@ class TooLarge(Problem):
 class BadSequence(Problem):
     code = "bad_sequence"
 
-    def __init__(self, client: str, seen: int, wanted: str) -> None:
-        super().__init__(f"client {client} sent sequence {seen}; wanted {wanted}", seen=seen)
+    def __init__(self, client: str, seen: int, wanted: str, next_sequence: int) -> None:
+        super().__init__(f"client {client} sent sequence {seen}; wanted {wanted}", seen=seen, next=next_sequence)
 
 
 class WrongEpoch(Problem):
