@@ -1,0 +1,51 @@
+#!/usr/bin/env bash
+# Builds the wheel and installs it, with the base dependencies only, into a virtual environment of its own:
+# the four source roots must arrive as one namespace package, the light client must work without the service's extras,
+# and what needs them must say so.
+#
+#     deploy/setup/try-wheel.sh PYTHON        PYTHON has pip; the build back end is brought by pip itself
+set -euo pipefail
+
+main() {
+    local python=$1 here folder
+    here=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+    folder=$(mktemp -d)
+    # Expanded now: the variable is gone by the time the trap runs.
+    # shellcheck disable=SC2064
+    trap "rm -rf '$folder'" EXIT
+    "$python" -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$folder/dist" "$here"
+    "$python" -m venv "$folder/venv"
+    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check "$folder"/dist/factorbus-*.whl
+    cd "$folder"
+    every_root_is_there
+    light_client_works
+    service_says_what_it_needs
+    echo "wheel: $(cd dist && ls) is whole, light, and says what it lacks"
+}
+
+every_root_is_there() {
+    venv/bin/python - <<'EOF'
+from importlib.util import find_spec
+
+for part in ("proto", "solver", "service", "formats", "workers", "client", "cli", "viz", "simulate"):
+    assert find_spec(f"factorbus.{part}"), f"factorbus.{part} is not in the wheel"
+assert find_spec("factorbus").origin is None, "factorbus must stay a namespace package"
+EOF
+}
+
+light_client_works() {
+    venv/bin/factorbus --help | grep -q "factorbus demo"
+    venv/bin/factorbus version | grep -q "^factorbus "
+    venv/bin/python -c 'import sys, factorbus.client; assert not {"numba", "scipy", "sksparse"} & set(sys.modules)'
+}
+
+service_says_what_it_needs() {
+    local code=0 said
+    said=$(venv/bin/factorbus serve 2>&1) || code=$?
+    [ "$code" != 0 ] && grep -q "pip install 'factorbus\[service\]'" <<<"$said" || {
+        echo "wheel: factorbus serve without its extra said: $said (exit $code)" >&2
+        return 1
+    }
+}
+
+main "$@"
