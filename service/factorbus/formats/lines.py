@@ -1,0 +1,54 @@
+"""From a file to its lines, in buckets by the name of the record."""
+
+import gzip
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from factorbus.formats.errors import FormatError
+
+
+@dataclass(frozen=True, slots=True)
+class Bucket:
+    """All lines of one record: what follows the name, and the number of the line."""
+
+    rests: list[bytes] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+
+
+def read_buckets(path: Path) -> dict[str, Bucket]:
+    """The lines of `path` by record, in the order of the file; blank lines and those that begin with # are left out.
+
+    Raises FormatError when the file cannot be read, is not text or has no record.
+    """
+    content = _content(path)
+    if b"\0" in content:
+        line = content[: content.index(b"\0")].count(b"\n") + 1
+        raise FormatError(str(path), line, "a zero byte", "a text file in ASCII or UTF-8")
+    found: dict[bytes, Bucket] = {}
+    for number, line in enumerate(content.split(b"\n"), 1):
+        name, *rest = line.split(None, 1) or (b"#",)
+        if name[0] == 35:  # '#'
+            continue
+        bucket = found.get(name)
+        if bucket is None:
+            bucket = found[name] = Bucket()
+        bucket.rests.append(rest[0] if rest else b"")
+        bucket.numbers.append(number)
+    if not found:
+        raise FormatError(str(path), None, "no record at all", "lines such as EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1")
+    return {name.decode("utf-8", "backslashreplace"): bucket for name, bucket in found.items()}
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of the file, unpacked where it is a gzip file, without a byte order mark."""
+    try:
+        content = path.read_bytes()
+        if content.startswith(b"\x1f\x8b"):
+            content = gzip.decompress(content)
+    except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
+        reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
+        raise FormatError(
+            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO or iSAM file"
+        ) from failure
+    return content.removeprefix(b"\xef\xbb\xbf")

@@ -1,0 +1,244 @@
+"""When each variable of a graph enters a replay: as early as the order of the poses and the factors allow."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.formats.errors import FormatError
+from factorbus.proto.arrays import I64
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch
+from factorbus.proto.symbols import format_symbol
+
+POSES = ("se2", "se3")
+
+
+@dataclass(frozen=True, slots=True)
+class Roster:
+    """All variables of a batch in one list.
+
+    keys, is_pose, fixed, valued (N,); rank (N,): the place of a pose among the poses by key, -1 for points;
+    pose_at (P,): the pose of each rank; ends: per group of factors the rows (m, arity) of its variables.
+    """
+
+    keys: I64
+    is_pose: np.ndarray
+    fixed: np.ndarray
+    valued: np.ndarray
+    rank: I64
+    pose_at: I64
+    ends: tuple[I64, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """entry (N,): the rank of the pose with which each variable enters.  root: the row of a pose to be fixed as the
+    origin of the map, or -1.  given: rows of poses that no composition reaches, so that they need their value."""
+
+    entry: I64
+    root: int
+    given: I64
+
+
+def roster(file: str, batch: Batch) -> Roster:
+    """The variables of `batch`.  Raises FormatError when a factor names a variable that it does not have."""
+    empty = np.empty(0, np.int64)
+    keys = np.concatenate([empty, *(group.keys for group in batch.variables)])
+    is_pose = _spread(batch, [group.kind in POSES for group in batch.variables])
+    order = np.argsort(keys, kind="stable")
+    pose_at = order[is_pose[order]]
+    rank = np.full(len(keys), -1, np.int64)
+    rank[pose_at] = np.arange(len(pose_at))
+    ends = []
+    for group in batch.factors:
+        at = np.minimum(np.searchsorted(keys[order], group.keys), max(len(keys) - 1, 0))
+        if len(keys) == 0 or (keys[order][at] != group.keys).any():
+            raise FormatError(file, None, f"a {group.kind} of a variable that is not in the graph", "all its variables")
+        ends.append(order[at])
+    return Roster(
+        keys=keys,
+        is_pose=is_pose,
+        fixed=_spread(batch, [group.fixed for group in batch.variables]),
+        valued=_spread(batch, [group.values is not None for group in batch.variables]),
+        rank=rank,
+        pose_at=pose_at,
+        ends=tuple(ends),
+    )
+
+
+def scheduled(file: str, batch: Batch, names: Roster) -> Schedule:
+    """When every variable enters.  Raises FormatError when the graph is in parts or has no beginning.
+
+    A pose enters at its own turn (by key) if an edge joins it to a pose that is in, else with the first pose that
+    makes such a chain.  Where nothing is fixed and no pose has a prior, the first pose is the root; otherwise the
+    replay begins at those poses.  A point enters with the first pose that sees it.
+    """
+    if not len(names.pose_at):
+        raise FormatError(file, None, "no pose", "at least one pose to replay")
+    seeds = _seeds(batch, names)
+    root = -1
+    if not (names.fixed.any() or seeds.any()):
+        root = int(names.pose_at[0])
+        seeds[root] = True
+    seeds |= names.fixed & names.is_pose
+    _refuse_unknown_fixed(file, names)
+    entry, given = _in_turn(batch, names, seeds)
+    if entry is None:
+        entry, given = _flooded(batch, names, seeds)
+    _enter_points(batch, names, entry)
+    if (entry < 0).any():
+        raise _unreached(file, batch, names, entry)
+    return Schedule(entry, root, given)
+
+
+def _spread(batch: Batch, flags: Sequence[bool]) -> np.ndarray:
+    """One flag for each group of variables, as one for each variable."""
+    return np.repeat(np.array(flags, bool), [len(group.keys) for group in batch.variables])
+
+
+def _seeds(batch: Batch, names: Roster) -> np.ndarray:
+    """Poses that have a prior."""
+    seeds = np.zeros(len(names.keys), bool)
+    for group, ends in zip(batch.factors, names.ends, strict=True):
+        if group.kind in ("prior_se2", "prior_se3"):
+            seeds[ends] = True
+    return seeds
+
+
+def _refuse_unknown_fixed(file: str, names: Roster) -> None:
+    """A fixed variable needs its value; only the very first pose may do without, as the origin."""
+    lost = names.fixed & ~names.valued
+    lost[names.pose_at[0]] = False
+    if lost.any():
+        shown = format_symbol(int(names.keys[np.argmax(lost)]))
+        raise FormatError(file, None, f"{shown} is fixed but has no value", f"a vertex line for {shown}")
+
+
+def _pairs(batch: Batch, names: Roster, points: bool) -> I64:
+    """Rows (m, 2) of the variables of all factors between two poses, or between a pose and a point."""
+    chosen = [
+        ends
+        for group, ends in zip(batch.factors, names.ends, strict=True)
+        if ends.shape[1] == 2 and (FACTOR_KINDS[group.kind].connects[1] not in POSES) == points
+    ]
+    return np.concatenate([np.empty((0, 2), np.int64), *chosen])
+
+
+def _in_turn(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64 | None, I64]:
+    """Entries when every pose can enter at its own turn: each is a seed or has an edge to an earlier one."""
+    ranks = names.rank[_pairs(batch, names, points=False)]
+    joined = seeds[names.pose_at].copy()
+    joined[ranks.max(axis=1, initial=-1)] = True
+    if not seeds[names.pose_at[0]] or not joined.all():
+        return None, np.empty(0, np.int64)
+    return names.rank.copy(), np.empty(0, np.int64)
+
+
+def _flooded(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64, I64]:
+    """Entries of poses when some must wait, pose by pose.
+
+    A pose is reached over an edge from a pose that is in.  When there is none, a pose that sees a point that is in,
+    or a fixed one, is let in at the value its vertex line gives, if it has one.
+    """
+    edges, sightings = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
+    entry = np.full(len(names.keys), -1, np.int64)
+    known = set(np.flatnonzero(names.fixed & ~names.is_pose).tolist())
+    given: list[int] = []
+
+    def enter(turn: int, first: int) -> list[int]:
+        """Let `first` in and all poses that had been waiting for it; the poses that see a point newly known."""
+        waiting, sighted = [first], []
+        while waiting:
+            pose = waiting.pop()
+            if entry[pose] >= 0:
+                continue
+            entry[pose] = turn
+            waiting += [other for other in edges[pose] if entry[other] < 0 and names.rank[other] <= turn]
+            for point in sightings[pose]:
+                if point not in known:
+                    known.add(point)
+                    sighted += sightings[point]
+        return sighted
+
+    for turn, pose in enumerate(names.pose_at.tolist()):
+        candidates = [pose]
+        if seeds[pose] or any(entry[other] >= 0 for other in edges[pose]):
+            candidates = enter(turn, pose)
+        while candidates:
+            late = candidates.pop()
+            ready = names.rank[late] <= turn and entry[late] < 0 and names.valued[late]
+            if ready and any(point in known for point in sightings[late]):
+                given.append(late)
+                candidates += enter(turn, late)
+    return entry, np.array(given, np.int64)
+
+
+def _neighbours(pairs: I64) -> dict[int, list[int]]:
+    found: dict[int, list[int]] = defaultdict(list)
+    for one, other in pairs.tolist():
+        found[one].append(other)
+        found[other].append(one)
+    return found
+
+
+def _enter_points(batch: Batch, names: Roster, entry: I64) -> None:
+    """Entries of points: with the first pose that sees them; unseen ones that are known, at the start."""
+    sightings = _pairs(batch, names, points=True)
+    first = np.full(len(entry), np.iinfo(np.int64).max)
+    seen = sightings[entry[sightings[:, 0]] >= 0]
+    np.minimum.at(first, seen[:, 1], entry[seen[:, 0]])
+    points = ~names.is_pose
+    known = names.fixed.copy()
+    for group, ends in zip(batch.factors, names.ends, strict=True):
+        if group.kind in ("prior_point2", "prior_point3"):
+            known[ends] = True
+    unseen = first == np.iinfo(np.int64).max
+    start = int(entry[names.pose_at][entry[names.pose_at] >= 0].min(initial=0))
+    entry[points] = np.where(unseen, np.where(known, start, -1), first)[points]
+
+
+def _unreached(file: str, batch: Batch, names: Roster, entry: I64) -> FormatError:
+    """The error that names what cannot be joined to the rest."""
+    parts = _parts(len(entry), [ends for ends in names.ends if ends.shape[1] == 2])
+    if len(parts) > 1:
+        shown = "; ".join(_shown_part(names, part) for part in parts[:4]) + ("; ..." if len(parts) > 4 else "")
+        return FormatError(
+            file,
+            None,
+            f"the graph is in {len(parts)} parts that no factor joins: {shown}",
+            "one part, or a fixed vertex with a value (FIX) or a prior in each",
+        )
+    lost = format_symbol(int(names.keys[np.argmax(entry < 0)]))
+    return FormatError(
+        file,
+        None,
+        f"{lost} is joined to the rest only through points",
+        f"an edge to another pose, or a vertex line for {lost}",
+    )
+
+
+def _parts(count: int, ends: list[I64]) -> list[I64]:
+    """Rows of the variables of each connected part, the largest first."""
+    label = np.arange(count)
+    pairs = np.concatenate([np.empty((0, 2), np.int64), *ends])
+    while True:  # every pass gives both ends of each factor the lower label, then follows labels to their own label
+        low = np.minimum(label[pairs[:, 0]], label[pairs[:, 1]])
+        new = label.copy()
+        np.minimum.at(new, label[pairs[:, 0]], low)
+        np.minimum.at(new, label[pairs[:, 1]], low)
+        while (new[new] != new).any():
+            new = new[new]
+        new = new[label]
+        if (new == label).all():
+            break
+        label = new
+    parts = [np.flatnonzero(label == name) for name in np.unique(label)]
+    return sorted(parts, key=len, reverse=True)
+
+
+def _shown_part(names: Roster, part: I64) -> str:
+    keys = np.sort(names.keys[part])
+    ends = [format_symbol(int(key)) for key in (keys[0], keys[-1])]
+    return ends[0] if len(part) == 1 else f"{ends[0]} .. {ends[1]} ({len(part)} variables)"

@@ -1,0 +1,74 @@
+"""Information matrices as files have them, turned into packed upper triangles of positive definite matrices."""
+
+import numpy as np
+
+from factorbus.formats.errors import refuse_first
+from factorbus.proto.arrays import F64, I64
+
+
+def checked_information(file: str, name: str, lines: I64, packed: F64, dim: int) -> F64:
+    """`packed`, if every matrix is positive definite.  Raises FormatError with the first line that is not.
+
+    in   packed (n, dim (dim + 1) / 2): upper triangles row by row
+    """
+    bad = ~positive_definite(packed, dim)
+    refuse_first(
+        file,
+        lines,
+        bad,
+        lambda row: (
+            f"{name} with an information matrix that is not positive definite"
+            f" (smallest eigenvalue {_smallest_eigenvalue(packed[row], dim):.3g})"
+        ),
+        "a symmetric positive definite matrix",
+    )
+    return packed
+
+
+def positive_definite(packed: F64, dim: int) -> np.ndarray:
+    """Whether each matrix has a Cholesky factor, for all matrices at once.
+
+    in   packed (n, dim (dim + 1) / 2)   out  (n,) bool
+    """
+    entry = {(i, j): packed[:, k] for k, (i, j) in enumerate(_upper(dim))}
+    good = np.ones(len(packed), bool)
+    with np.errstate(all="ignore"):  # rows already found bad may divide by zero
+        for k in range(dim):
+            good &= entry[k, k] > 0
+            for i in range(k + 1, dim):
+                ratio = entry[k, i] / entry[k, k]
+                for j in range(i, dim):
+                    entry[i, j] = entry[i, j] - ratio * entry[k, j]
+    return good
+
+
+def squared(root: F64, dim: int) -> F64:
+    """RᵀR of upper triangular matrices R, packed as they are.
+
+    in   root (n, dim (dim + 1) / 2)   out  the same shape
+    """
+    R = unpacked_triangle(root, dim)
+    return packed_upper(np.einsum("nki,nkj->nij", R, R))
+
+
+def unpacked_triangle(packed: F64, dim: int) -> F64:
+    """Upper triangular matrices (n, dim, dim) of packed ones."""
+    full = np.zeros((len(packed), dim, dim))
+    rows, columns = np.triu_indices(dim)
+    full[:, rows, columns] = packed
+    return full
+
+
+def packed_upper(full: F64) -> F64:
+    """Upper triangles (n, dim (dim + 1) / 2), row by row, of matrices (n, dim, dim)."""
+    rows, columns = np.triu_indices(full.shape[1])
+    return np.ascontiguousarray(full[:, rows, columns])
+
+
+def _upper(dim: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(dim) for j in range(i, dim)]
+
+
+def _smallest_eigenvalue(packed: F64, dim: int) -> float:
+    upper = unpacked_triangle(packed[None], dim)[0]
+    return float(np.linalg.eigvalsh(upper, UPLO="U")[0])
