@@ -1,0 +1,11 @@
+"""The process that owns maps: a pure state machine per map, and one thin shell that puts it on the bus.
+
+app        the shell: the only file here that knows Zenoh
+core       one map: events in, effects out
+admission  who may insert what next: sequence numbers, the bounded inbox, fairness
+fold       waiting inserts into the solver, one step, the delta: what the solver thread runs
+questions  what may be asked, and answers made from a snapshot
+dispatch   jobs for workers: who gets which, until when, and who next
+registry   the maps there are
+config     limits and endpoints
+"""

@@ -1,0 +1,220 @@
+"""Who may insert what next: sequence numbers per client, a bounded inbox, and a fair order between clients.
+
+The rules, in the order they are tried (n is the number that the client has to send next, 1 at first):
+
+    another epoch                       wrong_epoch, the number is not used up
+    waiting, same bytes                 one more to answer when its answer is there
+    answered, same bytes                the first answer again
+    used for other bytes, or forgotten  bad_sequence
+    the map is closing                  shutting_down, not used up
+    n                                   admitted if the inbox has room, else busy, not used up
+    after n, within the window          parked until the gap is closed; no room: busy; gap not closed: bad_sequence
+    further                             bad_sequence
+
+Parked inserts have room of their own: were they to fill the inbox, the one that closes the gap would find it full.
+"""
+
+from collections import OrderedDict, deque
+from dataclasses import dataclass, field
+
+from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, TooLarge, WrongEpoch
+from factorbus.service.config import Limits
+from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse, Waiting
+
+# How many may wait for one and the same answer: a client that asks again and again is told to be patient instead.
+_ASKERS = 8
+_RETRY_S = (0.02, 2.0)
+
+
+@dataclass(slots=True)
+class _Client:
+    """One client's place in its sequence."""
+
+    next: int = 1
+    heard: float = 0.0  # when it last sent what it has to send next
+    ready: deque[Waiting] = field(default_factory=deque)
+    open: dict[int, Waiting] = field(default_factory=dict)  # admitted or parked, not answered
+    parked: dict[int, Waiting] = field(default_factory=dict)
+    answered: OrderedDict[int, tuple[int, object]] = field(default_factory=OrderedDict)
+
+
+class Admission:
+    """The inserts of one map between their arrival and their answer."""
+
+    def __init__(self, epoch: int, limits: Limits) -> None:
+        self._epoch, self._limits = epoch, limits
+        self._clients: dict[str, _Client] = {}
+        self._turns: deque[str] = deque()  # clients with something ready, next in turn first
+        self._ready = self._parked = self._bytes = 0
+        self._pace_s = 0.01  # seconds per insert, smoothed
+        self._closing = False
+
+    @property
+    def ready(self) -> int:
+        """Inserts that wait for a step."""
+        return self._ready
+
+    @property
+    def parked(self) -> int:
+        """Inserts that wait for the one before them."""
+        return self._parked
+
+    @property
+    def next_sequences(self) -> dict[str, int]:
+        """What each client has to send next."""
+        return {name: client.next for name, client in self._clients.items()}
+
+    def admit(self, arrived: Arrived) -> list[Effect]:
+        """Judge one arrival: nothing to say yet (it waits), or its answer."""
+        try:
+            answer = self._judge(arrived)
+        except Problem as problem:
+            return [Refuse(arrived.asker, problem)]
+        return [] if answer is None else [_reply(arrived.asker, answer)]
+
+    def take(self, most: int) -> tuple[Waiting, ...]:
+        """Up to `most` inserts for the next step: one of each client in turn, and again."""
+        taken: list[Waiting] = []
+        while self._turns and len(taken) < most:
+            name = self._turns.popleft()
+            queue = self._clients[name].ready
+            taken.append(queue.popleft())
+            if queue:
+                self._turns.append(name)
+        self._ready -= len(taken)
+        return tuple(taken)
+
+    def answer(self, insert: Waiting, answer: object) -> list[Effect]:
+        """`insert` has its answer: give it to all who wait for it, and remember it."""
+        client = self._clients[insert.client]
+        del client.open[insert.sequence]
+        self._bytes -= insert.size
+        client.answered[insert.sequence] = (insert.digest, answer)
+        if len(client.answered) > self._limits.remembered:
+            client.answered.popitem(last=False)
+        return [_reply(asker, answer) for asker in insert.askers]
+
+    def expire(self, now: float) -> list[Effect]:
+        """Refuse what was parked for too long: its client has not sent what comes before."""
+        if not self._parked:
+            return []
+        late = [c for c in self._clients.values() if c.parked and now - c.heard > self._limits.parked_s]
+        return [effect for client in late for effect in self._unpark(client, None)]
+
+    def close(self, problem: Problem | None = None) -> list[Effect]:
+        """Take nothing new and refuse what is parked; with a `problem`, refuse what is ready as well."""
+        self._closing = True
+        effects = [e for c in self._clients.values() for e in self._unpark(c, problem or ShuttingDown())]
+        if problem is not None:
+            for insert in self.take(self._ready):
+                effects += self.answer(insert, problem)
+        return effects
+
+    def took(self, inserts: int, seconds: float) -> None:
+        """Learn the pace: `inserts` were folded in `seconds`."""
+        if inserts:
+            self._pace_s += 0.1 * (seconds / inserts - self._pace_s)
+
+    def _judge(self, arrived: Arrived) -> object | None:
+        """Its answer if there is one, None if it waits.  Raises Problem."""
+        if arrived.epoch not in (0, self._epoch):
+            raise WrongEpoch(arrived.epoch, self._epoch)
+        client = self._clients.get(arrived.client)
+        if client is None:
+            client = self._new_client(arrived)
+        if arrived.sequence in client.open:
+            return self._ask_again(client.open[arrived.sequence], arrived, client.next)
+        if arrived.sequence < client.next:
+            return _remembered(client, arrived)
+        if self._closing:
+            raise ShuttingDown
+        if arrived.sequence == client.next:
+            self._admit_next(client, arrived)
+        else:
+            self._park(client, arrived)
+        self._clients[arrived.client] = client
+        return None
+
+    def _new_client(self, arrived: Arrived) -> _Client:
+        """A place for a name not seen before; it counts as soon as something of it is taken."""
+        if len(self._clients) >= self._limits.clients:
+            raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
+        return _Client(heard=arrived.now)
+
+    def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> None:
+        if insert.digest != arrived.digest:
+            raise BadSequence(arrived.client, arrived.sequence, "a number not used for another insert", following)
+        if len(insert.askers) >= _ASKERS:
+            raise self._busy()
+        insert.askers.append(arrived.asker)
+
+    def _admit_next(self, client: _Client, arrived: Arrived) -> None:
+        """Into the inbox, and with it whatever waited for just this one."""
+        client.heard = arrived.now
+        # The smallest inbox still takes one insert, whatever its size.
+        crowded = self._ready and self._bytes + arrived.size > self._limits.waiting_bytes
+        if self._ready >= self._limits.waiting or crowded:
+            raise self._busy()
+        self._bytes += arrived.size
+        self._make_ready(client, _waiting(arrived))
+        while client.next in client.parked:
+            self._parked -= 1
+            self._make_ready(client, client.parked.pop(client.next))
+
+    def _make_ready(self, client: _Client, insert: Waiting) -> None:
+        if not client.ready:
+            self._turns.append(insert.client)
+        client.ready.append(insert)
+        client.open[insert.sequence] = insert
+        client.next += 1
+        self._ready += 1
+
+    def _park(self, client: _Client, arrived: Arrived) -> None:
+        window = self._limits.waiting
+        if arrived.sequence - client.next >= window:
+            raise BadSequence(arrived.client, arrived.sequence, _wanted(client), client.next)
+        if self._parked >= window or (self._parked and self._bytes + arrived.size > 2 * self._limits.waiting_bytes):
+            raise self._busy()
+        if not client.parked:
+            client.heard = arrived.now
+        self._bytes += arrived.size
+        self._parked += 1
+        client.parked[arrived.sequence] = client.open[arrived.sequence] = _waiting(arrived)
+
+    def _unpark(self, client: _Client, problem: Problem | None) -> list[Effect]:
+        """Refuse what `client` has parked; its numbers are not used up."""
+        effects: list[Effect] = []
+        for sequence, insert in client.parked.items():
+            why = problem or BadSequence(insert.client, sequence, _wanted(client), client.next)
+            effects += [Refuse(asker, why) for asker in insert.askers]
+            del client.open[sequence]
+            self._bytes -= insert.size
+        self._parked -= len(client.parked)
+        client.parked.clear()
+        return effects
+
+    def _busy(self) -> Busy:
+        """Come back when half of what waits is likely to be done."""
+        waiting = self._ready + self._parked
+        least, most = _RETRY_S
+        return Busy(waiting, round(min(max(self._pace_s * waiting / 2, least), most), 3))
+
+
+def _remembered(client: _Client, arrived: Arrived) -> object:
+    digest, answer = client.answered.get(arrived.sequence, (None, None))
+    if digest != arrived.digest:
+        what = "a number not used for another insert" if digest is not None else "one not older than those remembered"
+        raise BadSequence(arrived.client, arrived.sequence, f"{what}: {client.next} is next", client.next)
+    return answer
+
+
+def _waiting(arrived: Arrived) -> Waiting:
+    return Waiting(arrived.client, arrived.sequence, arrived.size, arrived.digest, arrived.content, [arrived.asker])
+
+
+def _wanted(client: _Client) -> str:
+    return f"{client.next} first"
+
+
+def _reply(asker: Asker, answer: object) -> Effect:
+    return Answer(asker, answer) if isinstance(answer, bytes) else Refuse(asker, answer)

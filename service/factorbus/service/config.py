@@ -1,0 +1,125 @@
+"""What an operator may set: endpoints, which maps, limits.  From code, or from a TOML file of the same names."""
+
+import tomllib
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+from factorbus.proto.limits import Limits as MessageLimits
+from factorbus.proto.problems import Problem
+
+
+class BadConfig(Problem):
+    """A setting that does not exist or cannot have the value it was given."""
+
+    code = "bad_config"
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one service takes before it says no.  Every refusal names the limit that was met.
+
+    Each is per map unless it says otherwise.
+    """
+
+    maps: int = 64  # in this service
+    clients: int = 1024  # names that ever inserted in this epoch
+    waiting: int = 256  # inserts admitted and not yet in a step; as many again may be parked
+    waiting_bytes: int = 256 << 20
+    questions: int = 256  # waiting for the solver to come to a revision
+    remembered: int = 1024  # answers per client that a repeated sequence number gets again
+    fold: int = 64  # inserts that one step takes in
+    parked_s: float = 5.0  # how long an insert waits for the one before it
+    message_bytes: int = 64 << 20
+    insert_variables: int = 1_000_000
+    insert_factors: int = 1_000_000
+    variables: int = 20_000_000
+    factors: int = 100_000_000
+    keyframe_steps: int = 1000  # a keyframe after so many steps ...
+    keyframe_bytes: int = 64 << 20  # ... or so many bytes of deltas
+    jobs: int = 64  # batch optima being computed or waiting, in this service
+
+    def message(self) -> MessageLimits:
+        """The codec's part of the limits."""
+        return MessageLimits(self.message_bytes, self.insert_variables, self.insert_factors)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """How a service is on the bus.
+
+    mode: "peer" is a hub of its own that clients connect to; "router" the same and other routers may join;
+    "client" needs `connect` and meets its clients at a router.  maps: the names this service answers for, a name or
+    a beginning and `*`; several services at one router need patterns that do not overlap.  create: maps there are
+    from the start.  zenoh: path of a Zenoh configuration file for everything not said here (TLS, access control).
+    """
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+    mode: str = "peer"
+    name: str = ""  # of this service, in its liveliness tokens; empty: made up
+    maps: str = "*"
+    create: tuple[str, ...] = ()
+    zenoh: str = ""
+    warm: bool = True  # compile every kernel before taking the first insert
+    job_deadline_s: float = 120.0  # for one worker to answer one job
+    limits: Limits = field(default_factory=Limits)
+
+
+def load(path: str | Path, **overrides: Any) -> Config:
+    """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, OSError."""
+    with Path(path).open("rb") as file:
+        try:
+            content = tomllib.load(file)
+        except tomllib.TOMLDecodeError as error:
+            raise BadConfig(f"{path} is not TOML: {error}") from None
+    return checked(replace(_build(Config, content, str(path)), **overrides))
+
+
+def checked(config: Config) -> Config:
+    """`config`, if it can work.  Raises BadConfig."""
+    if config.mode not in ("peer", "router", "client"):
+        raise BadConfig(f"mode is {config.mode!r}; wanted peer, router or client")
+    if config.mode == "client" and not config.connect:
+        raise BadConfig("mode is 'client' and there is nothing to connect to; give connect = [\"tcp/HOST:7447\"]")
+    if config.mode != "client" and not config.listen and not config.connect:
+        raise BadConfig('there is nothing to listen on or connect to; give listen = ["tcp/127.0.0.1:7447"]')
+    for name in (f.name for f in fields(Limits)):
+        if getattr(config.limits, name) <= 0:
+            raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
+    if config.job_deadline_s <= 0:
+        raise BadConfig(f"job_deadline_s is {config.job_deadline_s}; wanted more than 0")
+    stem = config.maps.removesuffix("*")
+    if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
+        raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")
+    return config
+
+
+def _build(kind: type, content: Mapping[str, Any], where: str) -> Any:
+    """A `kind` from a table.  Strict: a misspelt setting must not be a setting ignored."""
+    types_of = get_type_hints(kind)
+    if unknown := sorted(set(content) - set(types_of)):
+        raise BadConfig(f"{where}: {unknown[0]!r} is not a setting; wanted one of {', '.join(types_of)}")
+    return kind(**{name: _value(types_of[name], value, f"{where}: {name}") for name, value in content.items()})
+
+
+def _value(kind: Any, value: Any, where: str) -> Any:
+    if kind is Limits:
+        if not isinstance(value, dict):
+            raise BadConfig(f"{where} is {value!r}; wanted a table")
+        return _build(Limits, value, where)
+    if get_origin(kind) is tuple:
+        item = get_args(kind)[0]
+        if not isinstance(value, list):
+            raise BadConfig(f"{where} is {value!r}; wanted an array")
+        return tuple(_value(item, entry, where) for entry in value)
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise BadConfig(f"{where} is {value!r}; wanted {_NAMES[kind]}")
+    return value
+
+
+_NAMES = types.MappingProxyType({int: "a whole number", float: "a number", str: "a string", bool: "true or false"})

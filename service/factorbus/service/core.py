@@ -1,0 +1,165 @@
+"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
+
+    Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
+    Asked ───▶ reads ──────────────┴▶ Run ─▶ Folded ────┼─▶ Publish           delta of every step
+                                    (solver thread)     └─▶ Run               what came in meanwhile
+
+At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
+"""
+
+from collections import Counter, deque
+from typing import Any
+
+from factorbus.proto import codec
+from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
+from factorbus.service.admission import Admission
+from factorbus.service.config import Limits
+from factorbus.service.events import (
+    Arrived,
+    Asked,
+    Drained,
+    Effect,
+    Folded,
+    Publish,
+    Read,
+    Refuse,
+    Run,
+    Step,
+    Tell,
+)
+from factorbus.service.questions import Question, parse
+
+_KEYFRAME = Read(Question("keyframe"))
+
+
+class MapCore:
+    """The state of one map, short of its estimate.  Every method takes an event and returns effects, in order."""
+
+    def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float) -> None:
+        self.name, self.mode, self.epoch = name, mode, epoch
+        self.revision = self.variables = self.factors = 0
+        self._limits, self._created = limits, now
+        self._admission = Admission(epoch, limits)
+        self._reads: deque[Read] = deque()
+        self._running: Run | None = None
+        self._started = 0.0
+        self._closing: Problem | None = None
+        self._drained = False
+        self._since_keyframe = [0, 0]  # steps, bytes of deltas
+        self._strategies: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
+        self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
+
+    def row(self) -> dict[str, Any]:
+        """What admin/maps says of this map."""
+        return {
+            "name": self.name,
+            "mode": self.mode,
+            "epoch": self.epoch,
+            "revision": self.revision,
+            "variables": self.variables,
+            "factors": self.factors,
+        }
+
+    def created(self) -> list[Effect]:
+        """The map is on the bus."""
+        return [self._event("created")]
+
+    def insert(self, arrived: Arrived) -> list[Effect]:
+        """An insert came in."""
+        effects = self._admission.expire(arrived.now)
+        judged = self._admission.admit(arrived)
+        for effect in judged:
+            if isinstance(effect, Refuse):
+                self._counts["busy" if effect.problem.code == "busy" else "refused"] += 1
+        return self._go_on(effects + judged, arrived.now)
+
+    def ask(self, asked: Asked, now: float) -> list[Effect]:
+        """A question came in."""
+        if self._closing is not None:
+            return [Refuse(asked.asker, self._closing)]
+        try:
+            question = parse(asked.question, asked.payload)
+        except Problem as problem:
+            return [Refuse(asked.asker, problem)]
+        if question.name == "stats":
+            return [Tell(asked.asker, self.stats(now))]
+        if len(self._reads) >= self._limits.questions:
+            return [Refuse(asked.asker, Busy(len(self._reads), 0.1))]
+        self._reads.append(Read(question, asked.asker))
+        return self._go_on([], now)
+
+    def folded(self, folded: Folded) -> list[Effect]:
+        """The solver is free again."""
+        taken = self._running.inserts if self._running else ()
+        self._running = None
+        self._admission.took(len(taken), folded.now - self._started)
+        effects: list[Effect] = [e for o in folded.outcomes for e in self._admission.answer(o.insert, o.answer)]
+        effects += [Publish("delta", step.delta) for step in folded.steps]
+        for step in folded.steps:
+            self._stepped(step)
+        self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
+        self._counts["accepted"] += sum(isinstance(o.answer, bytes) for o in folded.outcomes)
+        self._counts["refused"] += sum(not isinstance(o.answer, bytes) for o in folded.outcomes)
+        return self._go_on(effects, folded.now)
+
+    def tick(self, now: float) -> list[Effect]:
+        """Time went by."""
+        return self._admission.expire(now)
+
+    def stop(self, now: float) -> list[Effect]:
+        """Take nothing new; Drained comes when everything accepted is answered."""
+        self._closing = ShuttingDown()
+        return self._go_on([*self._admission.close(), self._event("stopping")], now)
+
+    def drop(self, now: float) -> list[Effect]:
+        """The map is to go: what waits is refused, what the solver has is still answered."""
+        self._closing = UnknownMap(self.name)
+        effects: list[Effect] = [Refuse(read.asker, self._closing) for read in self._reads if read.asker is not None]
+        self._reads.clear()
+        return self._go_on([*effects, *self._admission.close(self._closing), self._event("dropped")], now)
+
+    def stats(self, now: float) -> dict[str, Any]:
+        """What ask/stats says of this map."""
+        return self.row() | {
+            "chi2": self._chi2,
+            "uptime_s": now - self._created,
+            "waiting": self._admission.ready,
+            "parked": self._admission.parked,
+            "in_solver": len(self._running.inserts) if self._running else 0,
+            "clients": self._admission.next_sequences,
+            "inserts": {name: self._counts[name] for name in ("accepted", "refused", "busy")},
+            "steps": self.revision,
+            "strategies": dict(self._strategies),
+            "solver_ms": self._solver_ms,
+            "solver_cpu_s": self._solver_cpu_s,
+        }
+
+    def _go_on(self, effects: list[Effect], now: float) -> list[Effect]:
+        """Give the solver what waits, if it is free."""
+        if self._running is not None:
+            return effects
+        if self._reads or self._admission.ready:
+            self._running = Run(tuple(self._reads), self._admission.take(self._limits.fold))
+            self._reads.clear()
+            self._started = now
+            effects.append(self._running)
+        elif self._closing is not None and not self._drained:
+            self._drained = True
+            effects.append(Drained())
+        return effects
+
+    def _stepped(self, step: Step) -> None:
+        self.revision = step.revision
+        self._chi2 = step.chi2
+        self._solver_ms += step.solver_ms
+        self._strategies[step.strategy] += 1
+        self._since_keyframe[0] += 1
+        self._since_keyframe[1] += len(step.delta)
+        steps, size = self._since_keyframe
+        if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
+            self._since_keyframe = [0, 0]
+            self._reads.append(_KEYFRAME)
+
+    def _event(self, what: str) -> Publish:
+        return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

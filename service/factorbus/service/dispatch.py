@@ -1,0 +1,175 @@
+"""Which worker gets which job, until when, and who is next when one fails.  Pure: the shell sends and times.
+
+The worker with the fewest jobs in flight goes first; nobody gets more than it has slots for.  A job whose worker
+leaves, times out, answers nothing or fails goes to another one, and after `TRIES` of them, or when there is no
+worker at all, it is done in place.  Jobs are pure functions of their payload, so two workers on one job do no harm;
+every sending has a tag of its own, and an answer to any but the latest is dropped.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any, TypeAlias
+
+from factorbus.proto.messages import Job, JobDone
+
+TRIES = 3
+# A worker's word for "not my fault as a job": another worker, or a later try, may well succeed.
+_TRY_ANOTHER = frozenset({"internal", "shutting_down", "busy", "unknown_kind", "too_large"})
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Send `job` to `worker`; what comes of it is reported under `tag`."""
+
+    tag: int
+    worker: str
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class InPlace:
+    """Do `job` here; what comes of it is reported under `tag`."""
+
+    tag: int
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """`job` is done by `worker`, or cannot be done: result is a JobDone or a problem."""
+
+    job: str
+    worker: str
+    result: JobDone | Any
+
+
+Effect: TypeAlias = Send | InPlace | Ended
+IN_PLACE = "in-place"
+
+
+@dataclass(slots=True)
+class _Worker:
+    slots: int
+    tags: set[int] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class _Open:
+    """A job that is not done: where it was tried, and where it is (tag 0: waiting for a slot)."""
+
+    job: Job
+    tried: set[str] = field(default_factory=set)
+    tries: int = 0
+    tag: int = 0
+
+
+class Dispatch:
+    """The workers there are and the jobs that are not done."""
+
+    def __init__(self) -> None:
+        self._workers: dict[str, _Worker] = {}
+        self._jobs: dict[str, _Open] = {}
+        self._by_tag: dict[int, tuple[str, str]] = {}  # tag -> (job, worker)
+        self._waiting: deque[str] = deque()
+        self._tags = count(1)
+
+    @property
+    def open_jobs(self) -> int:
+        """Jobs that are not done."""
+        return len(self._jobs)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Who works here: rows of name, slots and jobs in flight."""
+        return [{"name": n, "slots": w.slots, "in_flight": len(w.tags)} for n, w in sorted(self._workers.items())]
+
+    def joined(self, worker: str, slots: int) -> list[Effect]:
+        """A worker announced itself; one that was known came back, and has forgotten its jobs."""
+        effects = self.left(worker) if worker in self._workers else []
+        self._workers[worker] = _Worker(max(1, slots))
+        return effects + self._place_waiting()
+
+    def left(self, worker: str) -> list[Effect]:
+        """A worker is gone: its jobs go to others."""
+        gone = self._workers.pop(worker, None)
+        for tag in sorted(gone.tags, reverse=True) if gone else ():
+            self._again(tag)
+        return self._place_waiting()
+
+    def submit(self, job: Job) -> list[Effect]:
+        """A new job."""
+        self._jobs[job.job] = _Open(job)
+        self._waiting.append(job.job)
+        return self._place_waiting()
+
+    def cancel(self, job: str) -> None:
+        """Nobody waits for `job` any more; a worker that has it is not disturbed, its answer will be dropped."""
+        found = self._jobs.pop(job, None)
+        if found is not None and found.tag == 0:
+            self._waiting.remove(job)
+
+    def done(self, tag: int, done: JobDone) -> list[Effect]:
+        """The sending `tag` was answered."""
+        job, worker = self._release(tag)
+        if not self._is_latest(job, tag):
+            return self._place_waiting()
+        del self._jobs[job]
+        return [Ended(job, worker, done), *self._place_waiting()]
+
+    def failed(self, tag: int, problem: Any) -> list[Effect]:
+        """The sending `tag` was refused, timed out or came to nothing."""
+        job, worker = self._by_tag.get(tag, ("", ""))
+        retry = worker != IN_PLACE and problem.code in _TRY_ANOTHER | {"unavailable"}
+        if retry or not self._is_latest(job, tag):
+            self._again(tag)
+            return self._place_waiting()
+        self._release(tag)
+        del self._jobs[job]
+        return [Ended(job, worker, problem), *self._place_waiting()]
+
+    def _is_latest(self, job: str, tag: int) -> bool:
+        return job in self._jobs and self._jobs[job].tag == tag
+
+    def _again(self, tag: int) -> None:
+        """The sending `tag` came to nothing: its job, if that was its latest, goes first among those that wait."""
+        job, _ = self._release(tag)
+        if self._is_latest(job, tag):
+            self._jobs[job].tag = 0
+            self._waiting.appendleft(job)
+
+    def _release(self, tag: int) -> tuple[str, str]:
+        job, worker = self._by_tag.pop(tag, ("", ""))
+        if worker in self._workers:
+            self._workers[worker].tags.discard(tag)
+        return job, worker
+
+    def _place_waiting(self) -> list[Effect]:
+        """Give away what waits, oldest first, as far as there are slots."""
+        effects: list[Effect] = []
+        for _ in range(len(self._waiting)):
+            job = self._waiting.popleft()
+            placed = self._place(self._jobs[job])
+            if placed is None:
+                self._waiting.append(job)
+            else:
+                effects.append(placed)
+        return effects
+
+    def _place(self, found: _Open) -> Effect | None:
+        """Where it goes now; None: it waits for a slot."""
+        untried: Mapping[str, _Worker] = {n: w for n, w in self._workers.items() if n not in found.tried}
+        tag = next(self._tags)
+        if found.tries >= TRIES or not untried:
+            worker, effect = IN_PLACE, InPlace(tag, found.job)
+        else:
+            worker = min(untried, key=lambda name: (len(untried[name].tags), name))
+            if len(untried[worker].tags) >= untried[worker].slots:
+                return None
+            self._workers[worker].tags.add(tag)
+            effect = Send(tag, worker, found.job)
+        found.tried.add(worker)
+        found.tries += 1
+        found.tag = tag
+        self._by_tag[tag] = (found.job.job, worker)
+        return effect

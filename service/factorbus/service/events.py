@@ -1,0 +1,150 @@
+"""What goes into the core and what comes out of it, as values.
+
+An `Asker` is whoever waits for an answer: the shell's query, which the core carries about and never looks into.
+Time is in seconds of any clock that does not go back; it arrives with the events.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from factorbus.proto.messages import Insert
+from factorbus.proto.problems import Problem
+from factorbus.service.questions import Question
+
+Asker: TypeAlias = Any
+
+
+# ---- events -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """An insert came in.
+
+    content: the message, or the problem with it when only its sequence number could be read; such an insert takes
+    its place in the sequence and is refused there.  digest tells a repetition from another message of that number.
+    """
+
+    asker: Asker
+    client: str
+    sequence: int
+    epoch: int
+    size: int
+    digest: int
+    content: Insert | Problem
+    now: float
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question came in, with its bytes."""
+
+    asker: Asker
+    question: str
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the solver and the delta that tells of it."""
+
+    revision: int
+    delta: bytes
+    strategy: str
+    chi2: float
+    solver_ms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one insert: the bytes of its Accepted, or why it was refused."""
+
+    insert: "Waiting"
+    answer: bytes | Any
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """The solver is done with a Run: zero or more steps, an outcome for every insert, and how large the map is now."""
+
+    steps: tuple[Step, ...]
+    outcomes: tuple[Outcome, ...]
+    variables: int
+    factors: int
+    solver_cpu_s: float
+    now: float
+
+
+# ---- what waits -------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True, eq=False)
+class Waiting:
+    """An insert in its place, with everybody who waits for its answer (a client may ask again)."""
+
+    client: str
+    sequence: int
+    size: int
+    digest: int
+    content: Insert | Problem
+    askers: list[Asker] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A question that needs the solver's state.  asker is None for a keyframe: its answer is published."""
+
+    question: Question
+    asker: Asker = None
+
+
+# ---- effects ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Answer `asker` with these bytes."""
+
+    asker: Asker
+    message: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """Answer `asker` with a plain map, which the shell may add its own numbers to."""
+
+    asker: Asker
+    content: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Refuse:
+    """Answer `asker` with a problem: anything with code, message and detail."""
+
+    asker: Asker
+    problem: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    """Publish to everybody: channel is delta or event."""
+
+    channel: str
+    message: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Work for the solver: first answer `reads` from the present revision, then fold `inserts`."""
+
+    reads: tuple[Read, ...]
+    inserts: tuple[Waiting, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Drained:
+    """Nothing is waiting any more and nothing will be taken: the map can be closed."""
+
+
+Effect: TypeAlias = Answer | Tell | Refuse | Publish | Run | Drained

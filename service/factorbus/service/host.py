@@ -1,0 +1,109 @@
+"""One map at work: its core, its lock, its solver and the thread that the solver runs on.  Knows no bus.
+
+Whoever brings an event takes the lock for the microseconds that the core needs; what the core wants done is done
+after the lock is free again.  Only the solver's thread brings Folded, so deltas leave in order.
+"""
+
+import logging
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+from factorbus.proto.problems import Internal, Problem
+from factorbus.service.core import MapCore
+from factorbus.service.events import Arrived, Asked, Effect, Read, Refuse, Run
+from factorbus.service.fold import Folder
+from factorbus.service.questions import Snapshot
+from factorbus.solver.errors import SolverError
+
+log = logging.getLogger(__name__)
+
+# perform(effect, on_solver_thread); answer(reads, snapshot) turns snapshots into answers, elsewhere.
+Perform: TypeAlias = Callable[[Effect, bool], None]
+AnswerReads: TypeAlias = Callable[[Sequence[Read], Snapshot], None]
+
+
+class Host:
+    """A map, running.  Its methods may be called from any thread and return at once."""
+
+    def __init__(self, core: MapCore, folder: Folder, perform: Perform, answer: AnswerReads) -> None:
+        self.core = core
+        self._folder, self._do, self._answer = folder, perform, answer
+        self._lock = threading.Lock()
+        self._runs: queue.SimpleQueue[Run | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._solve, name=f"solver {core.name}", daemon=True)
+        self._thread.start()
+
+    def created(self) -> None:
+        """The map is on the bus."""
+        self._perform(self.core.created(), False)
+
+    def insert(self, arrived: Arrived) -> None:
+        """An insert came in."""
+        with self._lock:
+            effects = self.core.insert(arrived)
+        self._perform(effects, False)
+
+    def ask(self, asked: Asked) -> None:
+        """A question came in."""
+        with self._lock:
+            effects = self.core.ask(asked, time.monotonic())
+        self._perform(effects, False)
+
+    def tick(self) -> None:
+        """Time went by."""
+        with self._lock:
+            effects = self.core.tick(time.monotonic())
+        self._perform(effects, False)
+
+    def stop(self) -> None:
+        """Take nothing new; Drained is performed when everything accepted is answered."""
+        with self._lock:
+            effects = self.core.stop(time.monotonic())
+        self._perform(effects, False)
+
+    def drop(self) -> None:
+        """The map is to go; Drained is performed when the solver is done with what it has."""
+        with self._lock:
+            effects = self.core.drop(time.monotonic())
+        self._perform(effects, False)
+
+    def end(self) -> None:
+        """End the solver's thread; after Drained."""
+        self._runs.put(None)
+
+    def _perform(self, effects: list[Effect], on_solver_thread: bool) -> None:
+        for effect in effects:
+            if isinstance(effect, Run):
+                self._runs.put(effect)
+            else:
+                self._do(effect, on_solver_thread)
+
+    def _solve(self) -> None:
+        while (run := self._runs.get()) is not None:
+            if run.reads:
+                self._read(run.reads)
+            folded = self._folder.fold(run.inserts)
+            with self._lock:
+                effects = self.core.folded(folded)
+            self._perform(effects, True)
+
+    def _read(self, reads: Sequence[Read]) -> None:
+        try:
+            taken = self._folder.snapshot([read.question for read in reads])
+        except (Problem, SolverError) as problem:
+            self._refuse(reads, problem)
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: no snapshot of map %s", reference, self.core.name)
+            self._refuse(reads, Internal(reference))
+        else:
+            self._answer(reads, taken)
+
+    def _refuse(self, reads: Sequence[Read], problem: Exception) -> None:
+        for read in reads:
+            if read.asker is not None:
+                self._do(Refuse(read.asker, problem), True)

@@ -1,0 +1,48 @@
+"""A thread that does what it is handed, one thing after the other, in order."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+
+class Lane:
+    """Calls run on one thread of their own, in the order they were handed in."""
+
+    def __init__(self, name: str) -> None:
+        self._calls: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
+        self._handed = self._done = 0
+        self._count = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Everything handed in so far is done."""
+        return self._handed == self._done
+
+    def hand(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Have `call(*arguments)` run after all that was handed in before.  Never blocks."""
+        with self._count:
+            self._handed += 1
+            self._calls.put((call, arguments))
+
+    def close(self) -> None:
+        """Return when all that was handed in is done and the thread has ended."""
+        self._calls.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (item := self._calls.get()) is not None:
+            call, arguments = item
+            try:
+                call(*arguments)
+            except Exception:
+                # One answer that cannot be given must not silence the lane for all others.
+                log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
+            finally:
+                item = call = arguments = None
+                self._done += 1

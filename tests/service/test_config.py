@@ -1,0 +1,52 @@
+"""Settings from a file: what is there is used, what is misspelt is said."""
+
+from pathlib import Path
+
+import pytest
+
+from factorbus.service.config import BadConfig, Config, Limits, checked, load
+
+
+def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "factorbus.toml"
+    path.write_text(
+        'listen = ["tcp/0.0.0.0:7447"]\nmaps = "site7-*"\njob_deadline_s = 5\n[limits]\nwaiting = 9\nparked_s = 2\n'
+    )
+    config = load(path, name="s1")
+    assert config == Config(
+        listen=("tcp/0.0.0.0:7447",),
+        maps="site7-*",
+        name="s1",
+        job_deadline_s=5.0,
+        limits=Limits(waiting=9, parked_s=2.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("lissten = []", "'lissten' is not a setting"),
+        ("[limits]\nwating = 3", "'wating' is not a setting"),
+        ('listen = "tcp/0.0.0.0:1"', "wanted an array"),
+        ("listen = [1]", "wanted a string"),
+        ("limits = 3", "wanted a table"),
+        ("[limits]\nwaiting = 0", "wanted more than 0"),
+        ("[limits]\nwaiting = 1.5", "wanted a whole number"),
+        ("[limits]\nwaiting = true", "wanted a whole number"),
+        ('mode = "hub"', "wanted peer, router or client"),
+        ('mode = "client"', "nothing to connect to"),
+        ("listen = []", "nothing to listen on"),
+        ('maps = "a/*"', "wanted a map name"),
+        ("job_deadline_s = -1", "wanted more than 0"),
+        ("mode = ", "not TOML"),
+    ],
+)
+def test_what_cannot_be_is_named(tmp_path: Path, text: str, wanted: str) -> None:
+    path = tmp_path / "factorbus.toml"
+    path.write_text(text)
+    with pytest.raises(BadConfig, match=wanted):
+        load(path)
+
+
+def test_the_defaults_can_work() -> None:
+    assert checked(Config()) == Config()

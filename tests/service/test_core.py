@@ -1,0 +1,173 @@
+"""One map as a state machine, with no bus, clock, thread or solver."""
+
+from typing import Any
+
+import pytest
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Batch, Insert
+from factorbus.proto.problems import UnknownMap
+from factorbus.service.config import Limits
+from factorbus.service.core import MapCore
+from factorbus.service.events import (
+    Answer,
+    Arrived,
+    Asked,
+    Drained,
+    Effect,
+    Folded,
+    Outcome,
+    Publish,
+    Refuse,
+    Run,
+    Step,
+    Tell,
+)
+
+
+@pytest.fixture
+def core() -> MapCore:
+    return MapCore("m", "auto", 5, Limits(fold=2, keyframe_steps=3, questions=2), now=0.0)
+
+
+def insert(client: str, sequence: int) -> Arrived:
+    return Arrived(f"{client}{sequence}", client, sequence, 0, 10, sequence, Insert(sequence, Batch()), 1.0)
+
+
+def run_of(effects: list[Effect]) -> Run:
+    (run,) = [effect for effect in effects if isinstance(effect, Run)]
+    return run
+
+
+def events(effects: list[Effect]) -> list[str]:
+    return [codec.decode_map(e.message)["event"] for e in effects if isinstance(e, Publish) and e.channel == "event"]
+
+
+def folded(core: MapCore, run: Run, answer: Any = b"ok") -> list[Effect]:
+    steps = (Step(core.revision + 1, b"delta", "all-batch", 1.5, 2.0),) if run.inserts else ()
+    outcomes = tuple(Outcome(i, answer) for i in run.inserts)
+    return core.folded(Folded(steps, outcomes, 3, 4, 0.5, 2.0))
+
+
+def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: MapCore) -> None:
+    run = run_of(core.insert(insert("a", 1)))
+    assert [core.insert(insert("a", s)) for s in (2, 3, 4)] == [[], [], []]
+    effects = folded(core, run)
+    assert effects[:2] == [Answer("a1", b"ok"), Publish("delta", b"delta")]
+    assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `fold` at a time"
+    assert core.revision == 1
+
+
+def test_a_refusal_is_answered_and_counted(core: MapCore) -> None:
+    problem = UnknownMap("x")
+    run = run_of(core.insert(insert("a", 1)))
+    assert core.folded(Folded((), (Outcome(run.inserts[0], problem),), 0, 0, 0.0, 2.0)) == [Refuse("a1", problem)]
+    assert core.revision == 0
+    assert core.stats(3.0)["inserts"] == {"accepted": 0, "refused": 1, "busy": 0}
+
+
+def test_questions_are_answered_between_two_steps(core: MapCore) -> None:
+    run = run_of(core.insert(insert("a", 1)))
+    assert core.ask(Asked("q", "estimate", b""), 1.0) == []
+    core.insert(insert("a", 2))
+    following = run_of(folded(core, run))
+    assert [read.asker for read in following.reads] == ["q"]
+    assert [i.sequence for i in following.inserts] == [2]
+
+
+def test_stats_do_not_wait_for_the_solver(core: MapCore) -> None:
+    core.insert(insert("a", 1))
+    core.insert(insert("a", 2))
+    (tell,) = core.ask(Asked("q", "stats", b""), 4.0)
+    assert isinstance(tell, Tell)
+    assert tell.asker == "q"
+    assert {k: tell.content[k] for k in ("name", "epoch", "waiting", "in_solver", "clients", "uptime_s")} == {
+        "name": "m",
+        "epoch": 5,
+        "waiting": 1,
+        "in_solver": 1,
+        "clients": {"a": 3},
+        "uptime_s": 4.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("question", "payload", "code"),
+    [
+        ("weather", b"", "unknown_question"),
+        ("estimate", b"\xc1", "bad_message"),
+        ("estimate", codec.encode_map({"keys": b"1234567"}), "bad_message"),
+        ("chi2", codec.encode_map({"batch": 1}), "bad_message"),
+        ("chi2", codec.encode_map({"timeout_s": -1}), "bad_message"),
+        ("export", codec.encode_map({"format": "pdf"}), "unknown_question"),
+        ("graph", b"\x93\x01\x02\x03", "bad_message"),
+    ],
+)
+def test_a_question_that_cannot_be_answered_is_refused(core: MapCore, question: str, payload: bytes, code: str) -> None:
+    (effect,) = core.ask(Asked("q", question, payload), 1.0)
+    assert isinstance(effect, Refuse)
+    assert effect.problem.code == code
+
+
+def test_questions_are_bounded(core: MapCore) -> None:
+    core.insert(insert("a", 1))
+    seen = [core.ask(Asked(n, "estimate", b""), 1.0) for n in range(3)]
+    assert seen[:2] == [[], []]
+    (effect,) = seen[2]
+    assert isinstance(effect, Refuse)
+    assert effect.problem.code == "busy"
+
+
+@pytest.mark.parametrize("limits", [Limits(keyframe_steps=3), Limits(keyframe_bytes=15)])
+def test_a_keyframe_now_and_then(limits: Limits) -> None:
+    core = MapCore("m", "auto", 5, limits, now=0.0)
+    due = 3  # the third step, or the third delta of five bytes
+    for sequence in range(1, due + 1):
+        effects = folded(core, run_of(core.insert(insert("a", sequence))))
+        keyframes = [r.question.name for e in effects if isinstance(e, Run) for r in e.reads]
+        assert keyframes == (["keyframe"] if sequence == due else [])
+
+
+def test_stopping_answers_everything_accepted_and_takes_nothing_new(core: MapCore) -> None:
+    run = run_of(core.insert(insert("a", 1)))
+    core.insert(insert("a", 2))
+    core.insert(insert("a", 9))
+    stopping = core.stop(2.0)
+    assert events(stopping) == ["stopping"]
+    assert [(e.asker, e.problem.code) for e in stopping if isinstance(e, Refuse)] == [("a9", "shutting_down")]
+    (refused,) = core.insert(insert("a", 3))
+    assert isinstance(refused, Refuse)
+    assert refused.problem.code == "shutting_down"
+    effects = folded(core, run)
+    assert Drained() not in effects
+    effects = folded(core, run_of(effects))
+    assert [e.asker for e in effects if isinstance(e, Answer)] == ["a2"]
+    assert effects[-1] == Drained()
+    assert core.ask(Asked("q", "stats", b""), 3.0)[0].problem.code == "shutting_down"  # type: ignore[union-attr]
+
+
+def test_stopping_when_nothing_waits_is_done_at_once(core: MapCore) -> None:
+    assert core.stop(1.0)[-1] == Drained()
+    assert Drained() not in core.insert(insert("a", 1)), "drained once"
+
+
+def test_dropping_refuses_what_waits_but_not_what_is_being_solved(core: MapCore) -> None:
+    run = run_of(core.insert(insert("a", 1)))
+    core.insert(insert("a", 2))
+    core.ask(Asked("q", "estimate", b""), 1.0)
+    dropping = core.drop(2.0)
+    assert sorted((e.asker, e.problem.code) for e in dropping if isinstance(e, Refuse)) == [
+        ("a2", "unknown_map"),
+        ("q", "unknown_map"),
+    ]
+    assert events(dropping) == ["dropped"]
+    effects = folded(core, run)
+    assert effects == [Answer("a1", b"ok"), Publish("delta", b"delta"), Drained()]
+
+
+def test_a_gap_ends_with_time(core: MapCore) -> None:
+    core.insert(insert("a", 2))
+    assert core.tick(3.0) == []
+    (effect,) = core.tick(60.0)
+    assert isinstance(effect, Refuse)
+    assert effect.problem.code == "bad_sequence"

@@ -1,0 +1,148 @@
+"""Which worker gets which job, and what happens when one fails."""
+
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+
+from factorbus.proto.messages import Job, JobDone
+from factorbus.proto.problems import Refused, Unavailable
+from factorbus.service.dispatch import IN_PLACE, TRIES, Dispatch, Effect, Ended, InPlace, Send
+
+TIMEOUT = Unavailable("worker", 1.0, "")
+
+
+def job(name: str) -> Job:
+    return Job(name, "batch", b"")
+
+
+def done(name: str) -> JobDone:
+    return JobDone(name, "batch", b"result", 0.1)
+
+
+def places(effects: list[Effect]) -> list[str]:
+    return [e.worker if isinstance(e, Send) else IN_PLACE if isinstance(e, InPlace) else "ended" for e in effects]
+
+
+def tag_of(effects: list[Effect]) -> int:
+    (effect,) = effects
+    assert isinstance(effect, Send | InPlace)
+    return effect.tag
+
+
+def test_no_worker_means_in_place() -> None:
+    dispatch = Dispatch()
+    effects = dispatch.submit(job("j"))
+    assert places(effects) == [IN_PLACE]
+    assert dispatch.done(tag_of(effects), done("j")) == [Ended("j", IN_PLACE, done("j"))]
+
+
+def test_the_least_busy_worker_first_and_no_more_than_slots() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 2)
+    dispatch.joined("b", 1)
+    sent = [dispatch.submit(job(f"j{n}")) for n in range(4)]
+    assert [places(e) for e in sent] == [["a"], ["b"], ["a"], []]
+    assert [row["in_flight"] for row in dispatch.table()] == [2, 1]
+    following = dispatch.done(tag_of(sent[1]), done("j1"))
+    assert places(following) == ["ended", "b"]
+
+
+@pytest.mark.parametrize("failure", ["left", "timeout", "internal"])
+def test_a_job_whose_worker_fails_goes_to_another_and_then_in_place(failure: str) -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    dispatch.joined("b", 1)
+    effects = dispatch.submit(job("j"))
+    for wanted in ("b", IN_PLACE):
+        (sent,) = effects
+        assert isinstance(sent, Send)
+        if failure == "left":
+            effects = dispatch.left(sent.worker)
+        else:
+            effects = dispatch.failed(sent.tag, TIMEOUT if failure == "timeout" else Refused("internal", "", {}))
+        assert places(effects) == [wanted]
+    problem = Refused("internal", "", {})
+    assert dispatch.failed(tag_of(effects), problem) == [Ended("j", IN_PLACE, problem)]
+    assert dispatch.open_jobs == 0
+
+
+def test_tries_are_bounded() -> None:
+    dispatch = Dispatch()
+    for n in range(9):
+        dispatch.joined(f"w{n}", 1)
+    effects = dispatch.submit(job("j"))
+    seen = []
+    while places(effects) != [IN_PLACE]:
+        seen += places(effects)
+        effects = dispatch.failed(tag_of(effects), TIMEOUT)
+    assert len(seen) == TRIES
+
+
+def test_a_problem_with_the_job_itself_is_not_tried_again() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    dispatch.joined("b", 1)
+    problem = Refused("underconstrained", "x1", {})
+    assert dispatch.failed(tag_of(dispatch.submit(job("j"))), problem) == [Ended("j", "a", problem)]
+
+
+def test_a_late_answer_is_dropped_by_its_tag() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    late = tag_of(dispatch.submit(job("j")))
+    effects = dispatch.left("a")
+    assert places(effects) == [IN_PLACE]
+    assert dispatch.done(late, done("j")) == []
+    assert dispatch.failed(late, TIMEOUT) == []
+    assert places(dispatch.done(tag_of(effects), done("j"))) == ["ended"]
+
+
+def test_a_worker_that_came_back_has_forgotten_its_jobs() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    dispatch.submit(job("j"))
+    assert places(dispatch.joined("a", 1)) == [IN_PLACE]
+    assert dispatch.table() == [{"name": "a", "slots": 1, "in_flight": 0}]
+
+
+def test_a_cancelled_job_is_forgotten_wherever_it_is() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    sent = dispatch.submit(job("j"))
+    dispatch.submit(job("k"))
+    dispatch.cancel("k")
+    dispatch.cancel("j")
+    assert dispatch.done(tag_of(sent), done("j")) == []
+    assert dispatch.open_jobs == 0
+
+
+@given(st.lists(st.tuples(st.sampled_from("jlfdx"), st.integers(0, 3)), max_size=80))
+def test_every_job_ends_once_whatever_the_workers_do(operations: list[tuple[str, int]]) -> None:
+    dispatch = Dispatch()
+    sendings: list[Any] = []
+    ended: list[str] = []
+    submitted: list[str] = []
+
+    def note(effects: list[Effect]) -> None:
+        sendings.extend(e for e in effects if isinstance(e, Send | InPlace))
+        ended.extend(e.job for e in effects if isinstance(e, Ended))
+
+    for what, n in operations:
+        if what == "j":
+            note(dispatch.joined(f"w{n}", n + 1))
+        elif what == "l":
+            note(dispatch.left(f"w{n}"))
+        elif what == "x":
+            submitted.append(f"job{len(submitted)}")
+            note(dispatch.submit(job(submitted[-1])))
+        elif sendings:
+            sending = sendings.pop(n % len(sendings))
+            tag = sending.tag
+            note(dispatch.failed(tag, TIMEOUT) if what == "f" else dispatch.done(tag, done(sending.job.job)))
+        assert all(row["in_flight"] <= row["slots"] for row in dispatch.table())
+    while sendings:
+        sending = sendings.pop()
+        note(dispatch.done(sending.tag, done(sending.job.job)))
+    assert sorted(ended) == sorted(submitted)
