@@ -3,6 +3,9 @@
     Problem
     ├── BadSymbol            bad_symbol           a variable key that cannot be read
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
+    ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
+    ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
+    ├── BadInformation       bad_information      an information matrix that is not symmetric, sigmas that are not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   └── UnknownKind      unknown_kind         a kind of variable or factor that this version does not know
     ├── TooLarge             too_large            a message, an insert or a map over its limit
@@ -53,6 +56,29 @@ class BadName(Problem):
         super().__init__(
             f"{what} name {name!r} will not do: wanted 1 to 64 of the characters A-Z a-z 0-9 _ -", seen=name
         )
+
+
+class BadEndpoint(Problem):
+    code = "bad_endpoint"
+
+    def __init__(self, endpoint: str) -> None:
+        super().__init__(
+            f"endpoint {endpoint!r} cannot be read; wanted protocol/address, such as tcp/127.0.0.1:7447", seen=endpoint
+        )
+
+
+class BadShape(Problem):
+    code = "bad_shape"
+
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
+
+
+class BadInformation(Problem):
+    code = "bad_information"
+
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
 
 
 class BadMessage(Problem):

@@ -1,0 +1,30 @@
+"""The client library: insert into a map over the bus, follow its estimate, ask it questions.
+
+    with connect("tcp/127.0.0.1:7447", client="robot1") as bus, bus.map("kitchen") as kitchen:
+        kitchen.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        print(kitchen.estimate["x0"])
+
+`factorbus.client.aio` is the same for asyncio.  Light: numpy, msgpack and zenoh, no compiler.
+"""
+
+from factorbus.client.bus import Bus, connect
+from factorbus.client.draft import Draft
+from factorbus.client.map import Map, MapRow
+from factorbus.client.mirror import Mirror, Snapshot
+from factorbus.client.ticket import NoAnswerYet, Ticket
+from factorbus.proto.problems import Problem, Refused, Unavailable
+
+__all__ = [
+    "Bus",
+    "Draft",
+    "Map",
+    "MapRow",
+    "Mirror",
+    "NoAnswerYet",
+    "Problem",
+    "Refused",
+    "Snapshot",
+    "Ticket",
+    "Unavailable",
+    "connect",
+]

@@ -1,0 +1,123 @@
+"""A connection to the bus, and the maps on it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from factorbus.client.courier import Courier, Errand
+from factorbus.client.link import Link, open_link
+from factorbus.client.map import Map, MapRow
+from factorbus.proto import codec, fields, keys
+from factorbus.proto.fields import read_map
+from factorbus.proto.limits import ANSWER_LIMITS
+from factorbus.proto.problems import UnknownMap
+
+
+def connect(
+    endpoint: str | Sequence[str],
+    *,
+    client: str = "client",
+    timeout_s: float = 10.0,
+    settings: Mapping[str, Any] | None = None,
+) -> "Bus":
+    """Connect to a service or router, trying again until `timeout_s` has passed.
+
+    endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
+    the service's lists.  timeout_s: also the default for everything done over this connection.
+    settings: further zenoh configuration, path to value.
+    Raises Unavailable, BadEndpoint, BadName.
+    """
+    keys.checked_name("client", f"{client}-00000000")
+    endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
+    return Bus(open_link(endpoints, timeout_s, settings or {}), client, timeout_s)
+
+
+class Bus:
+    """A connection to the bus; after a loss it comes back by itself.  Close it, or use it in `with`."""
+
+    def __init__(self, link: Link, client: str, timeout_s: float) -> None:
+        self.client, self.timeout_s = client, timeout_s
+        self._link = link
+        self._courier = Courier(link)
+        self._maps: list[Map] = []
+
+    def __enter__(self) -> "Bus":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def map(self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True) -> Map:
+        """Join map `name`, creating it if there is none (with create=False: UnknownMap).
+
+        window: inserts that may be unanswered at a time.  mirror: keep a live copy of the estimate; returns once
+        it is there.  Raises Refused, Unavailable, BadName, UnknownMap.
+        """
+        keys.checked_name("map", name)
+        joined = Map(
+            self._link,
+            self._courier,
+            self.client,
+            self.timeout_s,
+            window,
+            lambda: self.create(name, mode) if create else self._existing(name),
+        )
+        self._maps.append(joined)
+        try:
+            joined.watch_owner()
+            if mirror:
+                joined.open_mirror()
+        except BaseException:
+            joined.close()
+            raise
+        return joined
+
+    def maps(self, timeout_s: float | None = None) -> list[MapRow]:
+        """The maps of the service.  Raises Refused, Unavailable."""
+        return self._admin("maps", {}, _rows, timeout_s)
+
+    def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
+        """Create map `name`, or find it as it is if its mode is the same.  Raises Refused, Unavailable, BadName."""
+        return self._admin("create", {"map": keys.checked_name("map", name), "mode": mode}, _row, timeout_s)
+
+    def drop(self, name: str, timeout_s: float | None = None) -> None:
+        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
+        self._admin("drop", {"map": keys.checked_name("map", name)}, codec.decode_map, timeout_s)
+
+    def close(self) -> None:
+        """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
+        for joined in self._maps:
+            joined.close()
+        self._courier.close()
+        self._link.close()
+
+    def _existing(self, name: str) -> MapRow:
+        for row in self.maps():
+            if row.name == name:
+                return row
+        raise UnknownMap(name)
+
+    def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        what = f"the service, asked for admin/{operation},"
+        errand = Errand(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
+        return self._courier.carry(errand).future.result()
+
+
+def _rows(data: bytes) -> list[MapRow]:
+    content = read_map("maps", data, ANSWER_LIMITS)
+    return [_row_of(f"maps[{i}]", row) for i, row in enumerate(fields.maps("", content, "maps"))]
+
+
+def _row(data: bytes) -> MapRow:
+    return _row_of("", read_map("map", data, ANSWER_LIMITS))
+
+
+def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
+    return MapRow(
+        name=fields.text(where, content, "name"),
+        mode=fields.text(where, content, "mode"),
+        epoch=fields.integer(where, content, "epoch"),
+        revision=fields.integer(where, content, "revision"),
+        variables=fields.integer(where, content, "variables"),
+        factors=fields.integer(where, content, "factors"),
+    )

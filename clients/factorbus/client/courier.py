@@ -1,0 +1,155 @@
+"""Carries questions and inserts to the service, and carries them again until they are answered.
+
+The first try goes out on the caller's thread, for latency; later ones on the courier's own thread, because a
+callback of the bus must not call the bus.
+"""
+
+import heapq
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from factorbus.client.link import Link
+from factorbus.client.replies import Again, Reply, judge
+from factorbus.proto.problems import Problem, Unavailable
+
+# An unanswered try is repeated after this long: a step may take longer, but then repeating costs little.
+TRY_S = 5.0
+
+
+class Errand:
+    """One question or insert on its way: its future, and when it went and came back (time.perf_counter seconds).
+
+    timeout_s: give up with Unavailable after so long; None: keep trying until the courier is closed.
+    then: called with (errand, answer or Problem) right before those who wait for the future are woken.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        key: str,
+        payload: bytes,
+        decode: Callable[[bytes], Any],
+        timeout_s: float | None = None,
+        then: Callable[["Errand", Any], None] | None = None,
+    ) -> None:
+        self.what, self.key, self.payload, self.decode, self.then = what, key, payload, decode, then
+        self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        self.future: Future[Any] = Future()
+        self.future.set_running_or_notify_cancel()  # so that an asyncio wrapper cannot cancel what is on its way
+        self.attempt = 0
+        self.sent_at = self.answered_at = 0.0
+
+
+class Courier:
+    """All errands of one bus."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._due: list[tuple[float, int, Errand]] = []
+        self._order = itertools.count()
+        self._open: set[Errand] = set()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="factorbus-courier", daemon=True)
+        self._thread.start()
+
+    def carry(self, errand: Errand) -> Errand:
+        """Send `errand`; its future gets `decode(answer)`, or a Problem."""
+        with self._changed:
+            self._open.add(errand)
+            closed = self._closed
+        errand.sent_at = time.perf_counter()
+        if closed:
+            self._finish(errand, Unavailable(errand.what, 0.0, "this connection is closed; connect again"))
+        else:
+            self._try(errand)
+        return errand
+
+    def hurry(self, prefix: str) -> None:
+        """Try everything that waits and whose key begins with `prefix` now: somebody is there again."""
+        with self._changed:
+            now = time.monotonic()
+            self._due = [(now if e.key.startswith(prefix) else at, n, e) for at, n, e in self._due]
+            heapq.heapify(self._due)
+            self._changed.notify()
+
+    def abandon(self, errand: Errand, problem: Problem) -> None:
+        """Stop carrying `errand`; its future gets `problem` unless it is already answered."""
+        self._finish(errand, problem)
+
+    def close(self) -> None:
+        """Stop.  What is still unanswered fails with Unavailable."""
+        with self._changed:
+            self._closed = True
+            left = list(self._open)
+            self._changed.notify()
+        self._thread.join()
+        for errand in left:
+            self._finish(errand, Unavailable(errand.what, self._waited(errand), "the connection was closed first"))
+
+    def _try(self, errand: Errand) -> None:
+        errand.attempt += 1
+        timeout_s = TRY_S
+        if errand.deadline is not None:
+            timeout_s = min(TRY_S, max(errand.deadline - time.monotonic(), 0.001))
+        self._link.ask(errand.key, errand.payload, timeout_s, lambda reply: self._take(errand, reply))
+
+    def _take(self, errand: Errand, reply: Reply) -> None:
+        """On zenoh's thread: only decode, hand over, or put back."""
+        verdict = judge(reply, errand.attempt)
+        if isinstance(verdict, bytes):
+            try:
+                self._finish(errand, errand.decode(verdict))
+            except Problem as unreadable:
+                self._finish(errand, unreadable)
+        elif isinstance(verdict, Again):
+            self._put_back(errand, verdict)
+        else:
+            self._finish(errand, verdict)
+
+    def _put_back(self, errand: Errand, again: Again) -> None:
+        at = time.monotonic() + again.pause_s
+        if errand.deadline is not None and at >= errand.deadline:
+            hint = f"{again.because} on {errand.key} ({len(errand.payload)} bytes sent, {errand.attempt} tries)"
+            self._finish(errand, Unavailable(errand.what, self._waited(errand), hint))
+            return
+        with self._changed:
+            if errand in self._open:
+                heapq.heappush(self._due, (at, next(self._order), errand))
+                self._changed.notify()
+
+    def _finish(self, errand: Errand, result: Any) -> None:
+        with self._changed:
+            if errand not in self._open:
+                return
+            self._open.remove(errand)
+        errand.answered_at = time.perf_counter()
+        if errand.then is not None:
+            errand.then(errand, result)
+        if isinstance(result, BaseException):
+            errand.future.set_exception(result)
+        else:
+            errand.future.set_result(result)
+
+    def _waited(self, errand: Errand) -> float:
+        return round(time.perf_counter() - errand.sent_at, 3)
+
+    def _run(self) -> None:
+        while (errand := self._next()) is not None:
+            if not errand.future.done():
+                self._try(errand)
+
+    def _next(self) -> Errand | None:
+        with self._changed:
+            while not self._closed:
+                if not self._due:
+                    self._changed.wait()
+                elif (left := self._due[0][0] - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                else:
+                    return heapq.heappop(self._due)[2]
+        return None

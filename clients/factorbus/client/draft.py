@@ -1,0 +1,222 @@
+"""Putting together what goes into a map: variables and factors one by one, sent as columns.
+
+Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.02))
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias, TypedDict, TypeVar, Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.problems import BadInformation, BadShape, UnknownKind
+from factorbus.proto.symbols import format_symbol, parse_symbol
+
+Key: TypeAlias = str | int
+_Kind = TypeVar("_Kind")
+_Row: TypeAlias = NDArray[np.float64]
+# How far an information matrix may be from symmetric, relative to its largest entry: rounding, not meaning.
+_ASYMMETRY = 1e-9
+
+
+class Certainty(TypedDict, total=False):
+    """How certain a measurement is: one of the two.
+
+    sigmas (r,): standard deviations in the units and order of the residual.
+    information: the inverse covariance, a symmetric (r, r) matrix or its upper triangle (r(r+1)/2,) row by row.
+    The rotation part of an se3 residual is the vector part of a quaternion, so half an angle: for a standard
+    deviation of s radians say s/2.
+    """
+
+    sigmas: ArrayLike
+    information: ArrayLike
+
+
+class Draft:
+    """Variables and factors to be inserted together or not at all.  Every method returns the draft, to be chained.
+
+    A key is "x12" or an int64.  A variable without a value gets one from the first factor of the same insert that
+    reaches it.  fixed: the variable is held where it is (a map's first pose, say).
+    Every factor needs a certainty: sigmas= or information=.  Raises BadSymbol, BadShape, BadInformation, UnknownKind.
+    """
+
+    def __init__(self) -> None:
+        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row]]] = {}
+        self._factors: dict[str, tuple[list[list[int]], list[_Row], list[_Row]]] = {}
+
+    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A pose in the plane: x y (metres), theta (radians)."""
+        return self.variable("se2", key, value, fixed=fixed)
+
+    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A pose in space: x y z (metres), unit quaternion qx qy qz qw."""
+        return self.variable("se3", key, value, fixed=fixed)
+
+    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A point in the plane: x y (metres)."""
+        return self.variable("point2", key, value, fixed=fixed)
+
+    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A point in space: x y z (metres)."""
+        return self.variable("point3", key, value, fixed=fixed)
+
+    def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
+        return self.factor("prior_se2", (key,), measured, **certainty)
+
+    def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a pose in space is in the map: x y z (metres), qx qy qz qw."""
+        return self.factor("prior_se3", (key,), measured, **certainty)
+
+    def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a point in the plane is in the map: x y (metres)."""
+        return self.factor("prior_point2", (key,), measured, **certainty)
+
+    def prior_point3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a point in space is in the map: x y z (metres)."""
+        return self.factor("prior_point3", (key,), measured, **certainty)
+
+    def between_se2(
+        self,
+        first: Key,
+        second: Key,
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures."""
+        return self.factor("between_se2", (first, second), measured, **certainty)
+
+    def between_se3(
+        self,
+        first: Key,
+        second: Key,
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """The second pose in the first one's frame: x y z (metres), qx qy qz qw; residual x y z, then half-angles."""
+        return self.factor("between_se3", (first, second), measured, **certainty)
+
+    def landmark_se2(
+        self,
+        pose: Key,
+        point: Key,
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """A point2 in the pose's frame: x y (metres)."""
+        return self.factor("landmark_se2", (pose, point), measured, **certainty)
+
+    def landmark_se3(
+        self,
+        pose: Key,
+        point: Key,
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """A point3 in the pose's frame: x y z (metres)."""
+        return self.factor("landmark_se3", (pose, point), measured, **certainty)
+
+    def bearing_range_se2(
+        self,
+        pose: Key,
+        point: Key,
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
+        return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
+
+    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A variable of any kind of `factorbus.proto.kinds`."""
+        size = _known(VARIABLE_KINDS, kind).size
+        number = _number(key)
+        row = None if value is None else _row(f"{kind} {format_symbol(number)}", value, size)
+        keys, rows = self._variables.setdefault((kind, row is not None, fixed), ([], []))
+        keys.append(number)
+        if row is not None:
+            rows.append(row)
+        return self
+
+    def factor(
+        self,
+        kind: str,
+        keys: Sequence[Key],
+        measured: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """A factor of any kind of `factorbus.proto.kinds`."""
+        of = _known(FACTOR_KINDS, kind)
+        numbers = [_number(key) for key in keys]
+        where = " ".join([kind, *map(format_symbol, numbers)])
+        if len(numbers) != len(of.connects):
+            raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
+        row = _row(f"{where}: measured", measured, of.size)
+        triangle = _triangle(where, of, **certainty)
+        all_keys, all_measured, all_triangles = self._factors.setdefault(kind, ([], [], []))
+        all_keys.append(numbers)
+        all_measured.append(row)
+        all_triangles.append(triangle)
+        return self
+
+    def batch(self) -> Batch:
+        """What has been drafted so far, as columns."""
+        return Batch(
+            tuple(
+                Variables(kind, np.array(keys, np.int64), np.array(rows) if valued else None, fixed)
+                for (kind, valued, fixed), (keys, rows) in self._variables.items()
+            ),
+            tuple(
+                Factors(kind, np.array(keys, np.int64), np.array(measured), np.array(information))
+                for kind, (keys, measured, information) in self._factors.items()
+            ),
+        )
+
+
+def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
+    if kind not in kinds:
+        raise UnknownKind("draft", kind, tuple(kinds))
+    return kinds[kind]
+
+
+def _number(key: Key) -> int:
+    return parse_symbol(key) if isinstance(key, str) else int(key)
+
+
+def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
+    row = np.array(numbers, np.float64)
+    if row.shape != (size,):
+        raise BadShape(where, f"shape {row.shape}", f"({size},)")
+    return row
+
+
+def _triangle(
+    where: str, kind: FactorKind, sigmas: ArrayLike | None = None, information: ArrayLike | None = None
+) -> _Row:
+    if (sigmas is None) == (information is None):
+        raise BadInformation(where, "both or neither of sigmas and information", "one of the two")
+    if information is None:
+        return _from_sigmas(where, kind.dim, np.array(sigmas, np.float64))
+    return _from_matrix(where, kind, np.array(information, np.float64))
+
+
+def _from_sigmas(where: str, dim: int, sigmas: _Row) -> _Row:
+    if sigmas.shape != (dim,):
+        raise BadShape(f"{where}: sigmas", f"shape {sigmas.shape}", f"({dim},)")
+    if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+        raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
+    return np.diag(1.0 / sigmas**2)[np.triu_indices(dim)]
+
+
+def _from_matrix(where: str, kind: FactorKind, matrix: _Row) -> _Row:
+    if matrix.shape == (kind.information_size,):
+        return matrix
+    if matrix.shape != (kind.dim, kind.dim):
+        wanted = f"({kind.dim}, {kind.dim}), or ({kind.information_size},) for its upper triangle row by row"
+        raise BadShape(f"{where}: information", f"shape {matrix.shape}", wanted)
+    with np.errstate(invalid="ignore"):  # what is not finite the service refuses, with its place
+        worst = np.abs(matrix - matrix.T).max()
+    if worst > _ASYMMETRY * np.abs(matrix).max():
+        raise BadInformation(f"{where}: information", f"asymmetric by {worst:g}", "a symmetric matrix")
+    return matrix[np.triu_indices(kind.dim)]

@@ -1,0 +1,110 @@
+"""Following a map's estimate by its deltas.  Pure: events in, what to do out; `mirror` has the threads and the bus.
+
+    lost ──estimate──▶ live ──delta whose `previous` is our revision──▶ live
+      ▲                  │
+      └── gap, other epoch, owner gone, a probe that knows a newer revision
+
+While lost, deltas are kept aside, the last values stay readable, and the estimate is asked for; when it comes, the
+deltas that go on from it are applied.  So no change is ever skipped, and what is old says so.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+
+import numpy as np
+
+from factorbus.client.table import Table
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.messages import Delta, Estimate, Variables
+
+# While lost this many deltas wait; if more come before the estimate does, the oldest go: the estimate is newer.
+_KEPT_ASIDE = 256
+
+
+class Following:
+    """One map's estimate as far as it is known here."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self.revision = 0
+        self.live = False
+        self._tables: dict[str, Table] = {}
+        self._aside: deque[Delta] = deque(maxlen=_KEPT_ASIDE)
+
+    def delta(self, delta: Delta) -> list[Delta]:
+        """A delta came.  Returns what is new to the readers; afterwards `live` says whether an estimate is wanted."""
+        if self.live and delta.epoch == self.epoch and delta.revision <= self.revision:
+            return []
+        if self.live and delta.epoch == self.epoch and delta.previous == self.revision:
+            self._apply(delta)
+            return [delta]
+        self.live = False
+        self._aside.append(delta)
+        return []
+
+    def estimate(self, estimate: Estimate, tables: dict[str, Table]) -> list[Delta]:
+        """The whole estimate came, `tables` being `tables_of` it.  Returns what is new to the readers.
+
+        The first item stands for the estimate itself: a delta from revision 0.
+        """
+        if estimate.epoch == self.epoch and estimate.revision < self.revision + self.live:
+            return []
+        aside = list(self._aside)
+        self._aside.clear()
+        news = [Delta(estimate.epoch, estimate.revision, 0, estimate.variables)]
+        self.epoch, self.revision, self._tables, self.live = estimate.epoch, estimate.revision, tables, True
+        for delta in aside:
+            if delta.epoch == self.epoch:
+                news += self.delta(delta)
+        return news
+
+    def probe(self, epoch: int, revision: int) -> None:
+        """The owner says where the map is: if that is not where we are, we missed something."""
+        if epoch != self.epoch or revision > self.revision:
+            self.live = False
+
+    def lost(self) -> None:
+        """Nobody owns the map at the moment, or nobody answers: what we hold may be old."""
+        self.live = False
+
+    def value(self, key: int) -> F64 | None:
+        """A copy of one variable's value."""
+        for table in self._tables.values():
+            if (value := table.get(key)) is not None:
+                return value
+        return None
+
+    def columns(self) -> dict[str, tuple[I64, F64]]:
+        """Copies of (keys, values) by kind, ordered by key."""
+        return {kind: table.columns() for kind, table in self._tables.items()}
+
+    def columns_of(self, kind: str) -> tuple[I64, F64] | None:
+        """Copies of (keys, values) of one kind, ordered by key."""
+        table = self._tables.get(kind)
+        return None if table is None else table.columns()
+
+    def count(self) -> int:
+        """Number of variables."""
+        return sum(table.count for table in self._tables.values())
+
+    def _apply(self, delta: Delta) -> None:
+        _put(self._tables, delta.variables)
+        self.revision = delta.revision
+
+
+def tables_of(estimate: Estimate) -> dict[str, Table]:
+    """The tables that hold `estimate`: built apart from those being read."""
+    tables: dict[str, Table] = {}
+    _put(tables, estimate.variables)
+    return tables
+
+
+def _put(tables: dict[str, Table], groups: Iterable[Variables]) -> None:
+    for group in groups:
+        values = group.values
+        if values is None or not len(group.keys):
+            continue
+        table = tables.get(group.kind)
+        if table is None:
+            table = tables[group.kind] = Table(values.shape[1])
+        table.put(np.asarray(group.keys), values)

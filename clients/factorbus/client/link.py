@@ -1,0 +1,149 @@
+"""The only file of the client that touches zenoh: open, ask, listen, be seen.
+
+Every callback is direct (it runs on zenoh's receiving thread, in order of arrival, and costs no Python thread that
+could keep the interpreter from exiting), so what is passed in here may only hand over and return.
+"""
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import zenoh
+from zenoh.handlers import Callback
+
+from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
+from factorbus.proto.problems import BadEndpoint, Unavailable
+
+_ENDPOINT = re.compile(r"[a-z-]+/\S+")
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
+_TIMED_OUT = b"Timeout"
+
+
+class Link:
+    """One session on the bus, as a client."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def ask(self, key: str, payload: bytes, timeout_s: float, done: Callable[[Reply], None]) -> None:
+        """Query `key`; `done` is called once, from zenoh's thread or this one, with whatever came of it.
+
+        The first reply counts and is handed on without waiting for the end of the query.
+        """
+        answered = False
+
+        def finish(reply: Reply) -> None:
+            nonlocal answered
+            if not answered:
+                answered = True
+                done(reply)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            finish(_read(reply))
+
+        handler = Callback(on_reply, drop=lambda: finish(Silence()), indirect=False)
+        try:
+            self._session.get(
+                key, handler, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+            )
+        except zenoh.ZError:  # the session is closed
+            finish(Silence())
+
+    @contextmanager
+    def listening(self, key: str, hear: Callable[[bytes], None]) -> Iterator[None]:
+        """While inside, every publication on `key` goes to `hear`."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            hear(sample.payload.to_bytes())
+
+        subscriber = self._session.declare_subscriber(key, Callback(on_sample, indirect=False))
+        try:
+            yield
+        finally:
+            subscriber.undeclare()
+
+    @contextmanager
+    def watching(self, token: str, see: Callable[[str, bool], None]) -> Iterator[None]:
+        """While inside, `see` gets (key, alive) for every liveliness token below `token`, those present first."""
+
+        def on_change(sample: zenoh.Sample) -> None:
+            see(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        subscriber = self._session.liveliness().declare_subscriber(
+            token, Callback(on_change, indirect=False), history=True
+        )
+        try:
+            yield
+        finally:
+            subscriber.undeclare()
+
+    @contextmanager
+    def present(self, token: str) -> Iterator[None]:
+        """While inside, `token` is alive."""
+        declared = self._session.liveliness().declare_token(token)
+        try:
+            yield
+        finally:
+            declared.undeclare()
+
+    def close(self) -> None:
+        """End the session; questions still out end in silence."""
+        self._session.close()
+
+
+def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any]) -> Link:
+    """A link to the first of `endpoints` that takes us, trying until `timeout_s` has passed.
+
+    settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.
+    Raises BadEndpoint at once, Unavailable when time is up.
+    """
+    config = _config(endpoints, settings)
+    start, pause = time.monotonic(), _FIRST_PAUSE_S
+    while True:
+        try:
+            return Link(zenoh.open(config))
+        except zenoh.ZError:
+            if time.monotonic() - start + pause > timeout_s:
+                raise Unavailable(
+                    " and ".join(endpoints),
+                    timeout_s,
+                    "start a service there with `factorbus serve`, or check the address",
+                ) from None
+        time.sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+
+def _config(endpoints: Sequence[str], settings: Mapping[str, Any]) -> zenoh.Config:
+    for endpoint in endpoints:
+        if not _ENDPOINT.fullmatch(endpoint):
+            raise BadEndpoint(endpoint)
+    config = zenoh.Config()
+    for path, value in (_settings(endpoints) | dict(settings)).items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def _settings(endpoints: Sequence[str]) -> dict[str, Any]:
+    return {
+        "mode": "client",
+        "connect/endpoints": list(endpoints),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # On by default, and drops a large message silently when its receiver is descheduled for 100 ms (zenoh #2628).
+        "transport/shared_memory/enabled": False,
+        # A frozen service is noticed after 3 s, not 10; a restarted one is found within half a second, not four.
+        "transport/link/tx/lease": 3000,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "transport/link/rx/max_message_size": 256 << 20,
+    }
+
+
+def _read(reply: zenoh.Reply) -> Reply:
+    if (answer := reply.ok) is not None:
+        return Answer(answer.payload.to_bytes())
+    error = reply.err
+    payload = error.payload.to_bytes() if error is not None else b""
+    return TimedOut() if payload == _TIMED_OUT else Failure(payload)

@@ -1,0 +1,237 @@
+"""One map, as a client works with it."""
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from factorbus.client.courier import Courier, Errand
+from factorbus.client.draft import Draft, Key
+from factorbus.client.link import Link
+from factorbus.client.mirror import Mirror
+from factorbus.client.ticket import Ticket
+from factorbus.client.window import Window
+from factorbus.proto import codec, keys
+from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
+from factorbus.proto.problems import BadMessage, Problem, Unavailable
+from factorbus.proto.symbols import parse_symbol
+
+
+@dataclass(frozen=True, slots=True)
+class MapRow:
+    """A map as the service lists it."""
+
+    name: str
+    mode: str
+    epoch: int
+    revision: int
+    variables: int
+    factors: int
+
+
+class Map:
+    """A map that this client has joined.  Close it, or use it in `with`.
+
+    Inserts are numbered and sent until they are answered, each exactly once, in order, across restarts of the
+    link.  They belong to the epoch that was joined: if the map is created anew (service restarted, map dropped),
+    they are refused with wrong_epoch until `rejoin`; the mirror follows the new map by itself.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        courier: Courier,
+        client: str,
+        timeout_s: float,
+        window: int,
+        join: Callable[[], MapRow],
+    ) -> None:
+        self._link, self._courier, self._client, self._timeout_s = link, courier, client, timeout_s
+        self._size, self._join = window, join
+        self._stack, self._presence = ExitStack(), ExitStack()
+        self._mirror: Mirror | None = None
+        self._changed = threading.Condition()
+        self._sending = threading.Lock()
+        self._closed = False
+        self._enter(join())
+
+    def __enter__(self) -> "Map":
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        try:
+            if kind is None:
+                self.flush()
+        finally:
+            self.close()
+
+    @property
+    def estimate(self) -> Mirror:
+        """The live estimate.  Raises Unavailable for a map opened with mirror=False."""
+        if self._mirror is None:
+            raise Unavailable(f"the mirror of map {self.name!r}", 0.0, "open the map with mirror=True")
+        return self._mirror
+
+    def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+        """Add `batch` to the map and wait until the estimate includes it.  Raises Refused, Unavailable, Problem."""
+        return self.send(batch, settle=settle, timeout_s=timeout_s).result(timeout_s)
+
+    def settle(self, timeout_s: float | None = None) -> Accepted:
+        """Have the map iterate until it has converged.  Raises Refused, Unavailable."""
+        return self.insert(Batch(), settle=True, timeout_s=timeout_s)
+
+    def send(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Ticket:
+        """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
+
+        Raises Unavailable if the window stays full for `timeout_s`: `batch` is then not sent.
+        """
+        batch = batch.batch() if isinstance(batch, Draft) else batch
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
+            with self._changed:
+                self._wait_for_room(timeout_s)
+            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch), timeout_s)
+            with self._changed:
+                self._window.sent(ticket)
+            self._courier.carry(ticket.errand)
+        return ticket
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Wait until everything sent is answered.
+
+        Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
+        """
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
+                left = len(self._window.unanswered)
+                raise Unavailable(
+                    f"map {self.name!r}", timeout_s, f"{left} inserts are unanswered and still being sent"
+                )
+            refused = self._window.take_refused()
+        for ticket, refusal in refused:
+            if not ticket.seen:
+                raise refusal
+
+    def rejoin(self) -> int:
+        """Join the map as it is now, creating it if need be, and return its epoch; numbering starts again.
+
+        What is unanswered fails with Unavailable: look into the estimate for what the map already has.
+        """
+        with self._sending:
+            self._give_up("the client joined the map anew first; see in the estimate whether it arrived")
+            self._enter(self._join())
+        return self.epoch
+
+    def ask_estimate(self, of: list[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+        """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
+        numbers = None if of is None else np.array([parse_symbol(k) if isinstance(k, str) else k for k in of], np.int64)
+        return self.ask("estimate", codec.encode_keys_asked(numbers), codec.decode_estimate, timeout_s).result()
+
+    def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
+        """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        question = codec.encode_map({"batch": batch, "timeout_s": timeout_s})
+        return self.ask("chi2", question, codec.decode_chi2, timeout_s).result()
+
+    def graph(self, timeout_s: float | None = None) -> Graph:
+        """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
+        return self.ask("graph", codec.encode_map({}), codec.decode_graph, timeout_s).result()
+
+    def stats(self, timeout_s: float | None = None) -> dict[str, Any]:
+        """What the service counts and times about this map.  Raises Refused, Unavailable."""
+        return self.ask("stats", codec.encode_map({}), codec.decode_map, timeout_s).result()
+
+    def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
+        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
+        question = codec.encode_map({"format": format})
+        return self.ask("export", question, _text, timeout_s).result()
+
+    def ask(self, question: str, payload: bytes, decode: Callable[[bytes], Any], timeout_s: float | None = None) -> Any:
+        """A future of the answer to `question`, asked again until `timeout_s` has passed."""
+        what = f"map {self.name!r}, asked for its {question},"
+        key = keys.ask_key(self.name, question)
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
+
+    def close(self) -> None:
+        """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""
+        with self._changed:
+            already, self._closed = self._closed, True
+            self._changed.notify_all()
+        if not already:
+            with self._sending:
+                self._give_up("the map was closed first")
+            self._presence.close()
+            self._stack.close()
+
+    def open_mirror(self) -> None:
+        """Start the live estimate and wait for it.  Raises Unavailable."""
+        mirror = Mirror(self._link, self.name, self._timeout_s)
+        self._mirror = mirror
+        mirror.start(self._stack)
+
+    def watch_owner(self) -> None:
+        """Notice when the map's service goes and comes, so that nothing waits longer than it must."""
+        tokens = f"{keys.map_root(self.name)}/live/service/*"
+        self._stack.enter_context(self._link.watching(tokens, self._see_owner))
+
+    def _enter(self, row: MapRow) -> None:
+        """Take part in the map as `row` describes it, under a name of our own.
+
+        The suffix makes the name that of one run of one handle: sequence numbers start at 1 for a new name, and
+        two processes that use the same name by mistake do not answer for each other.
+        """
+        self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
+        self.client = f"{self._client}-{secrets.token_hex(4)}"
+        self._key = keys.insert_key(self.name, self.client)
+        self._window: Window[Ticket] = Window(self._size)
+        self._presence.close()
+        self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
+
+    def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
+        window = self._window
+
+        def then(_: Errand, result: Any) -> None:
+            if isinstance(result, Accepted) and self._mirror is not None:
+                self._mirror.expect(result.revision, result.epoch)
+            with self._changed:
+                window.answered(insert.sequence, result if isinstance(result, Problem) else None)
+                self._changed.notify_all()
+
+        errand = Errand(f"map {self.name!r}", self._key, codec.encode_insert(insert), codec.decode_accepted, then=then)
+        return Ticket(errand, insert.sequence, timeout_s)
+
+    def _wait_for_room(self, timeout_s: float) -> None:
+        room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)
+        if self._closed:
+            raise Unavailable(f"map {self.name!r}", 0.0, "it was closed here; open it again")
+        if not room:
+            hint = f"{self._size} inserts are unanswered (window={self._size}); this one was not sent"
+            raise Unavailable(f"map {self.name!r}", timeout_s, hint)
+
+    def _give_up(self, hint: str) -> None:
+        """Under `_sending`."""
+        with self._changed:
+            unanswered = self._window.unanswered
+        for ticket in unanswered:
+            waited_s = round(time.perf_counter() - ticket.errand.sent_at, 3)
+            self._courier.abandon(ticket.errand, Unavailable(f"map {self.name!r}", waited_s, hint))
+
+    def _see_owner(self, token: str, alive: bool) -> None:
+        if self._mirror is not None:
+            self._mirror.owner(token, alive)
+        if alive:
+            self._courier.hurry(keys.map_root(self.name) + "/")
+
+
+def _text(data: bytes) -> str:
+    text = codec.decode_map(data).get("text")
+    if not isinstance(text, str):
+        raise BadMessage("export.text", "missing or not a string", "a string")
+    return text

@@ -1,0 +1,296 @@
+"""A live copy of a map's estimate: a thread that applies deltas, and readers that never wait for the bus."""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+from factorbus.client.following import Following, tables_of
+from factorbus.client.link import Link
+from factorbus.client.replies import Answer, Reply, pause
+from factorbus.proto import keys
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_asked
+from factorbus.proto.messages import Delta
+from factorbus.proto.problems import BadSymbol, Problem, Unavailable
+from factorbus.proto.symbols import format_symbol, parse_symbol
+
+log = logging.getLogger("factorbus.client")
+
+# Without deltas for this long the owner is asked for its revision: a last delta that got lost leaves no gap to see.
+PROBE_S = 1.0
+_ANSWER_S = 5.0
+# Messages that may wait for this thread before they are given up for the whole estimate.
+_BACKLOG = 4096
+# A waiting reader has the owner asked this soon.
+_IMPATIENT_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """An estimate at one revision: {kind: (keys (n,), values (n, size))}, ordered by key."""
+
+    epoch: int
+    revision: int
+    columns: dict[str, tuple[I64, F64]]
+
+
+class Mirror:
+    """A map's estimate, kept up to date in the background.  Every method may be called from any thread.
+
+    Values are copies, bit for bit those of the service at `revision`; a reader never sees half a step.
+    `stale` is true from the moment a gap, a restart or silence is noticed until the whole estimate has come
+    again; the last values stay readable meanwhile.
+    """
+
+    def __init__(self, link: Link, map_name: str, timeout_s: float) -> None:
+        self._link, self._map, self._timeout_s = link, map_name, timeout_s
+        self._following = Following()
+        self._changed = threading.Condition()
+        self._callbacks: list[Callable[[Delta], None]] = []
+        self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._owners: set[str] = set()
+        self._expected = 0
+        self._confirmed_at = time.monotonic()
+        self._asking, self._probing, self._silences = False, False, 0
+        self._ask_at = 0.0
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
+
+    def __getitem__(self, key: str | int) -> F64:
+        """The value of a variable, "x12" or its number: a copy.  Raises KeyError."""
+        try:
+            number = parse_symbol(key) if isinstance(key, str) else int(key)
+        except BadSymbol as bad:
+            raise KeyError(bad.message) from None
+        with self._changed:
+            value = self._following.value(number)
+        if value is None:
+            raise KeyError(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
+        return value
+
+    def __contains__(self, key: str | int) -> bool:
+        try:
+            self[key]
+        except KeyError:
+            return False
+        return True
+
+    def __len__(self) -> int:
+        with self._changed:
+            return self._following.count()
+
+    @property
+    def revision(self) -> int:
+        """The revision the values are of."""
+        return self._following.revision
+
+    @property
+    def epoch(self) -> int:
+        """The epoch of the map the values are of; it changes when the map was restarted or created anew."""
+        return self._following.epoch
+
+    @property
+    def stale(self) -> bool:
+        """The service is known to be, or may be, ahead of these values."""
+        return not self._following.live or self._following.revision < self._expected
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the service last confirmed these values: by a delta, or by answering that nothing changed."""
+        return time.monotonic() - self._confirmed_at
+
+    def columns(self, kind: str) -> tuple[I64, F64]:
+        """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises KeyError."""
+        with self._changed:
+            columns = self._following.columns_of(kind)
+        if columns is None:
+            raise KeyError(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
+        return columns
+
+    def snapshot(self) -> Snapshot:
+        """Everything, at one revision."""
+        with self._changed:
+            return Snapshot(self.epoch, self.revision, self._following.columns())
+
+    def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
+        """Until the values are of `revision` or later and not stale.  Raises Unavailable."""
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        end = time.monotonic() + timeout_s
+        with self._changed:
+            if self._changed.wait_for(lambda: self._there(revision), min(_IMPATIENT_S, timeout_s)):
+                return
+            self._inbox.put(("probe", None))
+            if self._changed.wait_for(lambda: self._there(revision), max(end - time.monotonic(), 0.0)):
+                return
+        state = "stale" if self.stale else "up to date"
+        hint = (
+            f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
+        )
+        raise Unavailable(f"revision {revision} of map {self._map!r}", timeout_s, hint)
+
+    def on_delta(self, callback: Callable[[Delta], None]) -> Callable[[], None]:
+        """Have `callback` called with every delta after it is applied; returns what takes it off again.
+
+        It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronisation it gets
+        one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.
+        """
+        with self._changed:
+            self._callbacks = [*self._callbacks, callback]
+        return lambda: self._forget(callback)
+
+    def start(self, stack: ExitStack) -> None:
+        """Subscribe, then ask; `stack` gets what ends it.  Returns when the estimate is here.  Raises Unavailable."""
+        stack.callback(self._stop)
+        self._thread.start()
+        for key, word in ((keys.delta_key(self._map), "delta"), (keys.keyframe_key(self._map), "keyframe")):
+            stack.enter_context(self._link.listening(key, lambda data, word=word: self._hear(word, data)))
+        self._inbox.put(("ask", None))
+        self.wait_for(0)
+
+    def owner(self, token: str, alive: bool) -> None:
+        """A service came to own the map, or went: from the bus's thread."""
+        self._inbox.put(("owner", (token, alive)))
+
+    def expect(self, revision: int, epoch: int) -> None:
+        """`revision` exists: until it is here, the values are stale."""
+        if epoch == self._following.epoch:
+            self._expected = max(self._expected, revision)
+
+    # From here on: callbacks of the bus, which only hand over, and the mirror's own thread.
+
+    def _hear(self, word: str, data: bytes) -> None:
+        if self._inbox.qsize() < _BACKLOG:
+            self._inbox.put((word, data))
+        # Otherwise it is lost, and the next one that fits shows the gap.
+
+    def _there(self, revision: int) -> bool:
+        return self._following.live and self._following.revision >= revision
+
+    def _forget(self, callback: Callable[[Delta], None]) -> None:
+        with self._changed:
+            self._callbacks = [each for each in self._callbacks if each is not callback]
+
+    def _stop(self) -> None:
+        self._inbox.put(("stop", None))
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing:
+            try:
+                word, content = self._inbox.get(timeout=self._patience())
+            except queue.Empty:
+                word, content = "probe", None
+            try:
+                self._handle(word, content)
+            except Problem as unreadable:
+                log.error("map %s: %s from the service: %s", self._map, word, unreadable)
+                self._lose()
+            if not self._following.live:
+                self._ask()
+
+    def _patience(self) -> float:
+        if self._following.live or self._asking:
+            return PROBE_S
+        return min(max(self._ask_at - time.monotonic(), 0.0), PROBE_S)
+
+    def _handle(self, word: str, content: Any) -> None:
+        match word:
+            case "delta":
+                self._apply_delta(decode_delta(content))
+            case "keyframe":
+                self._adopt(content)
+            case "estimate":
+                self._take_estimate(content)
+            case "probed":
+                self._take_probe(content)
+            case "owner":
+                self._take_owner(*content)
+            case "probe" if self._following.live and not self._probing:
+                self._probing = True
+                self._query(encode_keys_asked(_NO_KEYS), "probed")
+            case "stop":
+                self._closing = True
+
+    def _apply_delta(self, delta: Delta) -> None:
+        with self._changed:
+            news = self._following.delta(delta)
+            self._confirm()
+        self._tell(news)
+
+    def _adopt(self, data: bytes) -> None:
+        estimate = decode_estimate(data)
+        if (estimate.epoch, estimate.revision) == (self.epoch, self.revision) and self._following.live:
+            return
+        tables = tables_of(estimate)  # outside the lock: readers do not wait for it
+        with self._changed:
+            if estimate.epoch != self._following.epoch:
+                self._expected = 0
+            news = self._following.estimate(estimate, tables)
+            self._confirm()
+        self._tell(news)
+
+    def _take_estimate(self, reply: Reply) -> None:
+        self._asking = False
+        if isinstance(reply, Answer):
+            self._adopt(reply.payload)
+        if self._following.live:
+            self._silences = 0
+        else:
+            self._silences += 1
+            self._ask_at = time.monotonic() + pause(self._silences)
+
+    def _take_probe(self, reply: Reply) -> None:
+        self._probing = False
+        if not isinstance(reply, Answer):
+            self._lose()
+            return
+        told = decode_estimate(reply.payload)
+        with self._changed:
+            self._following.probe(told.epoch, told.revision)
+            self._confirm()
+
+    def _take_owner(self, token: str, alive: bool) -> None:
+        if alive:
+            self._owners.add(token)
+            self._ask_at = 0.0
+            self._handle("probe", None)
+        else:
+            self._owners.discard(token)
+            if not self._owners:
+                self._lose()
+
+    def _lose(self) -> None:
+        with self._changed:
+            self._following.lost()
+
+    def _confirm(self) -> None:
+        """Under the lock, after a word from the service."""
+        if self._following.live:
+            self._confirmed_at = time.monotonic()
+            self._changed.notify_all()
+
+    def _tell(self, news: list[Delta]) -> None:
+        for delta in news:
+            for callback in self._callbacks:
+                try:
+                    callback(delta)
+                except Exception:
+                    log.exception("map %s: on_delta callback failed at revision %d", self._map, delta.revision)
+
+    def _ask(self) -> None:
+        if not self._asking and time.monotonic() >= self._ask_at and not self._closing:
+            self._asking = True
+            self._query(encode_keys_asked(None), "estimate")
+
+    def _query(self, question: bytes, word: str) -> None:
+        key = keys.ask_key(self._map, "estimate")
+        self._link.ask(key, question, _ANSWER_S, lambda reply: self._inbox.put((word, reply)))
+
+
+_NO_KEYS: Any = ()

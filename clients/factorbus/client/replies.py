@@ -1,0 +1,81 @@
+"""What can come of asking somebody on the bus, and what to make of it.  Pure.
+
+Silence (no reply at all) has four causes that look the same: nobody owns the key, access control said no, the
+message was over a limit of the bus, or the service died.  So it is asked again, with the same sequence number.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from factorbus.proto.codec import decode_problem
+from factorbus.proto.problems import Problem
+
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
+_DEFAULT_BUSY_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer's bytes."""
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A problem's bytes."""
+
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """Nobody replied."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedOut:
+    """Somebody has the question and has not replied in time."""
+
+
+Reply: TypeAlias = Answer | Failure | Silence | TimedOut
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """Ask again after `pause_s`."""
+
+    pause_s: float
+    because: str
+
+
+def judge(reply: Reply, attempt: int) -> bytes | Problem | Again:
+    """What `reply` to the `attempt`-th try (from 1) means: the answer, a final problem, or another try."""
+    match reply:
+        case Answer(payload):
+            return payload
+        case Silence():
+            return Again(pause(attempt), "nobody replies")
+        case TimedOut():
+            return Again(0.0, "the service has the message and has not answered yet")
+        case Failure(payload):
+            return _judge_failure(payload, attempt)
+
+
+def pause(attempt: int) -> float:
+    """Seconds to wait after the `attempt`-th silence: 0.1, 0.2, 0.4, 0.8, 1, 1, ..."""
+    return min(_FIRST_PAUSE_S * 2 ** min(attempt - 1, 10), _LONGEST_PAUSE_S)
+
+
+def _judge_failure(payload: bytes, attempt: int) -> Problem | Again:
+    try:
+        refused = decode_problem(payload)
+    except Problem as unreadable:
+        return unreadable
+    if refused.code == "busy":
+        wanted = refused.detail.get("retry_after_s")
+        pause_s = float(wanted) if isinstance(wanted, int | float) and 0 <= wanted <= 60 else _DEFAULT_BUSY_S
+        return Again(pause_s, refused.message)
+    if refused.code == "shutting_down":
+        return Again(pause(attempt), refused.message)
+    return refused

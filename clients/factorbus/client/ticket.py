@@ -1,0 +1,54 @@
+"""What stands for an insert that is on its way."""
+
+from concurrent.futures import Future
+
+from factorbus.client.courier import Errand
+from factorbus.proto.messages import Accepted
+from factorbus.proto.problems import Unavailable
+
+
+class Ticket:
+    """An insert that was sent: it will be delivered once, as long as its map is open here and keeps its epoch."""
+
+    def __init__(self, errand: Errand, sequence: int, timeout_s: float) -> None:
+        self.errand = errand
+        self.sequence = sequence
+        self.seen = False
+        self._timeout_s = timeout_s
+
+    @property
+    def future(self) -> Future[Accepted]:
+        """For callbacks and asyncio; looking at the answer through it counts as having seen it."""
+        self.seen = True
+        return self.errand.future
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """Seconds from the first sending to the answer; None while there is none."""
+        return self.errand.answered_at - self.errand.sent_at if self.done() else None
+
+    def done(self) -> bool:
+        """There is an answer."""
+        return self.errand.future.done()
+
+    def result(self, timeout_s: float | None = None) -> Accepted:
+        """Wait for the answer.  Raises Refused (the map is as it was), or NoAnswerYet, an Unavailable.
+
+        NoAnswerYet does not take the insert back: it goes on being sent with its number.  Wait again, or `flush`;
+        do not insert it anew.
+        """
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        try:
+            return self.future.result(timeout_s)
+        except TimeoutError:
+            self.seen = False
+            raise NoAnswerYet(self, self.errand.what, timeout_s) from None
+
+
+class NoAnswerYet(Unavailable):
+    """An insert's answer did not come in time; `ticket` still stands for it."""
+
+    def __init__(self, ticket: Ticket, what: str, waited_s: float) -> None:
+        self.ticket = ticket
+        hint = "it keeps being sent with its number: wait on .ticket.result() or flush(), do not insert it again"
+        super().__init__(f"{what}, insert {ticket.sequence},", waited_s, hint)

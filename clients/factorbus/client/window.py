@@ -1,0 +1,59 @@
+"""Sequence numbers and what is still unanswered of one client on one map.  Pure: no bus, no clock, no lock.
+
+Inserts are numbered 1, 2, 3, ...; the same number always goes with the same insert, however often it is sent, so
+the service takes each exactly once.  At most `size` are unanswered at a time.
+"""
+
+from typing import Generic, TypeVar
+
+from factorbus.proto.problems import Problem
+
+T = TypeVar("T")
+
+
+class Window(Generic[T]):
+    """The inserts in flight; T is whatever stands for one."""
+
+    def __init__(self, size: int) -> None:
+        if size < 1:
+            raise ValueError(f"window of {size} inserts; wanted at least 1")
+        self.size = size
+        self.last = 0
+        self._unanswered: dict[int, T] = {}
+        self._refused: list[tuple[T, Problem]] = []
+
+    @property
+    def full(self) -> bool:
+        """No further insert may be sent now."""
+        return len(self._unanswered) >= self.size
+
+    @property
+    def idle(self) -> bool:
+        """Everything sent is answered."""
+        return not self._unanswered
+
+    @property
+    def unanswered(self) -> list[T]:
+        """What is in flight, oldest first."""
+        return list(self._unanswered.values())
+
+    @property
+    def next(self) -> int:
+        """The sequence number of the next insert."""
+        return self.last + 1
+
+    def sent(self, item: T) -> None:
+        """`item` is on its way as number `next`."""
+        self.last += 1
+        self._unanswered[self.last] = item
+
+    def answered(self, sequence: int, refusal: Problem | None) -> None:
+        """`sequence` has its answer."""
+        item = self._unanswered.pop(sequence, None)
+        if refusal is not None and item is not None:
+            self._refused.append((item, refusal))
+
+    def take_refused(self) -> list[tuple[T, Problem]]:
+        """What was refused since the last call, and why, oldest answer first."""
+        refused, self._refused = self._refused, []
+        return refused
