@@ -28,9 +28,29 @@ import llvmlite
 import llvmlite.binding
 import numba
 import numpy as np
-from numba.core import caching, config, event
+from llvmlite import ir
+from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
+from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+__all__ = [
+    "BOUNDSCHECK",
+    "DISABLED",
+    "F64",
+    "I64",
+    "cache_folder",
+    "cgutils",
+    "compiled_seconds",
+    "inline_kernel",
+    "intrinsic",
+    "ir",
+    "iter_compile",
+    "kernel",
+    "sources_hash",
+    "types",
+    "vector_lanes",
+]
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -69,6 +89,14 @@ def iter_compile(*kernels: Any) -> Iterator[str]:
         yield function.__name__
         if not DISABLED:
             _compile_declared(function)
+
+
+def vector_lanes() -> int:
+    """Doubles in the widest vector register of this processor."""
+    features = llvmlite.binding.get_host_cpu_features()
+    if features.get("avx512f"):
+        return 8
+    return 4 if features.get("avx") else 2
 
 
 def cache_folder() -> Path:
