@@ -45,6 +45,16 @@ class _Mentions:
     lines: I64
 
 
+def numbered_apart(vertices: list[VertexColumns]) -> bool:
+    """Whether an id has a vertex line as a pose and one as a point, as in files that GTSAM writes."""
+    empty = np.empty(0, np.int64)
+    poses, points = (
+        np.concatenate([empty, *(v.ids for v in vertices if v.kind.startswith("point") == is_point)])
+        for is_point in (False, True)
+    )
+    return bool(np.isin(poses, points).any())
+
+
 def assembled(
     file: str,
     one_numbering: bool,
@@ -98,10 +108,14 @@ def _clash(mentions: _Mentions, earlier: int, row: int) -> str:
 def _fixed_rows(file: str, fixes: tuple[I64, I64], ids: I64) -> I64:
     """Places of the fixed ids in `ids`."""
     wanted, lines = fixes
-    order = np.argsort(ids)
+    order = np.argsort(ids, kind="stable")
     at = np.minimum(np.searchsorted(ids[order], wanted), max(len(ids) - 1, 0))
     unknown = ids[order][at] != wanted if len(ids) else np.ones(len(wanted), bool)
     refuse_first(file, lines, unknown, lambda row: f"FIX {wanted[row]}, which is no vertex", "the id of a vertex")
+    both = np.searchsorted(ids[order], wanted, "right") - np.searchsorted(ids[order], wanted) > 1
+    refuse_first(
+        file, lines, both, lambda row: f"FIX {wanted[row]}, which is a pose and a point", "an id of one vertex"
+    )
     return order[at]
 
 

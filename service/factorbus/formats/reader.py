@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorbus.formats.assemble import EdgeColumns, VertexColumns, assembled
+from factorbus.formats.assemble import EdgeColumns, VertexColumns, assembled, numbered_apart
 from factorbus.formats.errors import FormatError, refuse_first
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.lines import Bucket, read_buckets
@@ -29,9 +29,14 @@ def read(path: str | os.PathLike[str], dialect: str | None = None) -> GraphFile:
     Keys are symbol("x", id) for poses and symbol("l", id) for points.  Quaternions are normalised; angles stay as
     they are.  Raises FormatError, which names the file and the line.
     """
+    with np.errstate(all="ignore"):  # what overflows is not finite or not positive definite, and refused as such
+        return _read(Path(path), dialect)
+
+
+def _read(path: Path, dialect: str | None) -> GraphFile:
     file = str(path)
-    buckets = read_buckets(Path(path))
-    chosen = sniffed(Path(path), buckets) if dialect is None else _named(file, dialect)
+    buckets = read_buckets(path)
+    chosen = sniffed(path, buckets) if dialect is None else _named(file, dialect)
     _refuse_foreign(file, chosen, buckets)
     offsets = _identity_offsets(file, buckets)
     vertices = [
@@ -39,9 +44,12 @@ def read(path: str | os.PathLike[str], dialect: str | None = None) -> GraphFile:
     ]
     edges = [_edges(file, name, chosen.edges[name], buckets[name], offsets) for name in buckets if name in chosen.edges]
     fixes = _fixes(file, buckets["FIX"]) if "FIX" in buckets else None
-    batch, lines = assembled(file, chosen.one_numbering, vertices, edges, fixes)
-    notes = tuple(f"{len(buckets[name].rests)} {note}" for name, note in chosen.unspoken.items() if name in buckets)
-    return GraphFile(file, chosen.name, batch, lines, notes)
+    apart = chosen.one_numbering and numbered_apart(vertices)
+    batch, lines = assembled(file, chosen.one_numbering and not apart, vertices, edges, fixes)
+    notes = [f"{len(buckets[name].rests)} {note}" for name, note in chosen.unspoken.items() if name in buckets]
+    if apart:
+        notes.append("poses and points are numbered separately")
+    return GraphFile(file, chosen.name, batch, lines, tuple(notes))
 
 
 def _named(file: str, dialect: str) -> Dialect:

@@ -239,6 +239,6 @@ def _parts(count: int, ends: list[I64]) -> list[I64]:
 
 
 def _shown_part(names: Roster, part: I64) -> str:
-    keys = np.sort(names.keys[part])
+    keys = names.keys[part[np.lexsort((names.keys[part], ~names.is_pose[part]))]]  # poses first
     ends = [format_symbol(int(key)) for key in (keys[0], keys[-1])]
     return ends[0] if len(part) == 1 else f"{ends[0]} .. {ends[1]} ({len(part)} variables)"

@@ -1,6 +1,7 @@
 """Information matrices as files have them, turned into packed upper triangles of positive definite matrices."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorbus.formats.errors import refuse_first
 from factorbus.proto.arrays import F64, I64
@@ -25,13 +26,13 @@ def checked_information(file: str, name: str, lines: I64, packed: F64, dim: int)
     return packed
 
 
-def positive_definite(packed: F64, dim: int) -> np.ndarray:
+def positive_definite(packed: F64, dim: int) -> NDArray[np.bool]:
     """Whether each matrix has a Cholesky factor, for all matrices at once.
 
     in   packed (n, dim (dim + 1) / 2)   out  (n,) bool
     """
     entry = {(i, j): packed[:, k] for k, (i, j) in enumerate(_upper(dim))}
-    good = np.ones(len(packed), bool)
+    good: NDArray[np.bool] = np.isfinite(packed).all(axis=1, keepdims=True)[:, 0]
     with np.errstate(all="ignore"):  # rows already found bad may divide by zero
         for k in range(dim):
             good &= entry[k, k] > 0
@@ -71,4 +72,6 @@ def _upper(dim: int) -> list[tuple[int, int]]:
 
 def _smallest_eigenvalue(packed: F64, dim: int) -> float:
     upper = unpacked_triangle(packed[None], dim)[0]
+    if not np.isfinite(upper).all():  # squares of very large roots
+        return float("nan")
     return float(np.linalg.eigvalsh(upper, UPLO="U")[0])

@@ -1,0 +1,113 @@
+"""Every way in which a file is wrong names the file, the line, what stands there and what was wanted."""
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from factorbus.formats import FormatError, read
+
+INFO3 = "1 0 0 1 0 1"
+INFO6 = " ".join("1" if i == j else "0" for i in range(6) for j in range(i, 6))
+GOOD = f"EDGE_SE2 0 1 1 0 0 {INFO3}\n"
+
+WRONG = {
+    "unknown record": (f"{GOOD}EDGE_SE4 0 1\n", 2, "unknown record 'EDGE_SE4'"),
+    "unknown record first": ("HELLO 1 2\n", 1, "unknown record 'HELLO'"),
+    "record of another dialect": (f"{GOOD}\nVERTEX_FISH 0 1 1\n", 3, "unknown record"),
+    "prior without angle": (f"{GOOD}EDGE_PRIOR_SE2_XY 0 1 1 1 0 1\n", 2, "no factor kind"),
+    "bearing alone": (f"{GOOD}EDGE_BEARING_SE2_XY 0 1 1 1\n", 2, "bearing without a range"),
+    "3D TORO": ("VERTEX3 0 0 0 0 0 0 0\n", 1, "convert the file to g2o"),
+    "too few fields": (f"{GOOD}EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n", 2, "10 fields; wanted 11"),
+    "too many fields": (f"{GOOD}# hm\nEDGE_SE2 0 1 1 0 0 {INFO3} 1\n", 3, "12 fields; wanted 11"),
+    "no fields": (f"{GOOD}EDGE_SE2\n", 2, "0 fields; wanted 11"),
+    "fields that even out": (f"EDGE_SE2 0 1 1 0 0 1 0 0 1 0\nEDGE_SE2 1 2 1 0 0 {INFO3} 1\n", 1, "10 fields"),
+    "not a number": (f"{GOOD}EDGE_SE2 1 2 one 0 0 {INFO3}\n", 2, "'one'"),
+    "two numbers in one": (f"{GOOD}EDGE_SE2 1 2 1-2 0 0 {INFO3}\n", 2, "'1-2'"),
+    "underscore": (f"EDGE_SE2 1 2 1_0 0 0 {INFO3}\n", 1, "'1_0'"),
+    "comma": (f"{GOOD}{GOOD}EDGE_SE2 1 2 1,5 0 0 {INFO3}\n", 3, "'1,5'"),
+    "nan": (f"{GOOD}EDGE_SE2 1 2 nan 0 0 {INFO3}\n", 2, "not finite"),
+    "infinite": (f"{GOOD}VERTEX_SE2 1 0 inf 0\n", 2, "not finite"),
+    "overflow": (f"{GOOD}EDGE_SE2 1 2 1e999 0 0 {INFO3}\n", 2, "not finite"),
+    "id is not whole": (f"{GOOD}EDGE_SE2 1 2.5 1 0 0 {INFO3}\n", 2, "id '2.5'"),
+    "id below 0": (f"{GOOD}EDGE_SE2 -1 2 1 0 0 {INFO3}\n", 2, "id '-1'"),
+    "id too large": (f"{GOOD}EDGE_SE2 1 72057594037927936 1 0 0 {INFO3}\n", 2, "id '72057594037927936'"),
+    "indefinite": (f"{GOOD}EDGE_SE2 1 2 1 0 0 1 2 0 1 0 1\n", 2, "not positive definite (smallest eigenvalue -1)"),
+    "zero information": (f"{GOOD}EDGE_SE2 1 2 1 0 0 0 0 0 0 0 0\n", 2, "not positive definite"),
+    "indefinite in space": (f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {INFO6[:-1]}-1\n", 1, "not positive definite"),
+    "singular root": ("ODOMETRY 0 1 1 0 0 1 0 0 1 0 0\n", 1, "not positive definite"),
+    "root too large": ("ODOMETRY 0 1 1 0 0 1e200 0 0 1 0 1\n", 1, "not positive definite"),
+    "quaternion": (f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0.5 0.5 {INFO6}\n", 1, "quaternion of norm 0.707107"),
+    "zero quaternion": ("VERTEX_SE3:QUAT 0 1 0 0 0 0 0 0\n", 1, "quaternion of norm 0"),
+    "self-loop": (f"{GOOD}EDGE_SE2 3 3 1 0 0 {INFO3}\n", 2, "from 3 to itself"),
+    "vertex twice": (f"VERTEX_SE2 0 0 0 0\n{GOOD}VERTEX_SE2 0 0 1 0\n", 3, "other values than on line 1"),
+    "pose and point": (f"{GOOD}EDGE_SE2_XY 0 1 1 1 1 0 1\n", 2, "1 as a 2D point, which is a 2D pose on line 1"),
+    "plane and space": (f"{GOOD}EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 {INFO6}\n", 2, "which is a 2D pose on line 1"),
+    "FIX of nothing": (f"{GOOD}FIX 7\n", 2, "FIX 7, which is no vertex"),
+    "FIX without id": (f"{GOOD}FIX\n", 2, "FIX with 0 fields"),
+    "FIX alone": ("FIX 0\n", 1, "which is no vertex"),
+    "FIX of two": ("VERTEX_SE2 0 0 0 0\nVERTEX_XY 0 1 1\nFIX 0\n", 3, "a pose and a point"),
+    "offset missing": ("EDGE_SE3_TRACKXYZ 0 1 3 1 2 3 1 0 0 1 0 1\n", 1, "parameter 3, which no line declares"),
+    "offset moved": (
+        "PARAMS_SE3OFFSET 3 0 0 1 0 0 0 1\nEDGE_SE3_TRACKXYZ 0 1 3 1 2 3 1 0 0 1 0 1\n",
+        2,
+        "not the identity",
+    ),
+    "sigma": ("BR 0 1 0.1 4 0 1\n", 1, "standard deviations"),
+    "range": ("BR 0 1 0.1 -4 1 1\n", 1, "range -4"),
+    "zero byte": (f"{GOOD}EDGE_SE2 0 1 1 0 0 1\x00\n", 2, "a zero byte"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_error_names_file_and_line(tmp_path: Path, case: str) -> None:
+    text, line, words = WRONG[case]
+    path = tmp_path / "wrong.g2o"
+    path.write_bytes(text.encode())
+    with pytest.raises(FormatError) as caught:
+        read(path)
+    problem = caught.value
+    assert (problem.code, problem.file, problem.line) == ("bad_file", str(path), line)
+    assert str(problem).startswith(f"{path}:{line}: ")
+    assert words in str(problem)
+    assert "; wanted " in str(problem)
+    assert problem.detail == {"file": str(path), "line": line}
+
+
+def test_first_wrong_line_of_several_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "wrong.g2o"
+    bad = "EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1\n"
+    path.write_text(GOOD * 3 + bad + GOOD + bad)
+    with pytest.raises(FormatError, match=":4: "):
+        read(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n  \n", b"# only words\n"])
+def test_empty_file(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "empty.g2o"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="no record at all"):
+        read(path)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="No such file"):
+        read(tmp_path / "nowhere.g2o")
+    with pytest.raises(FormatError, match="cannot be read"):
+        read(tmp_path)
+
+
+def test_damaged_gzip(tmp_path: Path) -> None:
+    whole = gzip.compress(GOOD.encode() * 50)
+    for content in (whole[:-9], whole[:20], whole[:12] + b"\xff\xff" + whole[14:]):
+        path = tmp_path / "damaged.g2o.gz"
+        path.write_bytes(content)
+        with pytest.raises(FormatError, match="cannot be read"):
+            read(path)
+
+
+def test_unknown_dialect(tmp_path: Path) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text(GOOD)
+    with pytest.raises(FormatError, match="dialect 'g3o'; wanted one of g2o, toro, isam"):
+        read(path, "g3o")

@@ -1,0 +1,100 @@
+"""Files that were damaged on the way are read or refused with FormatError, never anything else."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from factorbus.formats import FormatError, read
+
+INFO3 = "1 0 0 1 0 1"
+INFO6 = " ".join("1" if i == j else "0" for i in range(6) for j in range(i, 6))
+FILES = [
+    "# plane\nVERTEX_SE2 0 0 0 0\nVERTEX_XY 3 1 1\nFIX 0\n"
+    f"EDGE_SE2 0 1 1 0 0.5 {INFO3}\nEDGE_SE2 1 2 1 0 -0.5 {INFO3}\nEDGE_SE2_XY 2 3 1 2 1 0 1\n"
+    f"EDGE_PRIOR_SE2 1 0 0 0 {INFO3}\n",
+    f"PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 0 1 2 3 0 0 0 1\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {INFO6}\n"
+    f"EDGE_SE3_TRACKXYZ 0 7 0 1 2 3 1 0 0 1 0 1\nEDGE_SE3_PRIOR 1 0 1 2 3 0 0 0 1 {INFO6}\n",
+    "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\nEQUIV 0 1\nBR 0 5 0.1 2 0.1 0.1\n",
+    f"ODOMETRY 0 1 1 0 0 {INFO3}\nLANDMARK 1 0 5 6 1 0 1\nEDGE3 5 6 1 2 3 0.1 0.2 0.3 {INFO6}\n",
+]
+NUMBERS = [
+    "0",
+    "1",
+    "-1",
+    "2",
+    "1e3",
+    "1e200",
+    "1e400",
+    "-inf",
+    "nan",
+    "0x1",
+    "1_0",
+    "1.5",
+    "+7",
+    ".",
+    "-",
+    "e",
+    "99999999999999999999999",
+    "72057594037927935",
+]
+NAMES = [
+    "FIX",
+    "EDGE2",
+    "EDGE3",
+    "EDGE_SE2",
+    "VERTEX2",
+    "EDGE_SE3:QUAT",
+    "VERTEX_XY",
+    "\x00",
+    "\u0661",
+    "\ufeff",
+    "#",
+    "é",
+]
+WORDS = st.sampled_from(NUMBERS + NAMES)
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> bytes:
+    """A good file after a few changes: words replaced, doubled or lost, lines cut, swapped or repeated, bytes."""
+    lines = [line.split(" ") for line in draw(st.sampled_from(FILES)).splitlines()]
+    for _ in range(draw(st.integers(1, 4))):
+        row = draw(st.integers(0, len(lines) - 1))
+        place = draw(st.integers(0, max(len(lines[row]) - 1, 0)))
+        match draw(st.sampled_from(["replace", "insert", "drop", "repeat", "swap", "take"])):
+            case "replace":
+                lines[row][place : place + 1] = [draw(WORDS)]
+            case "insert":
+                lines[row].insert(place, draw(WORDS))
+            case "drop":
+                del lines[row][place : place + 1]
+            case "repeat":
+                lines.append(list(lines[row]))
+            case "swap":
+                other = draw(st.integers(0, len(lines) - 1))
+                lines[row], lines[other] = lines[other], lines[row]
+            case "take":
+                lines[row] = lines[row][:place]
+    content = "\n".join(" ".join(words) for words in lines).encode()
+    if draw(st.booleans()) and content:
+        place = draw(st.integers(0, len(content) - 1))
+        content = content[:place] + draw(st.binary(max_size=3)) + content[place + draw(st.integers(0, 3)) :]
+    return content
+
+
+@settings(max_examples=400)
+@given(content=damaged() | st.binary(max_size=60))
+def test_damaged_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    path = tmp_path_factory.getbasetemp() / "damaged.g2o"
+    path.write_bytes(content)
+    problem = None
+    try:
+        graph = read(path)
+        count = sum(step.factor_count for step in graph.steps())
+    except FormatError as caught:
+        problem = caught
+    if problem is None:
+        assert count == graph.batch.factor_count
+    else:
+        assert problem.file == str(path)
+        assert problem.line is None or 1 <= problem.line <= content.count(b"\n") + 1

@@ -1,0 +1,168 @@
+"""Writing g2o and TUM, and that what was written is read back bit for bit."""
+
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factorbus.formats import FormatError, g2o_text, read, tum_text, write_g2o, write_tum
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.symbols import symbol
+
+WRITABLE = [name for name in FACTOR_KINDS if name not in ("bearing_range_se2", "prior_point2")]
+NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
+
+
+def letter(kind: str) -> str:
+    return "l" if kind.startswith("point") else "x"
+
+
+def unit(row: np.ndarray) -> np.ndarray:
+    """The row with a unit quaternion at its end, if it is an SE3 pose."""
+    if len(row) == 7:
+        size = np.abs(row[3:]).max()
+        quat = row[3:] if 1e-3 < size < 1e12 else np.array([0, 0, 0, 1.0])
+        row[3:] = quat / np.linalg.norm(quat)
+    return row
+
+
+@st.composite
+def batches(draw: st.DrawFn) -> Batch:
+    """Graphs as `read` gives them: per kind fixed ones first, those with a value before those without."""
+    ids = iter(draw(st.permutations(range(40))))
+    groups, keys = [], {}
+    for kind, facts in VARIABLE_KINDS.items():
+        keys[kind] = []
+        for fixed, valued in ((True, True), (False, True)):
+            mine = [symbol(letter(kind), next(ids)) for _ in range(draw(st.integers(0, 3)))]
+            if mine:
+                values = np.array(
+                    [unit(np.array(draw(st.lists(NUMBERS, min_size=facts.size, max_size=facts.size)))) for _ in mine]
+                )
+                groups.append(Variables(kind, np.array(mine), values if valued else None, fixed))
+                keys[kind] += mine
+    factors = []
+    for name in WRITABLE:
+        kind = FACTOR_KINDS[name]
+        free = [keys[end] for end in kind.connects]
+        if all(free) and (free[0] != free[-1] or len(free[0]) > 1):
+            count = draw(st.integers(0, 3))
+            rows = [draw(st.permutations(free[0]))[:1] + draw(st.permutations(free[-1]))[:1] for _ in range(count)]
+            rows = [row[: len(free)] for row in rows if row[0] != row[1]]
+            if rows:
+                measured = [
+                    unit(np.array(draw(st.lists(NUMBERS, min_size=kind.size, max_size=kind.size)))) for _ in rows
+                ]
+                root = [draw(st.lists(st.floats(-3, 3), min_size=kind.dim**2, max_size=kind.dim**2)) for _ in rows]
+                full = [np.reshape(r, (kind.dim, kind.dim)) for r in root]
+                packed = [(m.T @ m + np.eye(kind.dim))[np.triu_indices(kind.dim)] for m in full]
+                factors.append(Factors(name, np.array(rows), np.array(measured), np.array(packed)))
+    return Batch(tuple(groups), tuple(sorted(factors, key=lambda group: list(FACTOR_KINDS).index(group.kind))))
+
+
+def assert_same(one: Batch, other: Batch) -> None:
+    assert [(g.kind, g.fixed) for g in one.variables] == [(g.kind, g.fixed) for g in other.variables]
+    for a, b in zip(one.variables, other.variables, strict=True):
+        np.testing.assert_array_equal(a.keys, b.keys)
+        assert (a.values is None) == (b.values is None)
+        if a.values is not None and b.values is not None:
+            assert a.values.tobytes() == b.values.tobytes()
+    assert [g.kind for g in one.factors] == [g.kind for g in other.factors]
+    for a, b in zip(one.factors, other.factors, strict=True):
+        np.testing.assert_array_equal(a.keys, b.keys)
+        assert a.measured.tobytes() == b.measured.tobytes()
+        assert a.information.tobytes() == b.information.tobytes()
+
+
+@given(batch=batches().filter(lambda batch: batch.variable_count > 0))
+def test_what_is_written_is_read_back_bit_for_bit(tmp_path_factory: pytest.TempPathFactory, batch: Batch) -> None:
+    path = tmp_path_factory.mktemp("round") / "a.g2o"
+    write_g2o(path, batch)
+    assert_same(read(path).batch, batch)
+
+
+def small() -> Batch:
+    poses = Variables("se2", np.array([symbol("x", 0), symbol("x", 1)]), np.array([[0, 0, 0], [1, 0.5, math.pi / 2]]))
+    point = Variables("point2", np.array([symbol("l", 7)]), None, fixed=True)
+    edge = Factors(
+        "between_se2",
+        np.array([[symbol("x", 0), symbol("x", 1)]]),
+        np.array([[1, 0.5, 0.1]]),
+        np.array([[1, 0, 0, 1, 0, 1.0]]),
+    )
+    sight = Factors(
+        "landmark_se2", np.array([[symbol("x", 1), symbol("l", 7)]]), np.array([[2, -0.0]]), np.array([[1, 0, 1.0]])
+    )
+    return Batch((poses, point), (edge, sight))
+
+
+def test_text_of_g2o() -> None:
+    assert g2o_text(small()) == (
+        "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0.5 1.5707963267948966\nFIX 7\n"
+        "EDGE_SE2 0 1 1 0.5 0.1 1 0 0 1 0 1\nEDGE_SE2_XY 1 7 2 -0 1 0 1\n"
+    )
+    out = io.StringIO()
+    write_g2o(out, small())
+    assert out.getvalue() == g2o_text(small())
+
+
+def test_keys_that_share_an_index_are_numbered_anew(tmp_path: Path) -> None:
+    batch = small()
+    shared = np.array([symbol("l", 1)])
+    batch = Batch(
+        (batch.variables[0], Variables("point2", shared, np.array([[3.0, 4.0]]))),
+        (
+            Factors(
+                "landmark_se2", np.array([[symbol("x", 1), shared[0]]]), np.array([[2, 1.0]]), np.array([[1, 0, 1.0]])
+            ),
+        ),
+    )
+    text = g2o_text(batch)
+    assert "VERTEX_XY 2 3 4\n" in text
+    assert "EDGE_SE2_XY 1 2 2 1 1 0 1\n" in text
+    path = tmp_path / "a.g2o"
+    path.write_text(text)
+    assert read(path).batch.variable_count == 3
+
+
+@pytest.mark.parametrize("kind", ["bearing_range_se2", "prior_point2"])
+def test_what_g2o_has_no_record_for_is_refused_before_writing(tmp_path: Path, kind: str) -> None:
+    facts = FACTOR_KINDS[kind]
+    factor = Factors(kind, np.zeros((1, len(facts.connects)), np.int64), np.ones((1, 2)), np.array([[1, 0, 1.0]]))
+    path = tmp_path / "a.g2o"
+    with pytest.raises(FormatError, match=f"1 factor.* of kind {kind}; wanted only between_se2"):
+        write_g2o(path, Batch((), (factor,)))
+    assert not path.exists()
+
+
+def test_variable_that_would_be_lost_is_refused() -> None:
+    lonely = Variables("se2", np.array([symbol("x", 3)]))
+    with pytest.raises(FormatError, match="x3 has neither a value nor a factor"):
+        g2o_text(Batch((lonely,)))
+    with pytest.raises(FormatError, match="a factor of x0, which is not in the graph"):
+        g2o_text(Batch((), small().factors))
+
+
+def test_text_of_tum(tmp_path: Path) -> None:
+    space = Variables("se3", np.array([symbol("x", 12)]), np.array([[1, 2, 3, 0.5, 0.5, 0.5, -0.5]]))
+    batch = Batch((space, *small().variables))
+    rows = [line.split() for line in tum_text(batch).splitlines()]
+    assert [row[0] for row in rows] == ["0", "1", "12"]
+    half = math.sin(math.pi / 4), math.cos(math.pi / 4)
+    assert [float(word) for word in rows[1][1:]] == [1, 0.5, 0, 0, 0, *half]
+    assert [float(word) for word in rows[2][1:]] == [1, 2, 3, 0.5, 0.5, 0.5, -0.5]
+    write_tum(tmp_path / "a.tum", batch)
+    assert (tmp_path / "a.tum").read_text() == tum_text(batch)
+
+
+def test_tum_of_two_robots_and_of_poses_without_value() -> None:
+    one = Variables("se2", np.array([symbol("a", 5)]), np.zeros((1, 3)))
+    two = Variables("se2", np.array([symbol("b", 5)]), np.ones((1, 3)))
+    assert [line.split()[:2] for line in tum_text(Batch((two, one))).splitlines()] == [["0", "0.0"], ["1", "1.0"]]
+    with pytest.raises(FormatError, match="x1 has no value"):
+        tum_text(Batch((Variables("se2", np.array([symbol("x", 1)])),)))
