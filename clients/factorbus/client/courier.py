@@ -14,7 +14,7 @@ from typing import Any
 
 from factorbus.client.link import Link
 from factorbus.client.replies import Again, Reply, judge
-from factorbus.proto.problems import Problem, Unavailable
+from factorbus.proto.problems import Problem, Refused, Unavailable
 
 # An unanswered try is repeated after this long: a step may take longer, but then repeating costs little.
 TRY_S = 5.0
@@ -24,6 +24,7 @@ class Errand:
     """One question or insert on its way: its future, and when it went and came back (time.perf_counter seconds).
 
     timeout_s: give up with Unavailable after so long; None: keep trying until the courier is closed.
+    passing: which refusals will not last, so that it is sent again (besides busy and shutting_down).
     then: called with (errand, answer or Problem) right before those who wait for the future are woken.
     """
 
@@ -34,9 +35,11 @@ class Errand:
         payload: bytes,
         decode: Callable[[bytes], Any],
         timeout_s: float | None = None,
+        passing: Callable[[Refused], bool] | None = None,
         then: Callable[["Errand", Any], None] | None = None,
     ) -> None:
-        self.what, self.key, self.payload, self.decode, self.then = what, key, payload, decode, then
+        self.what, self.key, self.payload, self.decode = what, key, payload, decode
+        self.passing, self.then = passing, then
         self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
         self.future: Future[Any] = Future()
         self.future.set_running_or_notify_cancel()  # so that an asyncio wrapper cannot cancel what is on its way
@@ -100,7 +103,7 @@ class Courier:
 
     def _take(self, errand: Errand, reply: Reply) -> None:
         """On zenoh's thread: only decode, hand over, or put back."""
-        verdict = judge(reply, errand.attempt)
+        verdict = judge(reply, errand.attempt, errand.passing)
         if isinstance(verdict, bytes):
             try:
                 self._finish(errand, errand.decode(verdict))

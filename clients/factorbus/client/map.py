@@ -3,23 +3,21 @@
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft, Key
 from factorbus.client.link import Link
 from factorbus.client.mirror import Mirror
+from factorbus.client.questions import Questions
 from factorbus.client.ticket import Ticket
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
-from factorbus.proto.problems import BadMessage, Problem, Unavailable
-from factorbus.proto.symbols import parse_symbol
+from factorbus.proto.problems import Problem, Refused, Unavailable
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ class Map:
         window: int,
         join: Callable[[], MapRow],
     ) -> None:
-        self._link, self._courier, self._client, self._timeout_s = link, courier, client, timeout_s
+        self._link, self._courier, self._client, self.timeout_s = link, courier, client, timeout_s
         self._size, self._join = window, join
         self._stack, self._presence = ExitStack(), ExitStack()
         self._mirror: Mirror | None = None
@@ -59,6 +57,7 @@ class Map:
         self._sending = threading.Lock()
         self._closed = False
         self._enter(join())
+        self.ask = Questions(courier, self.name, timeout_s)
 
     def __enter__(self) -> "Map":
         return self
@@ -78,8 +77,14 @@ class Map:
         return self._mirror
 
     def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
-        """Add `batch` to the map and wait until the estimate includes it.  Raises Refused, Unavailable, Problem."""
-        return self.send(batch, settle=settle, timeout_s=timeout_s).result(timeout_s)
+        """Add `batch` to the map and wait until it is in the estimate, the mirror included.
+
+        Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
+        """
+        accepted = self.send(batch, settle=settle, timeout_s=timeout_s).result(timeout_s)
+        if self._mirror is not None:
+            self._mirror.try_wait_for(accepted.revision, self.timeout_s if timeout_s is None else timeout_s)
+        return accepted
 
     def settle(self, timeout_s: float | None = None) -> Accepted:
         """Have the map iterate until it has converged.  Raises Refused, Unavailable."""
@@ -91,7 +96,7 @@ class Map:
         Raises Unavailable if the window stays full for `timeout_s`: `batch` is then not sent.
         """
         batch = batch.batch() if isinstance(batch, Draft) else batch
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._changed:
                 self._wait_for_room(timeout_s)
@@ -106,7 +111,7 @@ class Map:
 
         Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
         """
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
         with self._changed:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
@@ -128,36 +133,25 @@ class Map:
             self._enter(self._join())
         return self.epoch
 
-    def ask_estimate(self, of: list[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+    def ask_estimate(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Estimate:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
-        numbers = None if of is None else np.array([parse_symbol(k) if isinstance(k, str) else k for k in of], np.int64)
-        return self.ask("estimate", codec.encode_keys_asked(numbers), codec.decode_estimate, timeout_s).result()
+        return self.ask.estimate(of, timeout_s).result()
 
     def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        question = codec.encode_map({"batch": batch, "timeout_s": timeout_s})
-        return self.ask("chi2", question, codec.decode_chi2, timeout_s).result()
+        return self.ask.chi2(batch, timeout_s).result()
 
     def graph(self, timeout_s: float | None = None) -> Graph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
-        return self.ask("graph", codec.encode_map({}), codec.decode_graph, timeout_s).result()
+        return self.ask.graph(timeout_s).result()
 
     def stats(self, timeout_s: float | None = None) -> dict[str, Any]:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
-        return self.ask("stats", codec.encode_map({}), codec.decode_map, timeout_s).result()
+        return self.ask.stats(timeout_s).result()
 
     def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
         """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
-        question = codec.encode_map({"format": format})
-        return self.ask("export", question, _text, timeout_s).result()
-
-    def ask(self, question: str, payload: bytes, decode: Callable[[bytes], Any], timeout_s: float | None = None) -> Any:
-        """A future of the answer to `question`, asked again until `timeout_s` has passed."""
-        what = f"map {self.name!r}, asked for its {question},"
-        key = keys.ask_key(self.name, question)
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
+        return self.ask.export(format, timeout_s).result()
 
     def close(self) -> None:
         """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""
@@ -172,7 +166,7 @@ class Map:
 
     def open_mirror(self) -> None:
         """Start the live estimate and wait for it.  Raises Unavailable."""
-        mirror = Mirror(self._link, self.name, self._timeout_s)
+        mirror = Mirror(self._link, self.name, self.timeout_s)
         self._mirror = mirror
         mirror.start(self._stack)
 
@@ -204,7 +198,13 @@ class Map:
                 window.answered(insert.sequence, result if isinstance(result, Problem) else None)
                 self._changed.notify_all()
 
-        errand = Errand(f"map {self.name!r}", self._key, codec.encode_insert(insert), codec.decode_accepted, then=then)
+        def passing(refused: Refused) -> bool:
+            # It overtook its predecessor, which is still being sent: the service did not use up its number.
+            wanted = refused.detail.get("next")
+            return refused.code == "bad_sequence" and type(wanted) is int and window.waits_for(insert.sequence, wanted)
+
+        payload = codec.encode_insert(insert)
+        errand = Errand(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
         return Ticket(errand, insert.sequence, timeout_s)
 
     def _wait_for_room(self, timeout_s: float) -> None:
@@ -228,10 +228,3 @@ class Map:
             self._mirror.owner(token, alive)
         if alive:
             self._courier.hurry(keys.map_root(self.name) + "/")
-
-
-def _text(data: bytes) -> str:
-    text = codec.decode_map(data).get("text")
-    if not isinstance(text, str):
-        raise BadMessage("export.text", "missing or not a string", "a string")
-    return text

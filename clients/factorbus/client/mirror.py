@@ -120,18 +120,22 @@ class Mirror:
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable."""
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        end = time.monotonic() + timeout_s
-        with self._changed:
-            if self._changed.wait_for(lambda: self._there(revision), min(_IMPATIENT_S, timeout_s)):
-                return
-            self._inbox.put(("probe", None))
-            if self._changed.wait_for(lambda: self._there(revision), max(end - time.monotonic(), 0.0)):
-                return
+        if self.try_wait_for(revision, timeout_s):
+            return
         state = "stale" if self.stale else "up to date"
         hint = (
             f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
         )
         raise Unavailable(f"revision {revision} of map {self._map!r}", timeout_s, hint)
+
+    def try_wait_for(self, revision: int, timeout_s: float) -> bool:
+        """Like `wait_for`, but says whether it came to that."""
+        end = time.monotonic() + timeout_s
+        with self._changed:
+            if self._changed.wait_for(lambda: self._there(revision), min(_IMPATIENT_S, timeout_s)):
+                return True
+            self._inbox.put(("probe", None))
+            return self._changed.wait_for(lambda: self._there(revision), max(end - time.monotonic(), 0.0))
 
     def on_delta(self, callback: Callable[[Delta], None]) -> Callable[[], None]:
         """Have `callback` called with every delta after it is applied; returns what takes it off again.

@@ -4,11 +4,12 @@ Silence (no reply at all) has four causes that look the same: nobody owns the ke
 message was over a limit of the bus, or the service died.  So it is asked again, with the same sequence number.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from factorbus.proto.codec import decode_problem
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Problem, Refused
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
 _DEFAULT_BUSY_S = 0.05
@@ -49,8 +50,11 @@ class Again:
     because: str
 
 
-def judge(reply: Reply, attempt: int) -> bytes | Problem | Again:
-    """What `reply` to the `attempt`-th try (from 1) means: the answer, a final problem, or another try."""
+def judge(reply: Reply, attempt: int, passing: Callable[[Refused], bool] | None = None) -> bytes | Problem | Again:
+    """What `reply` to the `attempt`-th try (from 1) means: the answer, a final problem, or another try.
+
+    passing: which refusals will not last, besides busy and shutting_down.
+    """
     match reply:
         case Answer(payload):
             return payload
@@ -59,7 +63,7 @@ def judge(reply: Reply, attempt: int) -> bytes | Problem | Again:
         case TimedOut():
             return Again(0.0, "the service has the message and has not answered yet")
         case Failure(payload):
-            return _judge_failure(payload, attempt)
+            return _judge_failure(payload, attempt, passing)
 
 
 def pause(attempt: int) -> float:
@@ -67,7 +71,7 @@ def pause(attempt: int) -> float:
     return min(_FIRST_PAUSE_S * 2 ** min(attempt - 1, 10), _LONGEST_PAUSE_S)
 
 
-def _judge_failure(payload: bytes, attempt: int) -> Problem | Again:
+def _judge_failure(payload: bytes, attempt: int, passing: Callable[[Refused], bool] | None) -> Problem | Again:
     try:
         refused = decode_problem(payload)
     except Problem as unreadable:
@@ -76,6 +80,6 @@ def _judge_failure(payload: bytes, attempt: int) -> Problem | Again:
         wanted = refused.detail.get("retry_after_s")
         pause_s = float(wanted) if isinstance(wanted, int | float) and 0 <= wanted <= 60 else _DEFAULT_BUSY_S
         return Again(pause_s, refused.message)
-    if refused.code == "shutting_down":
+    if refused.code == "shutting_down" or (passing is not None and passing(refused)):
         return Again(pause(attempt), refused.message)
     return refused

@@ -42,6 +42,10 @@ class Window(Generic[T]):
         """The sequence number of the next insert."""
         return self.last + 1
 
+    def waits_for(self, sequence: int, wanted: int) -> bool:
+        """Whether the service, which wants `wanted` before `sequence`, will get it: it is still being sent."""
+        return wanted < sequence and wanted in self._unanswered
+
     def sent(self, item: T) -> None:
         """`item` is on its way as number `next`."""
         self.last += 1

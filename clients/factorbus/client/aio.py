@@ -1,0 +1,176 @@
+"""The client for asyncio: the same maps, mirror and guarantees; what waits is awaited.
+
+    async with connect("tcp/127.0.0.1:7447", client="robot1") as bus, bus.map("kitchen") as kitchen:
+        await kitchen.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        async for delta in kitchen.deltas():
+            ...
+
+Answers come from the bus's threads straight into futures of the loop; only connecting, joining and leaving, which
+are rare, borrow a thread of the loop's executor.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
+from typing import Any
+
+from factorbus.client import bus as sync
+from factorbus.client.draft import Draft, Key
+from factorbus.client.map import Map as SyncMap
+from factorbus.client.map import MapRow
+from factorbus.client.mirror import Mirror
+from factorbus.client.stream import DeltaStream
+from factorbus.client.ticket import NoAnswerYet, Ticket
+from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, Graph
+
+
+@asynccontextmanager
+async def connect(
+    endpoint: str | Sequence[str],
+    *,
+    client: str = "client",
+    timeout_s: float = 10.0,
+    settings: Mapping[str, Any] | None = None,
+) -> AsyncIterator["Bus"]:
+    """As `factorbus.client.connect`, in `async with`."""
+    bus = await asyncio.to_thread(sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings)
+    try:
+        yield Bus(bus)
+    finally:
+        await asyncio.to_thread(bus.close)
+
+
+class Bus:
+    """A connection to the bus."""
+
+    def __init__(self, bus: sync.Bus) -> None:
+        self._bus = bus
+
+    @asynccontextmanager
+    async def map(
+        self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True
+    ) -> AsyncIterator["Map"]:
+        """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
+        joined = await asyncio.to_thread(self._bus.map, name, mode, window=window, mirror=mirror, create=create)
+        try:
+            here = Map(joined, window)
+            yield here
+            await here.flush()
+        finally:
+            await asyncio.to_thread(joined.close)
+
+    async def maps(self) -> list[MapRow]:
+        """The maps of the service.  Raises Refused, Unavailable."""
+        return await asyncio.to_thread(self._bus.maps)
+
+    async def create(self, name: str, mode: str = "auto") -> MapRow:
+        """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""
+        return await asyncio.to_thread(self._bus.create, name, mode)
+
+    async def drop(self, name: str) -> None:
+        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
+        await asyncio.to_thread(self._bus.drop, name)
+
+
+class Map:
+    """A map that this client has joined; see `factorbus.client.Map` for what it promises."""
+
+    def __init__(self, joined: SyncMap, window: int) -> None:
+        self._map = joined
+        self._room = asyncio.Semaphore(window)
+        self._loop = asyncio.get_running_loop()
+
+    @property
+    def name(self) -> str:
+        """The map's name."""
+        return self._map.name
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that was joined."""
+        return self._map.epoch
+
+    @property
+    def estimate(self) -> Mirror:
+        """The live estimate; reading it never waits.  Raises Unavailable for a map opened with mirror=False."""
+        return self._map.estimate
+
+    async def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+        """Add `batch` to the map and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
+        return await self.result(await self.send(batch, settle=settle), timeout_s)
+
+    async def settle(self, timeout_s: float | None = None) -> Accepted:
+        """Have the map iterate until it has converged.  Raises Refused, NoAnswerYet."""
+        return await self.insert(Batch(), settle=True, timeout_s=timeout_s)
+
+    async def send(self, batch: Batch | Draft, *, settle: bool = False) -> Ticket:
+        """Send `batch`; waits only while the window is full."""
+        await self._room.acquire()
+        try:
+            ticket = self._map.send(batch, settle=settle)
+        except BaseException:
+            self._room.release()
+            raise
+        ticket.errand.future.add_done_callback(lambda _: self._on_loop(self._room.release))
+        return ticket
+
+    async def result(self, ticket: Ticket, timeout_s: float | None = None) -> Accepted:
+        """The answer to what was sent.  Raises Refused, NoAnswerYet."""
+        timeout_s = self._map.timeout_s if timeout_s is None else timeout_s
+        try:
+            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(ticket.future)), timeout_s)
+        except TimeoutError:
+            raise NoAnswerYet(ticket, ticket.errand.what, timeout_s) from None
+
+    async def flush(self, timeout_s: float | None = None) -> None:
+        """Wait until everything sent is answered.  Raises Unavailable, and the first refusal nobody has looked at."""
+        await asyncio.to_thread(self._map.flush, timeout_s)
+
+    async def rejoin(self) -> int:
+        """Join the map as it is now and return its epoch; numbering starts again."""
+        return await asyncio.to_thread(self._map.rejoin)
+
+    async def ask_estimate(self, of: list[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+        """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.estimate(of, timeout_s))
+
+    async def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
+        """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s))
+
+    async def graph(self, timeout_s: float | None = None) -> Graph:
+        """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.graph(timeout_s))
+
+    async def stats(self, timeout_s: float | None = None) -> dict[str, Any]:
+        """What the service counts and times about this map.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.stats(timeout_s))
+
+    async def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
+        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.export(format, timeout_s))
+
+    async def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
+        """Until the mirror is at `revision` or later and not stale.  Raises Unavailable."""
+        await asyncio.to_thread(self.estimate.wait_for, revision, timeout_s)
+
+    async def deltas(self) -> AsyncIterator[Delta]:
+        """Every change of the estimate from now on, without end.
+
+        A delta whose `previous` is 0 holds the whole estimate: after a resynchronisation, or when this loop fell
+        too far behind.
+        """
+        ready = asyncio.Event()
+        stream = DeltaStream(self.estimate, lambda: self._on_loop(ready.set))
+        try:
+            while True:
+                await ready.wait()
+                ready.clear()
+                while (delta := stream.try_take()) is not None:
+                    yield delta
+        finally:
+            stream.close()
+
+    def _on_loop(self, call: Callable[..., Any], *arguments: Any) -> None:
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(call, *arguments)
