@@ -32,7 +32,7 @@ def positive_definite(packed: F64, dim: int) -> NDArray[np.bool]:
     in   packed (n, dim (dim + 1) / 2)   out  (n,) bool
     """
     entry = {(i, j): packed[:, k] for k, (i, j) in enumerate(_upper(dim))}
-    good: NDArray[np.bool] = np.isfinite(packed).all(axis=1, keepdims=True)[:, 0]
+    good = np.asarray(np.isfinite(packed).all(axis=1))
     with np.errstate(all="ignore"):  # rows already found bad may divide by zero
         for k in range(dim):
             good &= entry[k, k] > 0
