@@ -63,10 +63,11 @@ def test_the_same_number_while_it_waits_joins_those_who_wait(admission: Admissio
     assert admission.answer(insert, b"yes") == [Answer("a1", b"yes"), Answer("again", b"yes")]
 
 
-def test_asking_without_end_for_one_answer_is_busy(admission: Admission) -> None:
-    seen = [codes(admission.admit(arrived("a", 1, asker=n))) for n in range(1, 20)]
-    assert seen[:8] == [[]] * 8
-    assert all(code == ["busy"] for code in seen[8:])
+def test_of_too_many_who_wait_for_one_answer_the_first_is_sent_away(admission: Admission) -> None:
+    sent_away = [e.asker for n in range(10) for e in admission.admit(arrived("a", 1, asker=f"try{n}"))]  # type: ignore[union-attr]
+    assert sent_away == ["try0", "try1"]
+    (insert,) = admission.take(9)
+    assert [e.asker for e in admission.answer(insert, b"")] == [f"try{n}" for n in range(2, 10)]  # type: ignore[union-attr]
 
 
 def test_the_same_number_later_gets_the_first_answer(admission: Admission) -> None:
@@ -145,6 +146,18 @@ def test_a_gap_that_stays_is_refused(admission: Admission) -> None:
 
 def test_too_many_clients(admission: Admission) -> None:
     assert [codes(admission.admit(arrived(c, 1))) for c in "abcd"] == [[], [], [], ["too_large"]]
+
+
+def test_a_client_long_silent_makes_room(admission: Admission) -> None:
+    for now, client in ((0.0, "a"), (1.0, "b"), (500.0, "c")):
+        admission.admit(arrived(client, 1, now=now))
+    assert codes(admission.admit(arrived("d", 1, now=700.0))) == ["too_large"], "all have something open"
+    for insert in admission.take(9):
+        admission.answer(insert, b"")
+    admission.admit(arrived("a", 1, asker="again", now=650.0))
+    assert admission.admit(arrived("d", 1, now=700.0)) == []
+    assert set(admission.next_sequences) == {"a", "c", "d"}
+    assert codes(admission.admit(arrived("e", 1, now=701.0))) == ["too_large"]
 
 
 def test_closing_keeps_what_was_admitted(admission: Admission) -> None:

@@ -21,7 +21,7 @@ from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, T
 from factorbus.service.config import Limits
 from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse, Waiting
 
-# How many may wait for one and the same answer: a client that asks again and again is told to be patient instead.
+# How many may wait for one and the same answer.
 _ASKERS = 8
 _RETRY_S = (0.02, 2.0)
 
@@ -32,6 +32,7 @@ class _Client:
 
     next: int = 1
     heard: float = 0.0  # when it last sent what it has to send next
+    seen: float = 0.0  # when it last sent anything
     ready: deque[Waiting] = field(default_factory=deque)
     open: dict[int, Waiting] = field(default_factory=dict)  # admitted or parked, not answered
     parked: dict[int, Waiting] = field(default_factory=dict)
@@ -67,10 +68,9 @@ class Admission:
     def admit(self, arrived: Arrived) -> list[Effect]:
         """Judge one arrival: nothing to say yet (it waits), or its answer."""
         try:
-            answer = self._judge(arrived)
+            return self._judge(arrived)
         except Problem as problem:
             return [Refuse(arrived.asker, problem)]
-        return [] if answer is None else [_reply(arrived.asker, answer)]
 
     def take(self, most: int) -> tuple[Waiting, ...]:
         """Up to `most` inserts for the next step: one of each client in turn, and again."""
@@ -115,17 +115,18 @@ class Admission:
         if inserts:
             self._pace_s += 0.1 * (seconds / inserts - self._pace_s)
 
-    def _judge(self, arrived: Arrived) -> object | None:
-        """Its answer if there is one, None if it waits.  Raises Problem."""
+    def _judge(self, arrived: Arrived) -> list[Effect]:
+        """Its answer if there is one, nothing if it waits.  Raises Problem."""
         if arrived.epoch not in (0, self._epoch):
             raise WrongEpoch(arrived.epoch, self._epoch)
         client = self._clients.get(arrived.client)
         if client is None:
             client = self._new_client(arrived)
+        client.seen = arrived.now
         if arrived.sequence in client.open:
             return self._ask_again(client.open[arrived.sequence], arrived, client.next)
         if arrived.sequence < client.next:
-            return _remembered(client, arrived)
+            return [_reply(arrived.asker, _remembered(client, arrived))]
         if self._closing:
             raise ShuttingDown
         if arrived.sequence == client.next:
@@ -133,20 +134,26 @@ class Admission:
         else:
             self._park(client, arrived)
         self._clients[arrived.client] = client
-        return None
+        return []
 
     def _new_client(self, arrived: Arrived) -> _Client:
-        """A place for a name not seen before; it counts as soon as something of it is taken."""
+        """A place for a name not seen before; it counts as soon as something of it is taken.
+
+        Every run of a client has a name of its own, so the names of those long silent make room.
+        """
         if len(self._clients) >= self._limits.clients:
-            raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
+            name, idlest = min(self._clients.items(), key=lambda item: (bool(item[1].open), item[1].seen))
+            if idlest.open or arrived.now - idlest.seen < self._limits.client_idle_s:
+                raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
+            del self._clients[name]
         return _Client(heard=arrived.now)
 
-    def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> None:
+    def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> list[Effect]:
+        """One more waits for the answer; of too many, the first is told to come back: it has most likely given up."""
         if insert.digest != arrived.digest:
             raise BadSequence(arrived.client, arrived.sequence, "a number not used for another insert", following)
-        if len(insert.askers) >= _ASKERS:
-            raise self._busy()
         insert.askers.append(arrived.asker)
+        return [Refuse(insert.askers.pop(0), self._busy())] if len(insert.askers) > _ASKERS else []
 
     def _admit_next(self, client: _Client, arrived: Arrived) -> None:
         """Into the inbox, and with it whatever waited for just this one."""

@@ -25,7 +25,8 @@ class Limits:
     """
 
     maps: int = 64  # in this service
-    clients: int = 1024  # names that ever inserted in this epoch
+    clients: int = 1024  # names whose place in their sequence is known ...
+    client_idle_s: float = 600.0  # ... unless one has been silent for so long: it makes room for a new one
     waiting: int = 256  # inserts admitted and not yet in a step; as many again may be parked
     waiting_bytes: int = 256 << 20
     questions: int = 256  # waiting for the solver to come to a revision

@@ -1,0 +1,58 @@
+"""`python -m factorbus.service`: a service in the foreground, for tests, containers and service managers."""
+
+import argparse
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from factorbus.proto.problems import Problem
+from factorbus.service.config import Config, checked, load
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until SIGTERM or SIGINT.  Prints `ready ENDPOINT ...` when clients can connect; 2: cannot start."""
+    options = _parser().parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    from factorbus.service.app import serve
+
+    try:
+        serve(_config(options), lambda endpoints: print("ready", *endpoints, flush=True), stop)
+    except (Problem, OSError) as problem:
+        print(f"factorbus: {problem}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m factorbus.service", description="Keep maps and answer for them.")
+    parser.add_argument("--config", metavar="FILE", help="settings as TOML; what is given here wins")
+    parser.add_argument("--listen", action="append", metavar="ENDPOINT", help="such as tcp/127.0.0.1:7447; port 0: any")
+    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="a router to meet clients at")
+    parser.add_argument("--mode", choices=("peer", "router", "client"))
+    parser.add_argument("--name", help="of this service, in its liveliness tokens")
+    parser.add_argument("--maps", metavar="PATTERN", help="the maps it answers for: a name or a beginning and *")
+    parser.add_argument("--create", action="append", metavar="MAP", help="a map to have from the start")
+    parser.add_argument("--no-warm", action="store_true", help="compile kernels when they are first used")
+    return parser
+
+
+def _config(options: argparse.Namespace) -> Config:
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name in ("listen", "connect", "mode", "name", "maps", "create")
+        if (value := getattr(options, name)) is not None
+    }
+    if options.no_warm:
+        given["warm"] = False
+    return load(options.config, **given) if options.config else checked(replace(Config(), **given))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""Questions about the set of maps, read and judged: which name, which mode, is it ours."""
+
+from factorbus.proto import codec
+from factorbus.proto.keys import checked_name
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.problems import BadMessage, Problem
+
+# auto is what the service thinks best; so far there is one mode.
+MODES = ("auto", "all-batch")
+
+
+class OtherMode(Problem):
+    """The map is there, in another mode than asked for."""
+
+    code = "other_mode"
+
+    def __init__(self, name: str, mode: str, wanted: str) -> None:
+        super().__init__(f"map {name!r} is in mode {mode}, not {wanted}; join it as {mode} or drop it", mode=mode)
+
+
+class NotHere(Problem):
+    """This service does not keep maps of that name."""
+
+    code = "unknown_map"
+
+    def __init__(self, name: str, pattern: str) -> None:
+        super().__init__(f"this service keeps maps named {pattern}; {name!r} is not one of them", maps=pattern)
+
+
+def read_create(payload: bytes) -> tuple[str, str]:
+    """(map, mode) of an admin/create.  Raises BadMessage, BadName, TooLarge."""
+    content = codec.decode_map(payload, REQUEST_LIMITS, what="create")
+    mode = content.get("mode", "auto")
+    if mode not in MODES:
+        raise BadMessage("create.mode", f"is {mode!r:.40}", f"one of {', '.join(MODES)}")
+    return _map_name(content, "create"), mode
+
+
+def read_drop(payload: bytes) -> str:
+    """The map of an admin/drop.  Raises BadMessage, BadName, TooLarge."""
+    return _map_name(codec.decode_map(payload, REQUEST_LIMITS, what="drop"), "drop")
+
+
+def settled_mode(mode: str) -> str:
+    """What a map asked for in `mode` runs as."""
+    return "all-batch" if mode == "auto" else mode
+
+
+def ours(pattern: str, name: str) -> bool:
+    """Does a service that keeps `pattern` (a name, or a beginning and *) keep `name`?"""
+    return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
+
+
+def _map_name(content: dict, where: str) -> str:
+    name = content.get("map")
+    if type(name) is not str:
+        raise BadMessage(f"{where}.map", "missing" if name is None else f"is {name!r:.40}", "the name of a map")
+    return checked_name("map", name)

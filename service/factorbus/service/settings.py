@@ -1,0 +1,38 @@
+"""The Zenoh configuration of a service: paths and values, and why."""
+
+from typing import Any
+
+from factorbus.service.config import Config
+
+
+def zenoh_settings(config: Config) -> dict[str, Any]:
+    """What a service sets in its Zenoh configuration."""
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "listen/endpoints": list(config.listen) if config.mode != "client" else [],
+        "connect/endpoints": list(config.connect),
+        # Only endpoints that somebody wrote down.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # On by default, and drops a large message silently when its receiver is descheduled for 100 ms (zenoh #2628).
+        "transport/shared_memory/enabled": False,
+        # A frozen peer is noticed after 3 s, not 10.
+        "transport/link/tx/lease": 3000,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        # Zenoh drops what is larger without a word; up to here the service itself can say too_large.
+        "transport/link/rx/max_message_size": max(4 * config.limits.message_bytes, 16 << 20),
+        # What one client may have under way before its deltas are dropped (it asks for the estimate then): 1 MiB.
+        "transport/link/tx/queue/size/data": 16,
+        "transport/link/tx/queue/size/data_low": 16,
+        # How long one stuck client may hold up a publication to all, in microseconds; once per publication.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 200,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 5000,
+        # A client that does not take its answers for so long is disconnected; it reconnects by itself.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 1_000_000,
+        # Read-only; the service finds its own port there, and `factorbus doctor` what is connected.
+        "adminspace/enabled": True,
+    }
+    if config.mode != "client":
+        # Without something to connect to there is nobody to wait for; with it, start-up does not hang on it.
+        settings |= {"scouting/delay": 0, "connect/timeout_ms": -1, "connect/exit_on_failure": False}
+    return settings
