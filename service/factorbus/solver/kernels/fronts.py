@@ -1,0 +1,50 @@
+"""What a front is: the record that the multifrontal kernels share, and how its numbers lie in the arena.
+
+A front holds p pivot scalars and a border of m scalars, in elimination order.  Its rows of R are p rows over p + m
+columns, column j of row i at `ROWS + i·LD_ROWS + j`; its update matrix is m x m, upper triangle, column j of row i at
+`UPDATE + i·LD_UPDATE + j`.  Both start their border columns at a multiple of 8 doubles and pad rows to one, so that
+whole vectors cover them; what a row of R has before its first column, and behind its last, belongs to nobody.
+"""
+
+from factorbus.solver.kernels._jit import inline_kernel
+
+COLUMN = 0  # first pivot scalar, in elimination order
+PIVOTS = 1  # p
+BORDER = 2  # m
+ROWS = 3
+LD_ROWS = 4
+UPDATE = 5
+LD_UPDATE = 6
+PARENT = 7  # -1: a root
+CHILD = 8  # first child, -1: none
+SIBLING = 9  # next child of the same parent
+RUNS = 10  # its runs are runs[RUNS : RUNS_END]
+RUNS_END = 11
+BORDER_AT = 12  # its border scalars, in elimination order, are border[BORDER_AT : BORDER_AT + m]
+BLOCKS = 13  # the blocks of Λ that it takes in are blocks[BLOCKS : BLOCKS_END]
+BLOCKS_END = 14
+VARIABLE = 15  # first pivot variable, in elimination order
+FRONT = 16  # int64 in a record: 128 bytes
+
+# A run: border columns [first, first + count) of a child are columns [into, into + count) of its parent; a run lies
+# wholly among the parent's pivots or wholly in its border.
+RUN = 3
+
+# A block: its number, where it goes, rows and columns there, and whether to turn it.
+BLOCK = 5
+STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
+
+SCRATCH = 16  # the first doubles of an arena: room for a 4 x 4 triangle
+
+
+@inline_kernel
+def padded(count: int) -> int:
+    """The next multiple of 8: a cache line of doubles, and whole vectors on every processor."""
+    return (count + 7) & ~7
+
+
+@inline_kernel
+def row_stride(count: int) -> int:
+    """Padded, and not a multiple of a large power of two, whose rows would share a few sets of the cache."""
+    stride = padded(count)
+    return stride + 8 if stride >= 128 and stride % 16 == 0 else stride

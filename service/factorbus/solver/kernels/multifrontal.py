@@ -1,0 +1,80 @@
+"""Block Cholesky RᵀR = PΛPᵀ, front by front from the leaves to the roots (Duff and Reid's multifrontal method)."""
+
+from factorbus.solver.kernels import fronts as fr
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.dense import PIVOT_TOLERANCE, factor_front
+from factorbus.solver.kernels.simd import add_run, at, put, zero
+
+
+@kernel(
+    "int64(int64[:,::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1], float64, float64[::1], float64[::1])"
+)
+def factorize(
+    fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, floors: F64
+) -> int:
+    """Factorise Λ with its diagonal multiplied by 1 + damping.  Gives the scalar whose pivot failed, or -1.
+
+    in   values: blocks of Λ, block b row-major at offsets[b]
+    out  arena: rows of R   floors (n,): least pivot allowed;  scalars count in elimination order
+    """
+    for f in range(fronts.shape[0]):
+        front = fronts[f]
+        r, ld, p, column = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.COLUMN]
+        m, u, ldu = front[fr.BORDER], front[fr.UPDATE], front[fr.LD_UPDATE]
+        clear_front(arena, r, ld, p, m, u, ldu)
+        for b in range(front[fr.BLOCKS], front[fr.BLOCKS_END]):
+            block = blocks[b]
+            put_block(arena, block, ld, values, offsets[block[0]], 1.0 + damping)
+        for i in range(p):
+            floors[column + i] = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
+        c = front[fr.CHILD]
+        while c >= 0:
+            child = fronts[c]
+            extend_add(arena, child[fr.UPDATE], child[fr.LD_UPDATE], runs, child[fr.RUNS], child[fr.RUNS_END], front)
+            c = child[fr.SIBLING]
+        failed = factor_front(arena, r, ld, p, m, u, ldu, floors, column)
+        if failed >= 0:
+            return column + failed
+    return -1
+
+
+@inline_kernel
+def clear_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int) -> None:
+    """Zero the rows of R, their padding too, and the update matrix on and above the diagonal."""
+    zero(a, r - (fr.padded(p) - p), p * ld)
+    if m <= 64:
+        zero(a, u, m * ldu)
+    else:
+        for i in range(m):
+            zero(a, u + i * ldu + (i & ~7), ldu - (i & ~7))
+
+
+@inline_kernel
+def put_block(a: F64, block: I64, ld: int, values: F64, source: int, on_diagonal: float) -> None:
+    """Write a block of Λ into the front; `on_diagonal` multiplies the diagonal of a diagonal block."""
+    target, height, width, how = block[1], block[2], block[3], block[4]
+    for i in range(height):
+        if how == fr.TURNED:
+            for j in range(width):
+                put(a, target + i * ld + j, at(values, source + j * height + i))
+        else:
+            for j in range(width):
+                put(a, target + i * ld + j, at(values, source + i * width + j))
+            if how == fr.DIAGONAL:
+                put(a, target + i * ld + i, at(values, source + i * width + i) * on_diagonal)
+
+
+@inline_kernel
+def extend_add(a: F64, child: int, ld_child: int, runs: I64, run: int, run_end: int, front: I64) -> None:
+    """Add the update matrix at `child` into the front above it, run by run."""
+    p, r, ld, u, ldu = front[fr.PIVOTS], front[fr.ROWS], front[fr.LD_ROWS], front[fr.UPDATE], front[fr.LD_UPDATE]
+    for s in range(run, run_end):
+        first, count, into = runs[s, 0], runs[s, 1], runs[s, 2]
+        target, stride = (r + into * ld, ld) if into < p else (u + (into - p) * ldu - p, ldu)
+        source = child + first * ld_child
+        for i in range(count):
+            add_run(a, target + into + i, source + first + i, count - i)
+            for t in range(s + 1, run_end):
+                add_run(a, target + runs[t, 2], source + runs[t, 0], runs[t, 1])
+            target += stride
+            source += ld_child
