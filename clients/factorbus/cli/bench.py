@@ -1,0 +1,73 @@
+"""`factorbus bench`: the measurements of the repository, run from the command line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+
+from factorbus.cli.exits import FAILED, OK, Stopped
+from factorbus.cli.options import json_option
+from factorbus.cli.screen import document, note
+
+BENCHES = ("cholesky", "bus")
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("name", type=click.Choice([*BENCHES, "all"]), default="all")
+@click.argument("options", nargs=-1, type=click.UNPROCESSED)
+@json_option
+def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
+    """Measure NAME, each beside what it is held against; the exit code is 1 when a target is missed.
+
+    \b
+    cholesky   block Cholesky of real systems against CHOLMOD, same matrix and ordering
+    bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
+    all        all of them
+
+    The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
+    the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.
+
+    \b
+    factorbus bench cholesky
+    factorbus bench all --json > bench.json
+    """
+    folder = _folder()
+    names = BENCHES if name == "all" else (name,)
+    codes, results = {}, {}
+    for each in names:
+        note(f"bench {each}")
+        ran = subprocess.run(
+            [sys.executable, str(folder / f"{each}.py"), *(["--json"] if as_json else []), *options],
+            stdout=subprocess.PIPE if as_json else None,
+            text=True,
+            check=False,
+        )
+        codes[each] = ran.returncode
+        if as_json:
+            results[each] = _result(each, ran)
+    if as_json:
+        document(results if name == "all" else results[name])
+    missed = [each for each, code in codes.items() if code]
+    if missed:
+        note(f"bench: {', '.join(missed)} failed or missed a target")
+    return FAILED if missed else OK
+
+
+def _folder() -> Path:
+    """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
+    folder = Path(__file__).resolve().parents[3] / "tests" / "bench"
+    if not all((folder / f"{name}.py").is_file() for name in BENCHES):
+        raise Stopped(
+            "no_repository",
+            "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",
+        )
+    return folder
+
+
+def _result(name: str, ran: "subprocess.CompletedProcess[str]") -> object:
+    try:
+        return json.loads(ran.stdout)
+    except json.JSONDecodeError:
+        raise Stopped("bench_failed", f"bench {name} ended with exit code {ran.returncode} and no result") from None

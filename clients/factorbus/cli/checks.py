@@ -1,0 +1,194 @@
+"""What the doctor looks at.  A check looks, never changes anything, and gives one finding."""
+
+import ctypes
+import os
+import platform
+import resource
+import shutil
+import socket
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from factorbus.cli.exits import EXTRAS, Stopped
+from factorbus.cli.options import DEFAULT_ENDPOINT
+from factorbus.cli.version import LIBRARIES, installed
+from factorbus.proto.problems import Problem
+from factorbus.proto.version import __version__
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """state: "ok", "warn" (works, could be better) or "fail".  mend: the next move, where there is one."""
+
+    name: str
+    state: str
+    seen: str
+    mend: str = ""
+
+
+def python() -> Finding:
+    """the interpreter"""
+    return Finding("python", "ok", f"{platform.python_version()} at {sys.executable}, {platform.platform()}")
+
+
+def libraries() -> Finding:
+    """the libraries"""
+    have = {name: installed(name) for name in LIBRARIES}
+    seen = ", ".join([f"factorbus {__version__}", *(f"{name} {version}" for name, version in have.items() if version)])
+    lacking = [extra for extra, names in EXTRAS.items() if any(find_spec(name) is None for name in names)]
+    if "service" in lacking:
+        mend = "fine for a front end; for solver and workers: pip install 'factorbus[service]'"
+        return Finding("libraries", "warn", f"{seen}; a light client without the solver", mend)
+    if lacking:
+        return Finding("libraries", "warn", f"{seen}; no pictures", "pip install 'factorbus[viz]'")
+    return Finding("libraries", "ok", seen)
+
+
+def cholmod() -> Finding:
+    """SuiteSparse's CHOLMOD and its BLAS"""
+    if find_spec("sksparse") is None:
+        return Finding("cholmod", "warn", "scikit-sparse is not installed", "pip install 'factorbus[service]'")
+    try:
+        import sksparse.cholmod  # noqa: F401
+    except ImportError as error:
+        mend = "pip install --force-reinstall --no-binary scikit-sparse 'factorbus[service]'"
+        return Finding("cholmod", "fail", f"scikit-sparse does not load: {error}", mend)
+    mapped = _mapped_libraries()
+    library = next((path for path in mapped if "libcholmod" in path), None)
+    blas = [path for path in mapped if "blas" in Path(path).name]
+    seen = f"CHOLMOD {_cholmod_version(library)}, BLAS {', '.join(blas) or 'unknown'}"
+    if blas and not any(name in " ".join(blas) for name in ("openblas", "mkl", "blis", "atlas", "Accelerate")):
+        mend = "the reference BLAS makes CHOLMOD several times slower: apt-get install libopenblas0-pthread"
+        return Finding("cholmod", "warn", seen, mend)
+    return Finding("cholmod", "ok", seen)
+
+
+def cache() -> Finding:
+    """the cache of compiled kernels"""
+    folder = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        mend = "make it writable, or set FACTORBUS_CACHE to a folder that is; until then every start compiles"
+        return Finding("kernel cache", "fail", f"{folder}: {error.strerror}", mend)
+    free = shutil.disk_usage(folder).free
+    if free < 200 << 20:
+        return Finding("kernel cache", "warn", f"{folder}: {free >> 20} MiB free", "kernels take some 50 MiB")
+    compiled = sum(1 for _ in folder.glob("kernels/*/*.nbc"))
+    if not compiled:
+        return Finding("kernel cache", "warn", f"{folder}: empty", "factorbus warm compiles ahead")
+    return Finding("kernel cache", "ok", f"{folder}: {compiled} compiled kernels, {free >> 30} GiB free")
+
+
+def port() -> Finding:
+    """the usual port"""
+    number = int(DEFAULT_ENDPOINT.rpartition(":")[2])
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", number))
+            return Finding("port", "ok", f"{number} is free for factorbus serve")
+        except OSError:
+            pass
+    from factorbus.client import connect
+
+    try:
+        with connect(DEFAULT_ENDPOINT, client="doctor", timeout_s=3) as bus:
+            return Finding("port", "ok", f"{number} is taken by a factorbus service with {len(bus.maps())} maps")
+    except Problem:
+        mend = f"stop what listens there (ss -ltnp 'sport = :{number}'), or factorbus serve --listen tcp/127.0.0.1:7448"
+        return Finding("port", "warn", f"{number} is taken by something that is no factorbus service", mend)
+
+
+def bus() -> Finding:
+    """a round trip over the bus"""
+    if any(find_spec(name) is None for name in EXTRAS["service"]):
+        return Finding("bus", "warn", "not tried: it needs a solver process", "pip install 'factorbus[service]'")
+    from factorbus.cli.children import service
+    from factorbus.client import connect
+
+    times = []
+    try:
+        with service("--no-warm", timeout_s=60) as (_, endpoint), connect(endpoint, client="doctor") as line:
+            for _ in range(50):
+                start = time.perf_counter()
+                line.maps()
+                times.append((time.perf_counter() - start) * 1e3)
+    except (Stopped, Problem) as problem:
+        return Finding("bus", "fail", problem.message, "try factorbus serve by hand: it says what is wrong")
+    seen = f"a solver process answers on loopback in {statistics.median(times):.2f} ms (p50 of {len(times)})"
+    return Finding("bus", "ok", seen)
+
+
+def shared_memory() -> Finding:
+    """/dev/shm"""
+    folder = Path("/dev/shm")
+    if not folder.is_dir():
+        return Finding("shared memory", "ok", "there is no /dev/shm; the bus does not need it")
+    free = shutil.disk_usage(folder).free
+    seen = f"{folder}: {free >> 20} MiB free; the bus uses it only where a Zenoh configuration says so"
+    if free < 64 << 20:
+        return Finding("shared memory", "warn", seen, "before turning it on: docker run --shm-size=256m, or --ipc=host")
+    return Finding("shared memory", "ok", seen)
+
+
+def clock() -> Finding:
+    """the clock"""
+    name = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    source = name.read_text().strip() if name.is_file() else "unknown"
+    reads = 10_000
+    start = time.perf_counter()
+    for _ in range(reads):
+        time.perf_counter()
+    cost_ns = (time.perf_counter() - start) / reads * 1e9
+    seen = f"{source}, {cost_ns:.0f} ns a reading"
+    if cost_ns > 1000:
+        return Finding("clock", "warn", seen, "a slow clock blurs step times; the usual cure is clocksource=tsc")
+    return Finding("clock", "ok", seen)
+
+
+def machine() -> Finding:
+    """cores and limits"""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    load = os.getloadavg()[0]
+    seen = f"{cores} cores, load {load:.1f}, {files} open files allowed"
+    if cores < 2:
+        return Finding("machine", "warn", seen, "one core is shared by solver and bus: expect jitter")
+    if files < 1024:
+        return Finding("machine", "warn", seen, "ulimit -n 4096 for a service with many clients")
+    if load > cores:
+        return Finding("machine", "warn", seen, "other processes take the cores: times are worse than they could be")
+    return Finding("machine", "ok", seen)
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    python, libraries, cholmod, cache, machine, clock, shared_memory, port, bus,
+)  # fmt: skip
+
+
+def _mapped_libraries() -> list[str]:
+    """The system's shared libraries in this process: not the BLAS that numpy and scipy bring along."""
+    maps = Path("/proc/self/maps")
+    if not maps.is_file():
+        return []
+    paths = {line.split(maxsplit=5)[5] for line in maps.read_text().splitlines() if line.count("/") > 0}
+    return sorted(path for path in paths if ".so" in path and "site-packages" not in path)
+
+
+def _cholmod_version(library: str | None) -> str:
+    if library is None:
+        return "of unknown version"
+    parts = (ctypes.c_int * 3)()
+    try:
+        ctypes.CDLL(library).cholmod_version(parts)
+    except (OSError, AttributeError):
+        return library
+    return ".".join(map(str, parts))

@@ -1,0 +1,142 @@
+"""Other processes of ours: started with this interpreter, told to stop in order, and never left behind.
+
+A child runs with `--until-eof`: it stops when its standard input closes.  So it goes when we go, whatever ends us.
+"""
+
+import collections
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import IO
+
+from factorbus.cli.exits import Stopped
+
+READY = "ready "
+_STOP_S = 20.0
+
+
+class Child:
+    """A running child: what it prints, and what it last said on standard error."""
+
+    def __init__(self, name: str, arguments: Sequence[str], say: Callable[[str], None] | None = None) -> None:
+        self.name = name
+        self._say = say  # gets what it prints on standard error, until it is ready
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "factorbus.cli", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C is ours to handle: children are stopped in order
+        )
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._said: collections.deque[str] = collections.deque(maxlen=20)
+        self._readers = [
+            threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True),
+            threading.Thread(target=self._listen, args=(self._process.stderr,), daemon=True),
+        ]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    def line(self, timeout_s: float) -> str:
+        """The next line it prints.  Raises Stopped when it ends or stays silent instead."""
+        try:
+            line = self._lines.get(timeout=timeout_s)
+        except queue.Empty:
+            raise Stopped("child_silent", f"the {self.name} process said nothing for {timeout_s:g} s") from None
+        if line is None:
+            raise self._died()
+        return line.rstrip("\n")
+
+    def ready(self, timeout_s: float) -> list[str]:
+        """What follows `ready ` on the line that says so: endpoints, or a name.  Raises Stopped."""
+        while not (line := self.line(timeout_s)).startswith(READY):
+            pass
+        self._say = None
+        return line.removeprefix(READY).split()
+
+    def output(self, timeout_s: float) -> str:
+        """All it prints until it ends well.  Raises Stopped."""
+        try:
+            code = self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise Stopped("child_silent", f"the {self.name} process did not end within {timeout_s:g} s") from None
+        if code != 0:
+            raise self._died()
+        return "".join(iter(self._lines.get, None))
+
+    def ended(self) -> bool:
+        """Whether it has ended, well or not."""
+        return self._process.poll() is not None
+
+    def stop(self) -> None:
+        """Close its standard input and wait; what does not go by itself is made to."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        for act in (lambda: None, self._process.terminate, self._process.kill):
+            act()
+            try:
+                self._process.wait(_STOP_S)
+                break
+            except subprocess.TimeoutExpired:
+                continue
+        for reader in self._readers:
+            reader.join(_STOP_S)
+        for stream in (self._process.stdout, self._process.stderr):
+            if stream is not None:
+                stream.close()
+
+    def _read(self, stream: IO[str]) -> None:
+        for line in stream:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _listen(self, stream: IO[str]) -> None:
+        for line in stream:
+            self._said.append(line.rstrip("\n"))
+            if self._say is not None:
+                self._say(self._said[-1])
+
+    def _died(self) -> Stopped:
+        code = self._process.wait(_STOP_S)
+        self._readers[1].join(_STOP_S)
+        last = next((line for line in reversed(self._said) if line.strip()), "nothing")
+        return Stopped("child_failed", f"the {self.name} process ended with exit code {code}; it said: {last}")
+
+
+@contextmanager
+def child(name: str, *arguments: str, say: Callable[[str], None] | None = None) -> Iterator[Child]:
+    """`factorbus ARGUMENTS` as a process of its own while inside."""
+    process = Child(name, arguments, say)
+    try:
+        yield process
+    finally:
+        process.stop()
+
+
+@contextmanager
+def service(
+    *options: str, say: Callable[[str], None] | None = None, timeout_s: float = 600.0
+) -> Iterator[tuple[Child, str]]:
+    """A solver process of our own on a free port of this machine, and its endpoint.
+
+    say gets what it tells while it starts.  timeout_s allows for compiling every kernel on a cold start.
+    """
+    with child("solver", "serve", "--listen", "tcp/127.0.0.1:0", "--until-eof", *options, say=say) as process:
+        yield process, process.ready(timeout_s)[0]
+
+
+@contextmanager
+def worker(endpoint: str, name: str, timeout_s: float = 600.0) -> Iterator[Child]:
+    """A worker process joined to `endpoint`."""
+    with child(name, "work", "--connect", endpoint, "--name", name, "--until-eof") as process:
+        process.ready(timeout_s)
+        yield process

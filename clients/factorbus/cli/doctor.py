@@ -1,0 +1,44 @@
+"""`factorbus doctor`: what is wrong on this machine, and how to mend it."""
+
+from dataclasses import asdict
+
+import click
+
+from factorbus.cli import screen
+from factorbus.cli.exits import FAILED, OK
+from factorbus.cli.options import json_option
+
+_SIGNS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[red]FAIL[/]"}
+
+
+@click.command()
+@json_option
+def command(as_json: bool) -> int:
+    """Look at versions, SuiteSparse and its BLAS, caches, ports, the bus, shared memory and the clock.
+
+    A warning is something that works but could be better; with a failure the exit code is 1.
+
+    \b
+    factorbus doctor
+    factorbus doctor --json
+    """
+    from factorbus.cli.checks import CHECKS
+
+    findings = []
+    for look in CHECKS:
+        screen.note(f"looking at {look.__doc__}")
+        findings.append(look())
+    failed = sum(finding.state == "fail" for finding in findings)
+    if as_json:
+        screen.document({"healthy": not failed, "checks": [asdict(finding) for finding in findings]})
+    else:
+        screen.table([(f.name, _line(f.state, f.seen, f.mend)) for f in findings], title="factorbus doctor")
+        warned = sum(finding.state == "warn" for finding in findings)
+        click.echo(f"{len(findings) - failed - warned} ok, {warned} to look at, {failed} to mend")
+    return FAILED if failed else OK
+
+
+def _line(state: str, seen: str, mend: str) -> str:
+    from rich.markup import escape
+
+    return f"{_SIGNS[state]}  {escape(seen)}" + (f"\n      → {escape(mend)}" if mend else "")

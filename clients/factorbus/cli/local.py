@@ -1,0 +1,75 @@
+"""A map in this process, without a bus: the same solver, for `replay --in-process`."""
+
+import time
+from collections.abc import Iterable
+from typing import Any
+
+from factorbus.cli.drive import Compared, Stepped
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
+
+
+class LocalMap:
+    """A solver of our own."""
+
+    def __init__(self, mode: str = "auto") -> None:
+        self._solver = Solver(Options(mode=mode, clock=time.perf_counter))
+        self._revision = 0
+        self._cpu_s = 0.0
+        self._compared: list[Compared] = []
+
+    def send(self, batch: Batch) -> list[Stepped]:
+        """Stage and step.  Raises SolverError."""
+        start = time.thread_time()
+        self._solver.stage(batch)
+        return [self._step(start, settle=False)]
+
+    def flush(self) -> list[Stepped]:
+        """Nothing is ever out."""
+        return []
+
+    def settle(self) -> Stepped:
+        """Iterate until converged."""
+        return self._step(time.thread_time(), settle=True)
+
+    def compare(self) -> None:
+        """Solve the same graph from scratch, here and now: the drive waits."""
+        start = time.perf_counter()
+        batch = solve_batch(*self._solver.graph())
+        seconds = time.perf_counter() - start
+        self._compared.append(Compared(self._revision, self._solver.chi2(), batch.chi2, "in-process", seconds))
+
+    def compared(self) -> list[Compared]:
+        """All comparisons."""
+        return self._compared
+
+    def estimate(self) -> tuple[Variables, ...]:
+        """A copy of all variables."""
+        return _variables(self._solver.estimate())
+
+    def graph(self) -> Batch:
+        """A copy of all variables and factors."""
+        variables, factors = self._solver.graph()
+        return Batch(_variables(variables), tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in factors))
+
+    def account(self) -> dict[str, Any]:
+        """CPU seconds of this thread in the solver, seconds of compiling."""
+        return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compiled_seconds(), "deltas": None}
+
+    def _step(self, start: float, settle: bool) -> Stepped:
+        report = self._solver.step(settle=settle).as_dict()
+        self._cpu_s += time.thread_time() - start
+        self._revision += 1
+        return Stepped(self._revision, report, None)
+
+
+def dead_reckoning(batches: Iterable[Batch]) -> tuple[float, tuple[Variables, ...]]:
+    """(χ², variables) of the whole graph before any step: each as composed from the first factor that reaches it."""
+    solver = Solver(Options(clock=time.perf_counter))
+    for batch in batches:
+        solver.stage(batch)
+    return solver.chi2(), _variables(solver.estimate())
+
+
+def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
+    return tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in groups)

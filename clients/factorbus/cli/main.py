@@ -1,0 +1,88 @@
+"""The entry point: the table of commands, each imported when it is called, and how the process ends."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+import click
+
+from factorbus.cli.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
+
+# name -> (module, one line).  The lines stand here so that `factorbus --help` imports none of the commands.
+COMMANDS = {
+    "demo": ("demo", "A simulated robot drives: solver, workers, robot and viewer as processes."),
+    "serve": ("serve", "Own maps and answer on the bus until stopped."),
+    "work": ("work", "Join the bus as a worker and take jobs."),
+    "replay": ("replay", "Drive a g2o, TORO or iSAM file through a map, pose by pose."),
+    "simulate": ("simulate", "Write a simulated world to a file."),
+    "convert": ("convert", "Turn one file format into another."),
+    "warm": ("warm", "Compile the kernels ahead."),
+    "doctor": ("doctor", "Look for what is wrong on this machine, and say how to mend it."),
+    "bench": ("bench", "Measure, beside what it is held against."),
+    "version": ("version", "The version, and those of the libraries."),
+    "robot": ("robot", ""),
+}
+_HIDDEN = ("robot",)
+
+_EPILOG = """\b
+Start here:
+  factorbus demo                              what it looks like, in a minute
+  factorbus replay my.g2o --plot map.png      the same with a file of your own
+  factorbus serve                             then connect with ten lines of Python
+
+\b
+Exit codes:
+"""
+
+
+class _Commands(click.Group):
+    """A group that knows the names and lines of its commands without importing them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [name for name in COMMANDS if name not in _HIDDEN]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        return importlib.import_module(f"factorbus.cli.{COMMANDS[cmd_name][0]}").command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            ctx.fail(f"there is no command {args[0]!r}; wanted one of {', '.join(self.list_commands(ctx))}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, COMMANDS[name][1]) for name in self.list_commands(ctx)])
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog=_EPILOG + "\n".join(f"  {code:<5}{meaning}" for code, meaning in EXIT_CODES.items()),
+)
+@click.option("--debug", is_flag=True, help="On an error, show the traceback too (or FACTORBUS_DEBUG=1).")
+def cli(debug: bool) -> None:
+    """A SLAM back end that robots talk to over a Zenoh message bus."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code, and never shows a traceback unless asked to."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments or bool(os.environ.get("FACTORBUS_DEBUG"))
+    try:
+        return cli.main(arguments, prog_name="factorbus", standalone_mode=False) or OK
+    except click.ClickException as error:
+        error.show()
+        return USAGE
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output left, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return OK
+    except Exception as error:
+        return report(error, as_json="--json" in arguments, debug=debug)

@@ -1,0 +1,37 @@
+"""Options that several commands have."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+MODES = ("auto", "all-batch")
+
+
+def json_option(command: F) -> F:
+    """--json."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")(command)
+
+
+def file_argument(name: str) -> Callable[[F], F]:
+    """A path that is checked by who reads it, so that a bad one has the exit code of a bad file."""
+    return click.argument(name, type=click.Path(path_type=Path))
+
+
+def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F]:
+    """An option that names a file to write; its folder must exist, which is said before the work and not after."""
+    return click.option(
+        flag, name, type=click.Path(path_type=Path), callback=_folder_exists, metavar=metavar, help=text
+    )
+
+
+def _folder_exists(_ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    if path is not None and not path.absolute().parent.is_dir():
+        raise click.BadParameter(f"there is no folder {path.parent}; make it first", param=parameter)
+    if path is not None and path.is_dir():
+        raise click.BadParameter(f"{path} is a folder; wanted the name of a file", param=parameter)
+    return path

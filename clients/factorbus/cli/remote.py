@@ -1,0 +1,104 @@
+"""A map on the bus, driven and mirrored by this process."""
+
+import time
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from factorbus.cli.drive import Compared, Stepped
+from factorbus.client import Map, Ticket
+from factorbus.proto.messages import Accepted, Batch, Delta, Variables
+
+_ANSWER_S = 600.0
+
+
+class RemoteMap:
+    """A joined map.  With a window of 1 an insert is done when its answer and its delta are here."""
+
+    def __init__(self, joined: Map, window: int = 1) -> None:
+        self._map, self._window = joined, window
+        self._mirror = joined.estimate
+        self._out: deque[Ticket] = deque()
+        self._start = self._mirror.revision
+        self._received: set[int] = set()
+        self._forget = self._mirror.on_delta(self._on_delta)
+        self._comparers = ThreadPoolExecutor(2, thread_name_prefix="compare")
+        self._comparisons: list[Future[Compared]] = []
+
+    def send(self, batch: Batch) -> list[Stepped]:
+        """Insert, waiting with a window of 1; otherwise with up to `window` inserts out."""
+        if self._window == 1:
+            start = time.perf_counter()
+            accepted = self._map.insert(batch)
+            self._mirror.wait_for(accepted.revision)
+            return [_stepped(accepted, time.perf_counter() - start)]
+        self._out.append(self._map.send(batch))
+        return self._collect(wait=False)
+
+    def flush(self) -> list[Stepped]:
+        """Until all are answered and mirrored."""
+        steps = self._collect(wait=True)
+        if steps:
+            self._mirror.wait_for(steps[-1].revision)
+        return steps
+
+    def settle(self) -> Stepped:
+        """Iterate until converged."""
+        start = time.perf_counter()
+        accepted = self._map.settle()
+        self._mirror.wait_for(accepted.revision)
+        return _stepped(accepted, time.perf_counter() - start)
+
+    def compare(self) -> None:
+        """Ask for the batch optimum in the background; a worker finds it while the drive goes on."""
+        self._comparisons.append(self._comparers.submit(self._compare))
+
+    def compared(self) -> list[Compared]:
+        """All comparisons, by revision."""
+        done = [comparison.result(_ANSWER_S) for comparison in self._comparisons]
+        return sorted(done, key=lambda each: each.revision)
+
+    def estimate(self) -> tuple[Variables, ...]:
+        """The mirror's present values."""
+        columns = self._mirror.snapshot().columns
+        return tuple(Variables(kind, keys, values) for kind, (keys, values) in columns.items())
+
+    def graph(self) -> Batch:
+        """The map's graph, from the service."""
+        return self._map.graph().batch
+
+    def account(self) -> dict[str, Any]:
+        """What the service says of itself, and the deltas that came here."""
+        stats = self._map.stats()
+        return {
+            "solver_cpu_s": stats["solver_cpu_s"],
+            "kernels_compiled_s": stats["kernels_compiled_s"],
+            "deltas": len(self._received),
+        }
+
+    def close(self) -> None:
+        """Stop listening; comparisons not begun are dropped."""
+        self._forget()
+        self._comparers.shutdown(cancel_futures=True)
+
+    def _on_delta(self, delta: Delta) -> None:
+        """Count a step's own delta; a resynchronisation (previous 0, everything in one) is not one."""
+        if delta.previous == delta.revision - 1 and delta.revision > self._start:
+            self._received.add(delta.revision)
+
+    def _compare(self) -> Compared:
+        answer = self._map.chi2(batch=True, timeout_s=_ANSWER_S)
+        batch = float("nan") if answer.batch is None else answer.batch
+        return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds)
+
+    def _collect(self, wait: bool) -> list[Stepped]:
+        steps = []
+        while self._out and (wait or self._out[0].done()):
+            ticket = self._out.popleft()
+            accepted = ticket.result(_ANSWER_S)
+            steps.append(_stepped(accepted, ticket.round_trip_s or 0.0))
+        return steps
+
+
+def _stepped(accepted: Accepted, seconds: float) -> Stepped:
+    return Stepped(accepted.revision, accepted.report, seconds * 1e3 - accepted.report["step_ms"])

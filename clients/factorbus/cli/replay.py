@@ -1,0 +1,219 @@
+"""`factorbus replay`: a graph file through a map, pose by pose, as a robot would have sent it."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.exits import Stopped, input_file, require
+from factorbus.cli.options import MODES, file_argument, json_option, out_option
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the command line asked for."""
+
+    file: Path
+    in_process: bool
+    connect: str | None
+    map_name: str
+    mode: str
+    every: int
+    window: int
+    use_values: bool
+    settle: bool
+    tum: Path | None
+    out: Path | None
+    plot: Path | None
+
+    @property
+    def where(self) -> str:
+        """In words."""
+        if self.in_process:
+            return "this process"
+        return f"map {self.map_name} at {self.connect}" if self.connect else "a solver process of its own"
+
+
+@click.command()
+@file_argument("file")
+@click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
+@click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
+@click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
+@click.option("--mode", type=click.Choice(MODES), default="auto", show_default=True, help="How the map is solved.")
+@click.option(
+    "--every",
+    type=click.IntRange(0),
+    default=0,
+    metavar="N",
+    help="Hold χ² against the batch optimum at every Nth step.",
+)
+@click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
+@click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
+@click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
+@out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
+@out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
+@out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
+@json_option
+def command(as_json: bool, **asked: Any) -> None:
+    """Drive FILE (g2o, TORO .graph or iSAM text) through a map, pose by pose.
+
+    Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
+    there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
+
+    \b
+    factorbus replay intel.g2o
+    factorbus replay intel.g2o --every 100 --plot intel.png
+    factorbus replay intel.g2o --connect tcp/127.0.0.1:7447 --map lab --tum lab.tum
+    factorbus replay intel.g2o --in-process --json
+
+    \b
+    In the result, per insert or step:
+      step_ms      the solver's own time
+      bus_ms       from sending the insert to having its answer and its delta here, beyond step_ms; with --window
+                   above 1, from sending to the answer, queueing included
+      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
+    """
+    request = Request(**asked)
+    if request.in_process and request.connect:
+        raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
+    from factorbus.cli import screen
+
+    result = replay(request)
+    if as_json:
+        screen.document(result)
+    else:
+        screen.table(_rows(result), title=f"{request.file}, in {request.where}")
+
+
+def replay(request: Request) -> dict[str, Any]:
+    """Do it, with progress on standard error; returns the document."""
+    from factorbus.cli import screen
+    from factorbus.cli.drive import drive
+    from factorbus.formats import read
+
+    with input_file(request.file):
+        graph = read(request.file)
+    for text in graph.notes:
+        screen.note(f"{request.file}: {text}")
+    steps = graph.steps(use_values=request.use_values)
+    with _target(request) as target:
+        before = target.account()
+        with screen.progress(request.file.name, graph.poses) as show:
+            driven = drive(target, steps, request.every, show)
+        unsettled = driven.steps[-1].report["chi2"]
+        last = target.settle() if request.settle else driven.steps[-1]
+        compared = target.compared()
+        after = target.account()
+        _write(request, target)
+        start = _start(request, steps)
+        if request.plot:
+            _draw(request.plot, request.file.name, target, start)
+    measured = driven.measures()
+    return {
+        "file": str(request.file),
+        "where": request.where,
+        **measured,
+        "revision": last.revision,
+        "chi2": last.report["chi2"],
+        "chi2_unsettled": unsettled,
+        "chi2_initial": start[0] if start else None,
+        "settled": bool(request.settle and last.report["converged"]),
+        "settle_iterations": last.report["iterations"] if request.settle else 0,
+        "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
+        "kernels_compiled_s": after["kernels_compiled_s"],
+        "deltas": after["deltas"],
+        "against_batch": [each.as_dict() for each in compared],
+    }
+
+
+@contextmanager
+def _target(request: Request) -> Iterator[Any]:
+    """The map to drive into: here, in a service of our own, or in one that runs."""
+    if request.in_process:
+        require("service", "factorbus replay --in-process")
+        from factorbus.cli.local import LocalMap
+
+        yield LocalMap(request.mode)
+        return
+    from factorbus.cli.children import service, worker
+    from factorbus.cli.remote import RemoteMap
+    from factorbus.cli.screen import note
+    from factorbus.cli.stopping import interrupt_on_sigterm
+    from factorbus.client import connect
+
+    with ExitStack() as stack:
+        stack.enter_context(interrupt_on_sigterm())
+        endpoint = request.connect
+        if endpoint is None:
+            require("service", "factorbus replay without --connect")
+            _, endpoint = stack.enter_context(service(say=note))
+            if request.every:
+                stack.enter_context(worker(endpoint, "worker1"))
+        bus = stack.enter_context(connect(endpoint, client="replay"))
+        joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))
+        if joined.estimate.revision > 0:
+            raise Stopped(
+                "map_not_empty",
+                f"map {request.map_name!r} is at revision {joined.estimate.revision} already; "
+                "a replay needs an empty one: give another --map",
+                map=request.map_name,
+            )
+        target = RemoteMap(joined, request.window)
+        stack.callback(target.close)
+        yield target
+
+
+def _write(request: Request, target: Any) -> None:
+    from factorbus.formats import write_g2o, write_tum
+
+    if request.out:
+        write_g2o(request.out, target.graph())
+    if request.tum:
+        write_tum(request.tum, _poses(target))
+
+
+def _poses(target: Any) -> Any:
+    from factorbus.proto.messages import Batch
+
+    return Batch(target.estimate())
+
+
+def _start(request: Request, steps: Any) -> Any:
+    """Dead reckoning, by the solver where it is installed; a light client does without."""
+    try:
+        from factorbus.cli.local import dead_reckoning
+    except ModuleNotFoundError:
+        return None
+    return dead_reckoning(steps)
+
+
+def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
+    step, bus = result["step_ms"], result["bus_ms"]
+    rows = [
+        ("graph", f"{result['poses']} poses, {result['landmarks']} landmarks, {result['factors']} factors"),
+        (
+            "time",
+            f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s; solver CPU {result['solver_cpu_s']:.2f} s",
+        ),
+        ("step", _times(step)),
+    ]
+    if bus:
+        rows.append(("bus", _times(bus)))
+        rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
+    initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
+    rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
+    rows += [
+        (f"χ² / batch at {each['revision']}", f"{each['ratio']:.9f}  ({each['worker']}, {each['seconds']:.2f} s)")
+        for each in result["against_batch"]
+    ]
+    rows.append(("strategies", ", ".join(f"{name} {count}" for name, count in result["strategies"].items())))
+    if result["kernels_compiled_s"] > 0.1:
+        rows.append(("compiling", f"{result['kernels_compiled_s']:.1f} s, once on this machine"))
+    return rows
+
+
+def _times(times: dict[str, float]) -> str:
+    return f"p50 {times['p50']:.2f}   p95 {times['p95']:.2f}   p99 {times['p99']:.2f}   max {times['max']:.2f} ms"

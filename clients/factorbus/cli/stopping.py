@@ -1,0 +1,57 @@
+"""When a long-running command stops: a signal, or the end of standard input."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from factorbus.cli.exits import INTERRUPTED
+
+
+@contextmanager
+def stop_on_signals(until_eof: bool) -> Iterator[threading.Event]:
+    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set.  The second signal is final."""
+    stop = threading.Event()
+
+    def on_signal(number: int, _frame: object) -> None:
+        if stop.is_set():
+            os._exit(INTERRUPTED)
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    if until_eof:
+        threading.Thread(target=_wait_for_eof, args=(stop,), daemon=True).start()
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interrupt_on_sigterm() -> Iterator[None]:
+    """While inside, SIGTERM ends the command as Ctrl-C does: through every `finally`."""
+
+    def on_signal(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, on_signal)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def leave_on_eof() -> None:
+    """Wait for the end of standard input, then end this process at once: whoever started it has gone."""
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os._exit(INTERRUPTED)
+
+
+def _wait_for_eof(stop: threading.Event) -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    stop.set()

@@ -1,0 +1,23 @@
+"""`factorbus warm`: compile every kernel ahead, so that no robot waits for it."""
+
+import click
+
+from factorbus.cli.exits import require
+from factorbus.cli.screen import note
+
+
+@click.command()
+def command() -> None:
+    """Compile the solver's kernels into the cache, and say how long it took.
+
+    Do it once after installing or upgrading, on each machine that runs `factorbus serve` or `factorbus work`.
+    A second time it only loads them.
+
+    \b
+    factorbus warm
+    """
+    require("service", "factorbus warm")
+    from factorbus.solver import compiled_seconds, warm
+
+    seconds = warm(lambda group: note(f"  {group}"))
+    click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")
