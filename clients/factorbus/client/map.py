@@ -82,8 +82,7 @@ class Map:
         Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
         """
         accepted = self.send(batch, settle=settle, timeout_s=timeout_s).result(timeout_s)
-        if self._mirror is not None:
-            self._mirror.try_wait_for(accepted.revision, self.timeout_s if timeout_s is None else timeout_s)
+        self._catch_up(timeout_s)
         return accepted
 
     def settle(self, timeout_s: float | None = None) -> Accepted:
@@ -107,7 +106,7 @@ class Map:
         return ticket
 
     def flush(self, timeout_s: float | None = None) -> None:
-        """Wait until everything sent is answered.
+        """Wait until everything sent is answered, and the mirror has it.
 
         Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
         """
@@ -122,6 +121,7 @@ class Map:
         for ticket, refusal in refused:
             if not ticket.seen:
                 raise refusal
+        self._catch_up(timeout_s)
 
     def rejoin(self) -> int:
         """Join the map as it is now, creating it if need be, and return its epoch; numbering starts again.
@@ -206,6 +206,11 @@ class Map:
         payload = codec.encode_insert(insert)
         errand = Errand(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
         return Ticket(errand, insert.sequence, timeout_s)
+
+    def _catch_up(self, timeout_s: float | None) -> None:
+        """Let the mirror reach what has been accepted; if it does not, it says that it is stale."""
+        if self._mirror is not None:
+            self._mirror.try_catch_up(self.timeout_s if timeout_s is None else timeout_s)
 
     def _wait_for_room(self, timeout_s: float) -> None:
         room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)

@@ -120,7 +120,7 @@ class Mirror:
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable."""
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        if self.try_wait_for(revision, timeout_s):
+        if self._try_wait(lambda: self._there(revision), timeout_s):
             return
         state = "stale" if self.stale else "up to date"
         hint = (
@@ -128,14 +128,9 @@ class Mirror:
         )
         raise Unavailable(f"revision {revision} of map {self._map!r}", timeout_s, hint)
 
-    def try_wait_for(self, revision: int, timeout_s: float) -> bool:
-        """Like `wait_for`, but says whether it came to that."""
-        end = time.monotonic() + timeout_s
-        with self._changed:
-            if self._changed.wait_for(lambda: self._there(revision), min(_IMPATIENT_S, timeout_s)):
-                return True
-            self._inbox.put(("probe", None))
-            return self._changed.wait_for(lambda: self._there(revision), max(end - time.monotonic(), 0.0))
+    def try_catch_up(self, timeout_s: float) -> bool:
+        """Wait until nothing is known that is not here; says whether it came to that."""
+        return self._try_wait(lambda: not self.stale, timeout_s)
 
     def on_delta(self, callback: Callable[[Delta], None]) -> Callable[[], None]:
         """Have `callback` called with every delta after it is applied; returns what takes it off again.
@@ -171,6 +166,14 @@ class Mirror:
         if self._inbox.qsize() < _BACKLOG:
             self._inbox.put((word, data))
         # Otherwise it is lost, and the next one that fits shows the gap.
+
+    def _try_wait(self, reached: Callable[[], bool], timeout_s: float) -> bool:
+        end = time.monotonic() + timeout_s
+        with self._changed:
+            if self._changed.wait_for(reached, min(_IMPATIENT_S, timeout_s)):
+                return True
+            self._inbox.put(("probe", None))
+            return self._changed.wait_for(reached, max(end - time.monotonic(), 0.0))
 
     def _there(self, revision: int) -> bool:
         return self._following.live and self._following.revision >= revision

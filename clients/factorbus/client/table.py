@@ -24,7 +24,8 @@ class Table:
             first = self._rows[int(keys[0])]
             self._values[first : first + known] = values[:known]
         if known < len(keys):
-            self._values[self._rows_of(keys[known:])] = values[known:]
+            rows = self._rows_of(keys[known:])  # first: it may replace the array by a larger one
+            self._values[rows] = values[known:]
 
     def get(self, key: int) -> F64 | None:
         """A copy of the row of `key`, if there is one."""

@@ -1,0 +1,468 @@
+"""The client against a service that fails in every way the bus allows, over real zenoh on a local socket.
+
+The service here is small (it stores point2 values as they come) but keeps the contract of `proto/README.md`: epochs,
+numbering, first answers repeated, deltas with their previous revision.  What it does wrong, it is told to.
+"""
+
+import json
+import subprocess
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from zenoh.handlers import Callback
+
+from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, courier
+from factorbus.client.mirror import Mirror
+from factorbus.proto import codec, keys
+from factorbus.proto.messages import Accepted, Delta, Estimate, Variables
+from factorbus.proto.problems import BadEndpoint, BadName, BadSequence, Busy, Problem, UnknownMap, WrongEpoch
+
+pytestmark = pytest.mark.timeout(40)
+MAP = "kitchen"
+
+
+class Service:
+    """One map, owned as the contract says; `faults` are taken one per insert."""
+
+    def __init__(self, folder: Path, epoch: int = 1) -> None:
+        self.epoch, self.revision = epoch, 0
+        self.values: dict[int, np.ndarray] = {}
+        self.answers: dict[tuple[str, int], bytes] = {}
+        self.next: Counter[str] = Counter()
+        self.faults: deque[str] = deque()
+        self.tries: Counter[int] = Counter()
+        self.asked: list[str] = []
+        self.mute = False
+        self.ask_fault = ""
+        self.held: list[zenoh.Query] = []
+        self._inbox: SimpleQueue[zenoh.Query | None] = SimpleQueue()
+        self._session = zenoh.open(_peer(folder))
+        self._queryables = [
+            self._session.declare_queryable(key, Callback(self._inbox.put, indirect=False), complete=True)
+            for key in (keys.inserts_of_any_client(MAP), keys.any_question(MAP), f"{keys.PREFIX}/admin/*")
+        ]
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._token = self._session.liveliness().declare_token(keys.service_token(MAP, f"s{epoch}"))
+
+    def close(self) -> None:
+        self._inbox.put(None)
+        self._thread.join(5)
+        for query in self.held:
+            query.drop()
+        self._session.close()
+
+    def step(self, values: dict[int, tuple[float, float]]) -> None:
+        """A step that no insert of ours caused."""
+        self.values |= {key: np.array(value, float) for key, value in values.items()}
+        self.revision += 1
+        if not self.mute:
+            delta = Delta(self.epoch, self.revision, self.revision - 1, self._columns(list(values)))
+            self._session.put(
+                keys.delta_key(MAP), codec.encode_delta(delta), congestion_control=zenoh.CongestionControl.BLOCK
+            )
+
+    def _run(self) -> None:
+        while (query := self._inbox.get()) is not None:
+            key = str(query.key_expr)
+            payload = query.payload.to_bytes() if query.payload else b""
+            try:
+                if "/in/" in key:
+                    answer = self._insert(keys.client_of(key), codec.decode_insert(payload), query)
+                elif "/ask/" in key:
+                    answer = self._ask(key.rpartition("/")[2], payload)
+                else:
+                    answer = self._admin(key.rpartition("/")[2])
+                if answer is not None:
+                    query.reply(query.key_expr, answer)
+            except Problem as problem:
+                query.reply_err(codec.encode_problem(problem))
+            if query not in self.held:
+                query.drop()
+
+    def _insert(self, client: str, insert: Any, query: zenoh.Query) -> bytes | None:
+        self.tries[insert.sequence] += 1
+        fault = self.faults.popleft() if self.faults else ""
+        if fault == "silence":
+            return None
+        if fault == "busy":
+            raise Busy(1, 0.01)
+        if fault == "hold":
+            self.held.append(query)
+            return None
+        if insert.epoch not in (0, self.epoch):
+            raise WrongEpoch(insert.epoch, self.epoch)
+        if fault == "parked too long":
+            raise BadSequence(client, insert.sequence, "earlier", insert.sequence - 1)
+        if (client, insert.sequence) not in self.answers:
+            if insert.sequence != self.next[client] + 1:
+                raise BadSequence(client, insert.sequence, "the next", self.next[client] + 1)
+            self.next[client] += 1
+            self.answers[client, insert.sequence] = self._fold(insert)
+        if fault == "answer lost":
+            return None
+        answer = self.answers[client, insert.sequence]
+        if not answer:
+            raise Problem("there is a NaN in it")
+        return answer
+
+    def _fold(self, insert: Any) -> bytes:
+        groups = insert.batch.variables
+        if any(not np.isfinite(group.values).all() for group in groups):
+            return b""
+        self.step({int(k): tuple(v) for g in groups for k, v in zip(g.keys, g.values, strict=True)})
+        return codec.encode_accepted(Accepted(insert.sequence, self.epoch, self.revision, 0, 1, {}))
+
+    def _ask(self, question: str, payload: bytes) -> bytes | None:
+        self.asked.append(question)
+        if self.ask_fault == "silence":
+            return None
+        if question == "stats":
+            return codec.encode_map({"steps": self.revision})
+        wanted = codec.decode_keys_asked(payload)
+        chosen = list(self.values) if wanted is None else wanted.tolist()
+        return codec.encode_estimate(Estimate(self.epoch, self.revision, self._columns(chosen)))
+
+    def _admin(self, operation: str) -> bytes:
+        row = {"name": MAP, "mode": "auto", "epoch": self.epoch, "revision": self.revision}
+        row |= {"variables": len(self.values), "factors": 0}
+        return codec.encode_map({"maps": [row]} if operation == "maps" else row)
+
+    def _columns(self, chosen: list[int]) -> tuple[Variables, ...]:
+        if not chosen:
+            return ()
+        return (Variables("point2", np.array(chosen), np.array([self.values[key] for key in chosen])),)
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Service]]:
+    running: list[Service] = []
+
+    def begin(epoch: int = 1) -> Service:
+        running.append(Service(tmp_path, epoch))
+        return running[-1]
+
+    yield begin
+    for service in running:
+        service.close()
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return _endpoint(tmp_path)
+
+
+def point(key: str, x: float, y: float = 0.0) -> Draft:
+    return Draft().point2(key, (x, y))
+
+
+def same(mirror: Mirror, service: Service) -> bool:
+    numbers, values = mirror.columns("point2")
+    return {k: v.tobytes() for k, v in zip(numbers.tolist(), values, strict=True)} == {
+        k: v.tobytes() for k, v in service.values.items()
+    }
+
+
+def test_inserts_are_answered_and_seen_in_the_mirror(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint, client="robot1") as bus, bus.map(MAP) as kitchen:
+        accepted = kitchen.insert(point("l1", 1.5))
+        assert (accepted.sequence, accepted.revision) == (1, 1)
+        assert kitchen.estimate["l1"].tolist() == [1.5, 0]
+        assert "l1" in kitchen.estimate
+        assert "l2" not in kitchen.estimate
+        assert len(kitchen.estimate) == 1
+        assert kitchen.client.startswith("robot1-")
+        tickets = [kitchen.send(point(f"l{i}", i / 3)) for i in range(2, 200)]
+        kitchen.flush()
+        assert [ticket.result().sequence for ticket in tickets] == list(range(2, 200))
+        assert all(0 < ticket.round_trip_s < 10 for ticket in tickets)
+        kitchen.estimate.wait_for(199)
+        assert same(kitchen.estimate, service)
+        assert not kitchen.estimate.stale
+        assert kitchen.estimate.age_s < 10
+        assert kitchen.stats() == {"steps": 199}
+        assert [row.name for row in bus.maps()] == [MAP]
+        with pytest.raises(KeyError, match="x7 is not in map 'kitchen'"):
+            kitchen.estimate["x7"]
+
+
+@pytest.mark.parametrize("fault", ["silence", "busy", "answer lost"])
+def test_an_insert_is_sent_again_with_its_number_and_taken_once(
+    start: Callable[..., Service], endpoint: str, fault: str
+) -> None:
+    service = start()
+    service.faults.extend([fault, fault, "", fault])
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        assert kitchen.insert(point("l1", 1)).revision == 1
+        assert kitchen.insert(point("l2", 2)).revision == 2
+        assert service.revision == 2
+        assert service.tries == {1: 3, 2: 2}
+        assert same(kitchen.estimate, service)
+
+
+def test_an_insert_nobody_answers_in_time_is_sent_again(
+    start: Callable[..., Service], endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(courier, "TRY_S", 0.1)
+    service = start()
+    service.faults.append("hold")
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        assert kitchen.insert(point("l1", 1)).revision == 1
+    assert service.tries[1] == 2
+
+
+def test_inserts_that_overtook_are_sent_again_behind_the_first(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    service.faults.extend(["silence", "parked too long", "parked too long"])
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        tickets = [kitchen.send(point(f"l{i}", i)) for i in range(3)]
+        kitchen.flush()
+        assert [ticket.result().revision for ticket in tickets] == [1, 2, 3]
+        assert same(kitchen.estimate, service)
+
+
+def test_a_refusal_reaches_whoever_looks(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        with pytest.raises(Refused, match="NaN"):
+            kitchen.insert(point("l1", float("nan")))
+        kitchen.flush()  # it has been seen
+        kitchen.send(point("l1", float("nan")))
+        kitchen.send(point("l2", 2))
+        with pytest.raises(Refused, match="NaN"):
+            kitchen.flush()
+        kitchen.flush()
+        assert service.revision == 1
+        assert kitchen.insert(point("l3", 3)).sequence == 4
+
+
+def test_a_refusal_nobody_saw_comes_out_of_with(start: Callable[..., Service], endpoint: str) -> None:
+    start()
+    with connect(endpoint) as bus:
+        kitchen = bus.map(MAP)
+        with pytest.raises(Refused, match="NaN"), kitchen:
+            kitchen.send(point("l1", float("nan")))
+
+
+def test_a_full_window_blocks_and_says_so(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    service.faults.extend(["hold", "hold"])
+    with connect(endpoint) as bus:
+        kitchen = bus.map(MAP, window=2)
+        first = kitchen.send(point("l1", 1))
+        kitchen.send(point("l2", 2))
+        with pytest.raises(Unavailable, match=r"window=2.*not sent"):
+            kitchen.send(point("l3", 3), timeout_s=0.05)
+        with pytest.raises(NoAnswerYet) as caught:
+            first.result(0.05)
+        assert caught.value.ticket is first
+        with pytest.raises(Unavailable, match="2 inserts are unanswered"):
+            kitchen.flush(0.05)
+        kitchen.close()
+        with pytest.raises(Unavailable, match="closed first"):
+            first.result()
+        with pytest.raises(Unavailable, match="open it again"):
+            kitchen.send(point("l3", 3))
+
+
+def test_a_lost_delta_is_noticed_by_the_next(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        heard: list[tuple[int, int]] = []
+        kitchen.estimate.on_delta(lambda delta: heard.append((delta.previous, delta.revision)))
+        service.step({1: (1, 1)})
+        kitchen.estimate.wait_for(1)
+        service.mute = True
+        service.step({2: (2, 2)})
+        service.mute = False
+        service.step({3: (3, 3)})
+        kitchen.estimate.wait_for(3)
+        assert same(kitchen.estimate, service)
+        assert heard == [(0, 1), (0, 3)]  # the second is the whole estimate
+
+
+def test_a_lost_last_delta_is_noticed_by_asking(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    service.mute = True
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        accepted = kitchen.send(point("l1", 1)).result()
+        assert kitchen.estimate.stale  # the answer told of a revision that is not here
+        kitchen.estimate.wait_for(accepted.revision)
+        assert same(kitchen.estimate, service)
+        changed = threading.Event()
+        kitchen.estimate.on_delta(lambda _: changed.set())
+        service.step({5: (5, 5)})  # nobody tells: found by the mirror's own asking
+        assert changed.wait(5)
+        assert same(kitchen.estimate, service)
+
+
+def test_a_mirror_nobody_confirms_is_stale(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        kitchen.insert(point("l1", 1))
+        service.ask_fault = "silence"
+        with pytest.raises(Unavailable, match="revision 9"):
+            kitchen.estimate.wait_for(9, timeout_s=0.5)
+        assert kitchen.estimate.stale
+        assert kitchen.estimate["l1"].tolist() == [1, 0]
+        service.ask_fault = ""
+        service.step({2: (2, 2)})
+        kitchen.estimate.wait_for(2)
+        assert same(kitchen.estimate, service)
+
+
+def test_a_callback_that_raises_stops_nothing(
+    start: Callable[..., Service], endpoint: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        forget = kitchen.estimate.on_delta(lambda _: 1 / 0)
+        kitchen.insert(point("l1", 1))
+        kitchen.insert(point("l2", 2))
+        forget()
+        assert kitchen.estimate.revision == 2
+    assert "on_delta callback failed at revision 1" in caplog.text
+
+
+def test_the_same_map_after_a_loss_of_the_link(start: Callable[..., Service], endpoint: str) -> None:
+    """The service goes and comes back with its state: what was sent meanwhile arrives, once."""
+    before = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        kitchen.insert(point("l1", 1))
+        before.close()
+        tickets = [kitchen.send(point(f"l{i}", i)) for i in range(2, 6)]
+        with pytest.raises(NoAnswerYet):
+            tickets[0].result(0.3)
+        assert kitchen.estimate.stale
+        after = start()
+        after.values, after.revision = before.values, before.revision
+        after.answers, after.next = before.answers, before.next
+        assert [ticket.result().sequence for ticket in tickets] == [2, 3, 4, 5]
+        kitchen.estimate.wait_for(5)
+        assert same(kitchen.estimate, after)
+
+
+def test_a_new_map_is_followed_but_not_written_to_until_joined(start: Callable[..., Service], endpoint: str) -> None:
+    before = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        kitchen.insert(point("l1", 1))
+        before.close()
+        after = start(epoch=2)
+        with pytest.raises(Refused) as caught:
+            kitchen.insert(point("l2", 2))
+        assert (caught.value.code, caught.value.detail["epoch"]) == ("wrong_epoch", 2)
+        after.step({9: (9, 9)})
+        kitchen.estimate.wait_for(1)
+        assert (kitchen.estimate.epoch, kitchen.epoch) == (2, 1)
+        assert same(kitchen.estimate, after)
+        assert kitchen.rejoin() == 2
+        assert kitchen.insert(point("l2", 2)).sequence == 1
+        assert same(kitchen.estimate, after)
+
+
+def test_joining_anew_gives_up_what_was_not_answered(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    service.faults.append("hold")
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        ticket = kitchen.send(point("l1", 1))
+        kitchen.rejoin()
+        with pytest.raises(Unavailable, match="joined the map anew"):
+            ticket.result()
+        assert kitchen.insert(point("l2", 1)).sequence == 1
+
+
+def test_nobody_there_is_said_within_the_time_given(endpoint: str) -> None:
+    with pytest.raises(Unavailable, match=r"did not answer within 0.2 s; start a service there"):
+        connect(endpoint, timeout_s=0.2)
+
+
+def test_connecting_waits_for_a_service_that_comes_later(start: Callable[..., Service], endpoint: str) -> None:
+    timer = threading.Timer(0.2, start)
+    timer.start()
+    with connect(endpoint, timeout_s=20) as bus, bus.map(MAP) as kitchen:
+        assert kitchen.insert(point("l1", 1)).revision == 1
+    timer.join()
+
+
+def test_a_map_nobody_owns_is_unavailable(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint, timeout_s=0.3) as bus:
+        with pytest.raises(UnknownMap, match="attic"):
+            bus.map("attic", create=False)
+        service.ask_fault = "silence"
+        with pytest.raises(Unavailable, match=r"asked for its stats, did not answer.*nobody replies"):
+            bus.map(MAP, mirror=False).stats()
+        with pytest.raises(Unavailable, match="mirror=True"):
+            _ = bus.map(MAP, mirror=False).estimate
+        with pytest.raises(Unavailable, match="the mirror is stale"):
+            bus.map(MAP)
+
+
+@pytest.mark.parametrize("bad", ["127.0.0.1:7447", "", "tcp", "tcp/"])
+def test_an_address_that_cannot_be_read_is_refused_at_once(bad: str) -> None:
+    with pytest.raises(BadEndpoint, match=r"tcp/127\.0\.0\.1:7447"):
+        connect(bad)
+
+
+def test_names_are_checked(start: Callable[..., Service], endpoint: str) -> None:
+    with pytest.raises(BadName, match="client"):
+        connect(endpoint, client="a/b")
+    start()
+    with connect(endpoint) as bus, pytest.raises(BadName, match="map"):
+        bus.map("a b")
+
+
+def test_two_threads_insert_through_one_handle(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP, window=4) as kitchen:
+
+        def drive(start_at: int) -> None:
+            for i in range(100):
+                kitchen.send(point(f"l{start_at + i}", i))
+
+        threads = [threading.Thread(target=drive, args=(at,)) for at in (0, 1000)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        kitchen.flush()
+        kitchen.estimate.wait_for(200)
+        assert same(kitchen.estimate, service)
+
+
+def test_a_process_that_forgets_to_close_ends_all_the_same(start: Callable[..., Service], endpoint: str) -> None:
+    start()
+    code = (
+        "from factorbus.client import connect, Draft\n"
+        f"kitchen = connect({endpoint!r}).map({MAP!r})\n"
+        "print(kitchen.insert(Draft().point2('l1', (1, 2))).revision, kitchen.estimate['l1'].tolist())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20, check=True)
+    assert done.stdout == "1 [1.0, 2.0]\n"
+
+
+def _endpoint(folder: Path) -> str:
+    return f"unixsock-stream/{folder}/bus.sock"
+
+
+def _peer(folder: Path) -> zenoh.Config:
+    config = zenoh.Config()
+    settings = {
+        "mode": "peer",
+        "listen/endpoints": [_endpoint(folder)],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
