@@ -1,0 +1,31 @@
+"""The solver of factorbus: pure mathematics, no bus, clock, thread, file or print.  `service/MATH.md` has the equations.
+
+    solver = Solver(Options(clock=time.perf_counter))
+    solver.stage(batch)
+    report = solver.step()
+    solver.estimate()
+"""
+
+from factorbus.solver import errors
+from factorbus.solver.batch import BatchResult, solve_batch
+from factorbus.solver.errors import SolverError
+from factorbus.solver.groups import FactorGroup, Group
+from factorbus.solver.kernels._jit import compiled_seconds
+from factorbus.solver.options import Options
+from factorbus.solver.report import StepReport
+from factorbus.solver.solver import Solver
+from factorbus.solver.warm import warm
+
+__all__ = [
+    "BatchResult",
+    "FactorGroup",
+    "Group",
+    "Options",
+    "Solver",
+    "SolverError",
+    "StepReport",
+    "compiled_seconds",
+    "errors",
+    "solve_batch",
+    "warm",
+]

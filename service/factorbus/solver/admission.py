@@ -1,0 +1,125 @@
+"""Judging a batch: everything about it is checked before any of it counts.
+
+Shapes and kinds are checked here; what concerns single rows is checked by the kernels in the pass that writes them
+behind the rows in use.  The caller goes back to its mark when this raises, so a batch is taken whole or not at all.
+"""
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.factors import FACTOR_KINDS, FactorKind
+from factorbus.solver.graph import Graph
+from factorbus.solver.groups import BatchLike, FactorsLike, VariablesLike
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.admit import admit_factors, admit_variables
+from factorbus.solver.kernels.reach import reach
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+
+_I64 = np.dtype(np.int64)
+_F64 = np.dtype(np.float64)
+
+
+def admit(graph: Graph, batch: BatchLike) -> None:
+    """Append `batch` to `graph` and give values to the variables that come without.
+
+    Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
+    BadRange, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and must go back to its mark.
+    """
+    first = int(graph.counts[at.VARIABLES])
+    first_factor = int(graph.counts[at.FACTORS])
+    given = [_admit_variables(graph, group) for group in batch.variables]
+    for group in batch.factors:
+        _admit_factors(graph, group)
+    if not all(has_values for _, has_values in given):
+        reached = np.repeat(np.array([flag for _, flag in given], np.int64), [count for count, _ in given])
+        _compose(graph, first, first_factor, reached)
+
+
+def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
+    """(how many, whether they come with values)."""
+    kind = VARIABLE_KINDS.get(group.kind)
+    if kind is None:
+        raise errors.UnknownKind("variable", group.kind, tuple(VARIABLE_KINDS))
+    keys = _column(group.keys, _I64, (-1,), group.kind, "keys")
+    if group.values is None:
+        values = np.empty((0, kind.size))
+    else:
+        values = _column(group.values, _F64, (keys.size, kind.size), group.kind, "values")
+    graph.reserve_variables(keys.size, kind.size)
+    row, wrong = admit_variables(
+        kind.code, bool(group.fixed), keys, values, graph.table, graph.keys, graph.var, graph.values, graph.dims,
+        graph.counts,
+    )  # fmt: skip
+    if wrong != at.GOOD:
+        raise _bad_variable(kind.name, wrong, int(keys[row]), values[row] if len(values) else None)
+    return keys.size, group.values is not None
+
+
+def _admit_factors(graph: Graph, group: FactorsLike) -> None:
+    kind = FACTOR_KINDS.get(group.kind)
+    if kind is None:
+        raise errors.UnknownKind("factor", group.kind, tuple(FACTOR_KINDS))
+    ends = _column(group.keys, _I64, (-1, len(kind.connects)), group.kind, "keys")
+    measured = _column(group.measured, _F64, (len(ends), kind.size), group.kind, "measured")
+    information = _column(group.information, _F64, (len(ends), kind.triangle), group.kind, "information")
+    graph.reserve_factors(len(ends), kind.size + kind.triangle)
+    row, wrong = admit_factors(
+        kind.code, ends, measured, information, graph.table, graph.keys, graph.var, graph.fac, graph.payload,
+        graph.counts,
+    )  # fmt: skip
+    if wrong != at.GOOD:
+        raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
+
+
+def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
+    missing = reach(
+        True, first, first_factor, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload,
+        reached,
+    )  # fmt: skip
+    if missing >= 0:
+        raise errors.Uninitialised(int(graph.keys[missing]))
+
+
+def _column(array: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> np.ndarray:
+    """`array` if it is fit for a kernel, a copy that is where it is not writable, aligned or contiguous."""
+    if not isinstance(array, np.ndarray) or array.dtype != dtype:
+        seen = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
+        raise errors.BadShape(f"{kind} {name}", seen, f"an array of {dtype}")
+    if array.shape != shape and (len(array.shape) != len(shape) or array.shape[1:] != shape[1:] or shape[0] >= 0):
+        wanted = " × ".join("n" if n < 0 else str(n) for n in shape)
+        raise errors.BadShape(f"{kind} {name}", " × ".join(map(str, array.shape)), wanted)
+    return array if array.flags.carray else np.array(array, dtype, order="C")
+
+
+def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.SolverError:
+    where = f"{kind} {errors.printed(key)}"
+    if wrong == at.DUPLICATE:
+        return errors.DuplicateVariable(key)
+    if wrong == at.BAD_QUATERNION and value is not None:
+        return errors.BadQuaternion(where, float(np.linalg.norm(value[3:])))
+    return errors.NotFinite(f"the value of {where}")
+
+
+def _bad_factor(
+    graph: Graph, kind: FactorKind, wrong: int, ends: I64, measured: F64, information: F64
+) -> errors.SolverError:
+    keys = [int(key) for key in ends]
+    where = f"{kind} ({', '.join(map(errors.printed, keys))})"
+    if wrong in (at.UNKNOWN_FIRST, at.UNKNOWN_SECOND):
+        return errors.UnknownVariable(keys[wrong - at.UNKNOWN_FIRST], where)
+    if wrong in (at.WRONG_KIND_FIRST, at.WRONG_KIND_SECOND):
+        end = wrong - at.WRONG_KIND_FIRST
+        seen = VARIABLE_KIND_OF_CODE[int(graph.var[graph.find(keys[end]), at.V_KIND])]
+        return errors.KindMismatch(keys[end], where, seen.name, kind.connects[end].name)
+    if wrong == at.SELF_LOOP:
+        return errors.SelfLoop(keys[0], where)
+    if wrong == at.BAD_QUATERNION:
+        return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:])))
+    if wrong == at.BAD_RANGE:
+        return errors.BadRange(where, float(measured[1]))
+    if wrong == at.NOT_POSITIVE_DEFINITE:
+        matrix = np.zeros((kind.dim, kind.dim))
+        matrix[np.triu_indices(kind.dim)] = information
+        return errors.NotPositiveDefinite(where, float(np.linalg.eigvalsh(matrix, UPLO="U")[0]))
+    return errors.NotFinite(f"the measurement or information of {where}")

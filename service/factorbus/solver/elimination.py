@@ -1,0 +1,70 @@
+"""Order, analysis and factorisation of Λ for a graph; what depends on the pattern only is kept while it stays.  MATH §5."""
+
+import numpy as np
+
+from factorbus.solver.blocks import Blocks
+from factorbus.solver.cholesky import Cholesky
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.ordering import order
+from factorbus.solver.report import Stopwatch
+from factorbus.solver.symbolic import Symbolic, analyze
+
+# Groups of the constrained ordering.
+_ANYWHERE, _RECENT_LANDMARK, _LAST_POSE = 0, 1, 2
+
+
+class Elimination:
+    """The factor R of Λ = Rᵀ R, with its arena, order and analysis."""
+
+    def __init__(self, last_pose_last: bool) -> None:
+        self._last_pose_last = last_pose_last
+        self._cholesky = Cholesky()
+        self._pattern = (0, 0)
+        self.symbolic: Symbolic | None = None
+
+    def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
+        """Factorise Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
+        symbolic = self._analysis(graph, blocks, watch)
+        failed = self._cholesky.factorize(symbolic, blocks.data, blocks.offsets, damping)
+        watch.lap("numeric")
+        return int(failed)
+
+    def solve(self, eta: F64, watch: Stopwatch) -> F64:
+        """δ with Λ δ = η by the factor made last; both in insertion order."""
+        step = self._cholesky.solve(eta)
+        watch.lap("solve")
+        return step
+
+    def _analysis(self, graph: Graph, blocks: Blocks, watch: Stopwatch) -> Symbolic:
+        pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
+        if self.symbolic is None or pattern != self._pattern:
+            dims = graph.dims[: pattern[0]]
+            group = constraint(graph) if self._last_pose_last else None
+            perm = order(dims, blocks.rows, blocks.cols, group)
+            watch.lap("order")
+            self.symbolic, self._pattern = analyze(dims, blocks.rows, blocks.cols, perm), pattern
+            watch.lap("symbolic")
+        return self.symbolic
+
+    def forget(self) -> None:
+        """The pattern was changed in a way that its size does not show."""
+        self.symbolic = None
+
+
+def constraint(graph: Graph) -> I64:
+    """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it right before it.
+
+    The next factors will most likely touch these, and changes near the end of the order are cheap (2013 paper, §5.2).
+    """
+    group = np.zeros(int(graph.counts[at.COLUMNS]), np.int64)
+    var = graph.var[: graph.counts[at.VARIABLES]]
+    poses = np.flatnonzero((var[:, at.V_KIND] <= at.SE3) & (var[:, at.V_COLUMN] >= 0))
+    if poses.size:
+        fac = graph.fac[: graph.counts[at.FACTORS]]
+        seen = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & (fac[:, at.F_I] == poses[-1]), at.F_J]
+        columns = var[seen, at.V_COLUMN]
+        group[columns[columns >= 0]] = _RECENT_LANDMARK
+        group[var[poses[-1], at.V_COLUMN]] = _LAST_POSE
+    return group

@@ -1,0 +1,157 @@
+"""Every way the solver refuses: one tree, one stable code each.  The code travels, the text is for a person.
+
+    SolverError
+    ├── UnknownMode            unknown_mode            a mode of solving that does not exist
+    ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
+    ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
+    ├── DuplicateVariable      duplicate_variable      a key that is taken already
+    ├── UnknownVariable        unknown_variable        a factor on a key that no variable has
+    ├── KindMismatch           kind_mismatch           a factor on a variable of a kind it does not connect
+    ├── SelfLoop               self_loop               a factor between a variable and itself
+    ├── NotFinite              not_finite              a NaN or an infinity, given or arising
+    ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
+    ├── BadRange               bad_range               a range that is not positive
+    ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
+    ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
+    └── Underconstrained       underconstrained        a variable that the factors leave free to move
+
+`code`, `message` and `detail` (plain types) are what a service needs to pass any of them on.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+_INDEX_BITS = 56
+
+
+class SolverError(Exception):
+    """Base of everything the solver refuses.  Whatever was asked for has left no trace."""
+
+    code = "solver_error"
+
+    def __init__(self, message: str, **detail: Any) -> None:
+        self.detail: dict[str, Any] = detail
+        super().__init__(message)
+
+    @property
+    def message(self) -> str:
+        """The text for a person."""
+        return str(self.args[0])
+
+
+def printed(key: int) -> str:
+    """How a variable's key prints: x12 for ord("x") << 56 | 12, its number where no letter fits."""
+    letter = key >> _INDEX_BITS
+    if key >= 0 and chr(letter).isalpha():
+        return f"{chr(letter)}{key & ((1 << _INDEX_BITS) - 1)}"
+    return str(key)
+
+
+class UnknownMode(SolverError):
+    code = "unknown_mode"
+
+    def __init__(self, seen: str, known: Sequence[str]) -> None:
+        super().__init__(f"there is no mode {seen!r}; wanted one of {', '.join(known)}", seen=seen)
+
+
+class UnknownKind(SolverError):
+    code = "unknown_kind"
+
+    def __init__(self, what: str, seen: str, known: Sequence[str]) -> None:
+        super().__init__(f"there is no kind of {what} {seen!r}; wanted one of {', '.join(known)}", seen=seen)
+
+
+class BadShape(SolverError):
+    code = "bad_shape"
+
+    def __init__(self, where: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{where}: seen {seen}, wanted {wanted}", where=where, seen=seen, wanted=wanted)
+
+
+class DuplicateVariable(SolverError):
+    code = "duplicate_variable"
+
+    def __init__(self, key: int) -> None:
+        super().__init__(
+            f"variable {printed(key)} exists already; take another key, or leave it out if it is meant", key=key
+        )
+
+
+class UnknownVariable(SolverError):
+    code = "unknown_variable"
+
+    def __init__(self, key: int, factor: str) -> None:
+        super().__init__(f"{factor}: there is no variable {printed(key)}; add it in this batch or before", key=key)
+
+
+class KindMismatch(SolverError):
+    code = "kind_mismatch"
+
+    def __init__(self, key: int, factor: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{factor}: {printed(key)} is a {seen}, wanted a {wanted} there", key=key, seen=seen)
+
+
+class SelfLoop(SolverError):
+    code = "self_loop"
+
+    def __init__(self, key: int, factor: str) -> None:
+        super().__init__(f"{factor} joins {printed(key)} to itself; wanted two different variables", key=key)
+
+
+class NotFinite(SolverError):
+    code = "not_finite"
+
+    def __init__(self, where: str) -> None:
+        super().__init__(f"{where} holds or leads to a NaN or an infinity; wanted finite numbers", where=where)
+
+
+class BadQuaternion(SolverError):
+    code = "bad_quaternion"
+
+    def __init__(self, where: str, norm: float) -> None:
+        super().__init__(
+            f"{where}: the quaternion has length {norm:.6g}, wanted 1 to within 1e-3, in the order qx qy qz qw",
+            where=where,
+        )
+
+
+class BadRange(SolverError):
+    code = "bad_range"
+
+    def __init__(self, where: str, seen: float) -> None:
+        super().__init__(f"{where}: the range is {seen:g}, wanted more than 0; measured is (bearing, range)", where=where)
+
+
+class NotPositiveDefinite(SolverError):
+    code = "not_positive_definite"
+
+    def __init__(self, where: str, smallest: float) -> None:
+        super().__init__(
+            f"{where}: the information matrix has the eigenvalue {smallest:.3g}, wanted all positive; it is the upper "
+            "triangle, row by row, of the inverse of the measurement's covariance",
+            where=where,
+        )
+
+
+class Uninitialised(SolverError):
+    code = "uninitialised"
+
+    def __init__(self, key: int) -> None:
+        super().__init__(
+            f"variable {printed(key)} has no value and no factor of its batch reaches it from one that has; give it a "
+            "value, or a factor that leads to it",
+            key=key,
+        )
+
+
+class Underconstrained(SolverError):
+    code = "underconstrained"
+
+    def __init__(self, key: int, factors: Sequence[str], missing: str) -> None:
+        listed = ", ".join(factors) if factors else "it has none"
+        super().__init__(
+            f"{printed(key)} is not fixed by its {len(factors)} factor(s) ({listed}): {missing}",
+            key=key,
+            factors=list(factors),
+            missing=missing,
+        )

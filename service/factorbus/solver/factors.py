@@ -1,0 +1,52 @@
+"""The kinds of factors.  A kind is a declaration; its residual and Jacobians are a kernel of the same name.  MATH §3.
+
+Tests are run for every entry of `FACTOR_KINDS`: a new kind gets them by being declared.
+"""
+
+from dataclasses import dataclass
+
+from factorbus.solver.kernels import layout
+from factorbus.solver.variables import POINT2, POINT3, SE2, SE3, VariableKind
+
+
+@dataclass(frozen=True, slots=True)
+class FactorKind:
+    """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim.
+
+    name: the wire name, whose meaning never changes.  code: how kernels know it.
+    """
+
+    name: str
+    code: int
+    connects: tuple[VariableKind, ...]
+    size: int
+    dim: int
+    measures: str
+    equation: str
+
+    @property
+    def triangle(self) -> int:
+        """Numbers in the upper triangle of the information matrix."""
+        return self.dim * (self.dim + 1) // 2
+
+    def __str__(self) -> str:
+        return self.name
+
+
+FACTOR_KINDS = {
+    kind.name: kind
+    for kind in (
+        FactorKind("prior_se2", layout.PRIOR_SE2, (SE2,), 3, 3, "the pose in the map", "MATH (3.1)"),
+        FactorKind("prior_se3", layout.PRIOR_SE3, (SE3,), 7, 6, "the pose in the map", "MATH (3.5)"),
+        FactorKind("prior_point2", layout.PRIOR_POINT2, (POINT2,), 2, 2, "the point in the map", "MATH (3.8)"),
+        FactorKind("prior_point3", layout.PRIOR_POINT3, (POINT3,), 3, 3, "the point in the map", "MATH (3.8)"),
+        FactorKind("between_se2", layout.BETWEEN_SE2, (SE2, SE2), 3, 3, "2nd pose in 1st's frame", "MATH (3.2)"),
+        FactorKind("between_se3", layout.BETWEEN_SE3, (SE3, SE3), 7, 6, "2nd pose in 1st's frame", "MATH (3.6)"),
+        FactorKind("landmark_se2", layout.LANDMARK_SE2, (SE2, POINT2), 2, 2, "point in pose's frame", "MATH (3.3)"),
+        FactorKind("landmark_se3", layout.LANDMARK_SE3, (SE3, POINT3), 3, 3, "point in pose's frame", "MATH (3.7)"),
+        FactorKind(
+            "bearing_range_se2", layout.BEARING_RANGE_SE2, (SE2, POINT2), 2, 2, "(radians, metres)", "MATH (3.4)"
+        ),
+    )
+}
+FACTOR_KIND_OF_CODE = {kind.code: kind for kind in FACTOR_KINDS.values()}

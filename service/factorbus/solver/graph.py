@@ -1,0 +1,119 @@
+"""The graph as columns: variables and factors in arenas that grow by doubling.  The arenas are laid out in
+`kernels/layout.py`.
+
+A `Mark` is how much of everything was in use at some moment; `forget` goes back to it.  Nothing that was there then
+has been moved, so going back is setting counts and clearing the keys that came after.
+"""
+
+from typing import TypeAlias
+
+import numpy as np
+
+from factorbus.solver.errors import printed
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, FactorKind
+from factorbus.solver.groups import FactorGroup, Group
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
+from factorbus.solver.kernels.move import gather
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+
+Mark: TypeAlias = tuple[int, ...]
+
+
+class Graph:
+    """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
+
+    def __init__(self) -> None:
+        self.keys: I64 = np.empty(16, np.int64)
+        self.var: I64 = np.empty((16, at.V_WIDTH), np.int64)
+        self.dims: I64 = np.empty(16, np.int64)
+        self.values: F64 = np.zeros(64)
+        self.fac: I64 = np.empty((16, at.F_WIDTH), np.int64)
+        self.payload: F64 = np.empty(256)
+        self.counts: I64 = np.zeros(at.COUNTS, np.int64)
+        self.table: I64 = np.zeros(64, np.int64)
+
+    def mark(self) -> Mark:
+        """How much is in use now."""
+        return tuple(self.counts.tolist())
+
+    def forget(self, mark: Mark) -> None:
+        """Go back to `mark`."""
+        remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
+        self.counts[:] = mark
+
+    def reserve_variables(self, more: int, size: int) -> None:
+        """Make room for `more` variables of `size` numbers each."""
+        counts = self.counts.tolist()
+        if (need := counts[at.VARIABLES] + more) > self.keys.size:
+            self.keys, self.var, self.dims = (grown(a, need) for a in (self.keys, self.var, self.dims))
+        if (need := counts[at.VALUES] + more * size) > self.values.size:
+            self.values = grown(self.values, need)
+        if 2 * (counts[at.VARIABLES] + more) > self.table.size:
+            self.table = np.zeros(table_size(counts[at.VARIABLES] + more), np.int64)
+            enter_keys(counts[at.VARIABLES], self.table, self.keys)
+
+    def reserve_factors(self, more: int, size: int) -> None:
+        """Make room for `more` factors of `size` numbers each (measurement and information)."""
+        counts = self.counts.tolist()
+        if (need := counts[at.FACTORS] + more) > len(self.fac):
+            self.fac = grown(self.fac, need)
+        if (need := counts[at.PAYLOAD] + more * size) > self.payload.size:
+            self.payload = grown(self.payload, need)
+
+    def find(self, key: int) -> int:
+        """Index of the variable `key`, or −1."""
+        return int(find_variable(key, self.table, self.keys))
+
+    def variables(self, picked: I64 | None = None) -> list[Group]:
+        """Values of all variables, or of those at the indices `picked`: a copy, at most one group per kind and fixed."""
+        var = self.var[: self.counts[at.VARIABLES]]
+        if picked is not None:
+            var = var[picked]
+        label = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
+        groups = []
+        for code in np.flatnonzero(np.bincount(label)).tolist():
+            rows = np.flatnonzero(label == code)
+            kind = VARIABLE_KIND_OF_CODE[code // 2]
+            keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
+            gather(rows if picked is None else picked[rows], self.var, self.keys, self.values, keys, values)
+            groups.append(Group(kind.name, keys, values, fixed=bool(code % 2)))
+        return groups
+
+    def factors(self) -> list[FactorGroup]:
+        """All factors, a copy."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        groups = []
+        for kind in FACTOR_KINDS.values():
+            rows = fac[fac[:, at.F_KIND] == kind.code]
+            if rows.size:
+                ends = self.keys[rows[:, at.F_I : at.F_I + len(kind.connects)]]
+                numbers = self.payload[rows[:, at.F_AT, None] + np.arange(kind.size + kind.triangle)]
+                measured, information = np.hsplit(numbers, [kind.size])
+                groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy()))
+        return groups
+
+    def factors_of(self, variable: int) -> list[str]:
+        """The factors on one variable, for a person: "between_se2 (x1, x2)"."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        rows = fac[(fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)]
+        return [self.describe(row) for row in rows]
+
+    def describe(self, row: I64) -> str:
+        """One row of `fac`, for a person."""
+        kind: FactorKind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
+        ends = [int(self.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)]]
+        return f"{kind} ({', '.join(printed(key) for key in ends)})"
+
+
+def grown(array: np.ndarray, need: int) -> np.ndarray:
+    """A copy with room for at least `need` rows, twice as many as before where that is more; the new room is zero."""
+    larger = np.zeros((max(need, 2 * len(array)), *array.shape[1:]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def table_size(entries: int) -> int:
+    """Slots of a hash table that is to hold `entries` and grow further: a power of two, a quarter full or less."""
+    return 1 << (4 * entries - 1).bit_length()

@@ -1,0 +1,62 @@
+"""What goes in and out of the solver: columns of variables and of factors, one group per kind."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from factorbus.solver.kernels._jit import F64, I64
+
+
+class VariablesLike(Protocol):
+    """Variables of one kind that come in: keys (n,), values (n, size) or None, fixed: not estimated."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def keys(self) -> I64: ...
+    @property
+    def values(self) -> F64 | None: ...
+    @property
+    def fixed(self) -> bool: ...
+
+
+class FactorsLike(Protocol):
+    """Factors of one kind that come in: keys (m, arity), measured (m, size), information (m, triangle)."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def keys(self) -> I64: ...
+    @property
+    def measured(self) -> F64: ...
+    @property
+    def information(self) -> F64: ...
+
+
+class BatchLike(Protocol):
+    """Variables and factors that go in together or not at all."""
+
+    @property
+    def variables(self) -> Sequence[VariablesLike]: ...
+    @property
+    def factors(self) -> Sequence[FactorsLike]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Variables of one kind with their values: keys (n,), values (n, size)."""
+
+    kind: str
+    keys: I64
+    values: F64
+    fixed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class FactorGroup:
+    """Factors of one kind in the order of their ids: keys (m, arity), measured (m, size), information (m, triangle)."""
+
+    kind: str
+    keys: I64
+    measured: F64
+    information: F64

@@ -1,0 +1,192 @@
+"""Admission: rows of a batch are checked and written behind the rows in use; the caller moves the counts back when
+one is bad.  One call per group of a batch, because a step has little time.
+
+Keys are found through an open-addressing hash table: `table` holds variable index + 1, 0 where free.  Variables are
+entered in the order of their indices and removed in the reverse order, so removing is clearing the slot.
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.se2 import wrap
+
+# A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
+_QUATERNION_TOLERANCE = 1e-3
+# A pivot of Ω below this share of its diagonal entry is rounding: the matrix is singular.
+_PIVOT_TOLERANCE = 1e-14
+
+
+@inline_kernel
+def slot_of(key: int, table: I64, keys: I64) -> int:
+    """Where `key` is in the table, or the free slot where it would go."""
+    k = int(key)
+    h = k ^ (k >> 32)
+    h = (h * 0x45D9F3B) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    h ^= h >> 16
+    mask = table.size - 1
+    slot = h & mask
+    while table[slot] != 0 and keys[table[slot] - 1] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@kernel("int64(int64, int64[::1], int64[::1])")
+def find_variable(key: int, table: I64, keys: I64) -> int:
+    """Index of the variable `key`, or −1."""
+    return table[slot_of(key, table, keys)] - 1
+
+
+@kernel("void(int64, int64[::1], int64[::1])")
+def enter_keys(count: int, table: I64, keys: I64) -> None:
+    """Fill an empty table with the first `count` keys."""
+    for v in range(count):
+        table[slot_of(keys[v], table, keys)] = v + 1
+
+
+@kernel("void(int64, int64, int64[::1], int64[::1])")
+def remove_keys(first: int, last: int, table: I64, keys: I64) -> None:
+    """Remove the variables first .. last−1, which are the last that were entered."""
+    for v in range(last - 1, first - 1, -1):
+        table[slot_of(keys[v], table, keys)] = 0
+
+
+@kernel(
+    "UniTuple(int64, 2)(int64, boolean, int64[::1], float64[:,::1], int64[::1], int64[::1], int64[:,::1], float64[::1],"
+    " int64[::1], int64[::1])"
+)
+def admit_variables(
+    kind: int, fixed: bool, new: I64, given: F64, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
+) -> tuple:
+    """Append variables of one kind; `given` (n, size) has their values, or (0, size) none.  Gives (row, what is wrong)."""
+    size = given.shape[1]
+    dim = 6 if kind == at.SE3 else size
+    for n in range(new.size):
+        v = counts[at.VARIABLES]
+        slot = slot_of(new[n], table, keys)
+        if table[slot] != 0:
+            return n, at.DUPLICATE
+        x = counts[at.VALUES]
+        if given.shape[0] > 0:
+            for c in range(size):
+                if not math.isfinite(given[n, c]):
+                    return n, at.NOT_FINITE
+                values[x + c] = given[n, c]
+            if kind == at.SE2:
+                values[x + 2] = wrap(values[x + 2])
+            if kind == at.SE3 and not make_unit(values, x + 3):
+                return n, at.BAD_QUATERNION
+        table[slot] = v + 1
+        keys[v] = new[n]
+        var[v, at.V_KIND], var[v, at.V_AT] = kind, x
+        var[v, at.V_SCALAR], var[v, at.V_COLUMN], var[v, at.V_DIAGONAL] = -1, -1, -1
+        if not fixed:
+            var[v, at.V_SCALAR], var[v, at.V_COLUMN] = counts[at.SCALARS], counts[at.COLUMNS]
+            dims[counts[at.COLUMNS]] = dim
+            counts[at.SCALARS] += dim
+            counts[at.COLUMNS] += 1
+        counts[at.VALUES] += size
+        counts[at.VARIABLES] += 1
+    return -1, at.GOOD
+
+
+@kernel(
+    "UniTuple(int64, 2)(int64, int64[:,::1], float64[:,::1], float64[:,::1], int64[::1], int64[::1], int64[:,::1],"
+    " int64[:,::1], float64[::1], int64[::1])"
+)
+def admit_factors(
+    kind: int, ends: I64, z: F64, info: F64, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64
+) -> tuple:
+    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle).  Gives (row, what is wrong)."""
+    size, triangle = z.shape[1], info.shape[1]
+    dim = 6 if size == 7 else size
+    first, second = kinds_of_ends(kind)
+    scratch = np.empty((6, 6))
+    for m in range(ends.shape[0]):
+        i = table[slot_of(ends[m, 0], table, keys)] - 1
+        j = -1
+        if i < 0:
+            return m, at.UNKNOWN_FIRST
+        if var[i, at.V_KIND] != first:
+            return m, at.WRONG_KIND_FIRST
+        if second >= 0:
+            j = table[slot_of(ends[m, 1], table, keys)] - 1
+            if j < 0:
+                return m, at.UNKNOWN_SECOND
+            if i == j:
+                return m, at.SELF_LOOP
+            if var[j, at.V_KIND] != second:
+                return m, at.WRONG_KIND_SECOND
+        f, p = counts[at.FACTORS], counts[at.PAYLOAD]
+        for c in range(size):
+            if not math.isfinite(z[m, c]):
+                return m, at.NOT_FINITE
+            payload[p + c] = z[m, c]
+        for c in range(triangle):
+            if not math.isfinite(info[m, c]):
+                return m, at.NOT_FINITE
+            payload[p + size + c] = info[m, c]
+        if size == 7 and not make_unit(payload, p + 3):
+            return m, at.BAD_QUATERNION
+        if kind == at.BEARING_RANGE_SE2 and not z[m, 1] > 0.0:
+            return m, at.BAD_RANGE
+        if not is_positive_definite(dim, payload, p + size, scratch):
+            return m, at.NOT_POSITIVE_DEFINITE
+        fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = kind, i, j, p
+        fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_SWAPPED] = -1, -1, -1, 0
+        counts[at.PAYLOAD] += size + triangle
+        counts[at.FACTORS] += 1
+    return -1, at.GOOD
+
+
+@inline_kernel
+def kinds_of_ends(kind: int) -> tuple:
+    """The kinds of variables that a kind of factor connects; −1: no second one."""
+    if kind <= at.PRIOR_POINT3:
+        return kind, -1
+    if kind == at.BETWEEN_SE2:
+        return at.SE2, at.SE2
+    if kind == at.BETWEEN_SE3:
+        return at.SE3, at.SE3
+    if kind == at.LANDMARK_SE3:
+        return at.SE3, at.POINT3
+    return at.SE2, at.POINT2
+
+
+@inline_kernel
+def make_unit(q: F64, k: int) -> bool:
+    """Bring the quaternion at k to unit length, unless it is there to the last bit; False: it is none."""
+    n2 = q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3]
+    if not abs(n2 - 1.0) <= 2.0 * _QUATERNION_TOLERANCE:
+        return False
+    if abs(n2 - 1.0) > 4e-16:
+        scale = 1.0 / math.sqrt(n2)
+        for c in range(4):
+            q[k + c] *= scale
+    return True
+
+
+@inline_kernel
+def is_positive_definite(n: int, upper: F64, start: int, L: F64) -> bool:
+    """Whether the n × n symmetric matrix with this upper triangle (row by row from `start`) is positive definite: its
+    Cholesky factor, made in the (6, 6) scratch `L`, has pivots above rounding."""
+    k = start
+    for a in range(n):
+        for b in range(a, n):
+            L[b, a] = upper[k]
+            k += 1
+    for a in range(n):
+        diagonal = L[a, a]
+        for c in range(a):
+            L[a, a] -= L[a, c] * L[a, c]
+        if not (diagonal > 0.0 and L[a, a] > _PIVOT_TOLERANCE * diagonal):
+            return False
+        L[a, a] = math.sqrt(L[a, a])
+        for b in range(a + 1, n):
+            for c in range(a):
+                L[b, a] -= L[b, c] * L[a, c]
+            L[b, a] /= L[a, a]
+    return True

@@ -1,0 +1,66 @@
+"""How the arenas are laid out that every kernel of the nonlinear side reads: column numbers, kind codes, sizes.
+
+    var      (n, 5) int64    one row per variable, in insertion order
+    fac      (m, 8) int64    one row per factor, in insertion order
+    values   float64         the variables' values, packed one after the other
+    payload  float64         per factor: its measurement, then the upper triangle of its information
+    counts   (6,)   int64    how much of each arena is in use
+"""
+
+# Columns of `var`.
+V_KIND = 0
+V_AT = 1  # where its value starts in `values`
+V_SCALAR = 2  # where it starts in δ and η; -1: fixed
+V_COLUMN = 3  # its block column in Λ; -1: fixed
+V_DIAGONAL = 4  # where its diagonal block starts in Λ's data; -1: fixed
+V_WIDTH = 5
+
+# Columns of `fac`.
+F_KIND = 0
+F_I = 1  # first variable
+F_J = 2  # second variable; -1: none
+F_AT = 3  # where its measurement starts in `payload`
+F_II = 4  # where the blocks it adds to start in Λ's data; -1: no such block
+F_JJ = 5
+F_IJ = 6
+F_SWAPPED = 7  # 1: the block of the pair stands as (j, i), because column j comes first
+F_WIDTH = 8
+
+# Entries of `counts`.
+VARIABLES = 0
+FACTORS = 1
+VALUES = 2
+PAYLOAD = 3
+COLUMNS = 4
+SCALARS = 5
+COUNTS = 6
+
+# Codes of the kinds of variables.
+SE2 = 0
+SE3 = 1
+POINT2 = 2
+POINT3 = 3
+
+# Codes of the kinds of factors.
+PRIOR_SE2 = 0
+PRIOR_SE3 = 1
+PRIOR_POINT2 = 2
+PRIOR_POINT3 = 3
+BETWEEN_SE2 = 4
+BETWEEN_SE3 = 5
+LANDMARK_SE2 = 6
+LANDMARK_SE3 = 7
+BEARING_RANGE_SE2 = 8
+
+# What an admission kernel found wrong with a row.
+GOOD = 0
+DUPLICATE = 1
+NOT_FINITE = 2
+BAD_QUATERNION = 3
+UNKNOWN_FIRST = 4
+UNKNOWN_SECOND = 5
+WRONG_KIND_FIRST = 6
+WRONG_KIND_SECOND = 7
+SELF_LOOP = 8
+BAD_RANGE = 9
+NOT_POSITIVE_DEFINITE = 10

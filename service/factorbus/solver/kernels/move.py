@@ -1,0 +1,61 @@
+"""x ⊞ δ for all variables, which of them changed, and their values gathered per kind.  MATH §2."""
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.points import move_point2, move_point3
+from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.se2 import move_se2
+from factorbus.solver.kernels.se3 import move_se3
+
+
+@kernel("void(int64, int64[:,::1], float64[::1], float64[::1], float64[::1])")
+def move(count: int, var: I64, values: F64, step: F64, out: F64) -> None:
+    """out = values ⊞ step, variable by variable; fixed ones are copied."""
+    for v in range(count):
+        kind, x, d = var[v, at.V_KIND], var[v, at.V_AT], var[v, at.V_SCALAR]
+        if d < 0:
+            for c in range(size_of(kind)):
+                out[x + c] = values[x + c]
+        elif kind == at.SE2:
+            move_se2(values, x, step, d, out)
+        elif kind == at.SE3:
+            move_se3(values, x, step, d, out)
+        elif kind == at.POINT2:
+            move_point2(values, x, step, d, out)
+        else:
+            move_point3(values, x, step, d, out)
+
+
+@kernel("int64(int64, int64, int64[:,::1], int64[::1], int64[::1], int64[::1])")
+def differing(old: int, count: int, var: I64, before: I64, values: I64, out: I64) -> int:
+    """List in `out` the variables whose values differ from `before`, and all from `old` on; gives how many.
+
+    The values are given as the integers that their bits are, so that −0.0 is not 0.0.
+    """
+    n = 0
+    for v in range(count):
+        x = var[v, at.V_AT]
+        if v >= old or differs(x, size_of(var[v, at.V_KIND]), before, values):
+            out[n] = v
+            n += 1
+    return n
+
+
+@inline_kernel
+def differs(x: int, size: int, a: I64, b: I64) -> bool:
+    """Whether any of `size` numbers from offset x on differ."""
+    for c in range(size):
+        if a[x + c] != b[x + c]:
+            return True
+    return False
+
+
+@kernel("void(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,::1])")
+def gather(picked: I64, var: I64, keys: I64, values: F64, out_keys: I64, out_values: F64) -> None:
+    """Keys and values of the picked variables, which are of one kind."""
+    for n in range(picked.size):
+        v = picked[n]
+        out_keys[n] = keys[v]
+        x = var[v, at.V_AT]
+        for c in range(out_values.shape[1]):
+            out_values[n, c] = values[x + c]

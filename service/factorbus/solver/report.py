@@ -1,0 +1,65 @@
+"""The account of a step: what was done, why, and how long each part took."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What one step did.
+
+    mode         the solver's mode
+    strategy     "all-batch": the system was factorised; "extend": the gradient was zero, there was nothing to solve
+    because      the reason for the strategy, for a person
+    iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
+    chi2, chi2_before        Σ rᵀ Ω r of all factors after and before solving (the new factors included in both)
+    new_variables, new_factors   taken in by this step
+    changed      variables whose values differ from before, the new ones included
+    relinearised linearisation points that were moved, counted once per iteration
+    eliminated   variables eliminated, counted once per factorisation
+    nnz_r, flops of one factorisation; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
+    converged    the next iteration would not have lowered χ² by more than the tolerance
+    phases_ms    milliseconds by phase;  step_ms: the whole step
+    """
+
+    mode: str
+    strategy: str
+    because: str
+    iterations: int = 0
+    chi2: float = 0.0
+    chi2_before: float = 0.0
+    new_variables: int = 0
+    new_factors: int = 0
+    changed: int = 0
+    relinearised: int = 0
+    eliminated: int = 0
+    nnz_r: int = 0
+    flops: float = 0.0
+    damping: float = 0.0
+    converged: bool = True
+    phases_ms: dict[str, float] = field(default_factory=dict)
+    step_ms: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain types."""
+        return asdict(self)
+
+
+class Stopwatch:
+    """Adds up the time of named phases, one after the other, by the clock it is given."""
+
+    def __init__(self, clock: Callable[[], float] | None) -> None:
+        self._clock = clock
+        self._start = self._last = clock() if clock else 0.0
+        self.phases_ms: dict[str, float] = {}
+
+    def lap(self, phase: str) -> None:
+        """What passed since the last call was `phase`."""
+        now = self._clock() if self._clock else 0.0
+        self.phases_ms[phase] = self.phases_ms.get(phase, 0.0) + 1e3 * (now - self._last)
+        self._last = now
+
+    def total_ms(self) -> float:
+        """Since it was made."""
+        return 1e3 * ((self._clock() if self._clock else 0.0) - self._start)
