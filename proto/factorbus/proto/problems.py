@@ -5,7 +5,7 @@
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
-    ├── BadInformation       bad_information      an information matrix that is not symmetric, sigmas that are not positive
+    ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   └── UnknownKind      unknown_kind         a kind of variable or factor that this version does not know
     ├── TooLarge             too_large            a message, an insert or a map over its limit

@@ -1,0 +1,132 @@
+"""Write the golden messages: one .msgpack per message and a .json that says what is in it.
+
+    python proto/vectors/make.py [FOLDER]        (default: the folder of this file)
+
+A client in another language reads the .msgpack and compares with the .json, or builds the message from the .json and
+compares with the .msgpack.  In the .json a bin is {"i64": [...]} or {"f64": [...]} (little-endian columns, flattened)
+or {"msgpack": {...}} (a message inside a message); floats are written so that they read back bit for bit.
+The bytes are part of wire version 1: they never change; new optional fields get new files.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from factorbus.proto import codec
+from factorbus.proto.messages import (
+    Accepted,
+    Batch,
+    Chi2,
+    Delta,
+    Estimate,
+    Factors,
+    Graph,
+    Insert,
+    Job,
+    JobDone,
+    Optimum,
+    Variables,
+)
+from factorbus.proto.problems import Busy
+from factorbus.proto.symbols import symbol
+
+_COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64"}
+
+
+def main() -> None:
+    """Write all vectors."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    for name, data in vectors().items():
+        (folder / f"{name}.msgpack").write_bytes(data)
+        (folder / f"{name}.json").write_text(described(data))
+
+
+def vectors() -> dict[str, bytes]:
+    """The golden messages by name."""
+    report = {"mode": "all-batch", "strategy": "all-batch", "iterations": 2, "chi2": 0.25, "step_ms": 1.5}
+    pair = (_poses(fixed=True, first=0, values=[[0, 0, 0]]), _poses(first=1, values=[[1.5, 0.25, 0.125]]))
+    graph = Graph(7, 2, Batch(pair, (_odometry(0),)))
+    optimum = Optimum(0.25, 3, (_poses(first=1, values=[[1.5, 0.25, 0.125]]),))
+    return {
+        "insert": codec.encode_insert(Insert(1, Batch(pair, (_odometry(0),)), epoch=7)),
+        "insert_without_values": codec.encode_insert(Insert(2, Batch((_poses(first=2),), (_odometry(1),)), epoch=7)),
+        "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
+        "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
+        "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
+        "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
+        "estimate_empty": codec.encode_estimate(Estimate(7, 2, ())),
+        "delta": codec.encode_delta(Delta(7, 2, 1, (pair[1],), report)),
+        "graph": codec.encode_graph(graph),
+        "chi2": codec.encode_chi2(Chi2(7, 2, 0.25)),
+        "chi2_batch": codec.encode_chi2(Chi2(7, 2, 0.25, 0.125, "w1", 0.5)),
+        "job": codec.encode_job(Job("j1", "batch", codec.encode_graph(graph))),
+        "job_done": codec.encode_job_done(JobDone("j1", "batch", codec.encode_optimum(optimum), 0.5)),
+        "problem": codec.encode_problem(Busy(256, 0.05)),
+        "ask_estimate": codec.encode_keys_asked(None),
+        "ask_estimate_keys": codec.encode_keys_asked(np.array([symbol("x", 1), symbol("l", 5)])),
+        "ask_estimate_none": codec.encode_keys_asked(np.array([], np.int64)),
+        "ask_chi2": codec.encode_map({"batch": True, "timeout_s": 10.0}),
+        "ask_export": codec.encode_map({"format": "g2o"}),
+        "admin_create": codec.encode_map({"map": "kitchen", "mode": "auto"}),
+        "event": codec.encode_map({"event": "created", "epoch": 7, "revision": 0}),
+    }
+
+
+def described(data: bytes) -> str:
+    """The .json of a message."""
+    return json.dumps(_plain(msgpack.unpackb(data)), indent=1, ensure_ascii=False) + "\n"
+
+
+def _poses(first: int, values: Any = None, fixed: bool = False) -> Variables:
+    rows = None if values is None else np.array(values, float)
+    count = 1 if rows is None else len(rows)
+    return Variables("se2", np.array([symbol("x", first + i) for i in range(count)]), rows, fixed)
+
+
+def _odometry(first: int) -> Factors:
+    keys = np.array([[symbol("x", first), symbol("x", first + 1)]])
+    return Factors("between_se2", keys, np.array([[1.5, 0.25, 0.125]]), np.array([[100.0, 0, 0, 100, 0, 400]]))
+
+
+def _every_kind() -> Batch:
+    x, y, l, p = (symbol(letter, 1) for letter in "xylp")
+    unit2, unit3, unit6 = (np.array([np.eye(r)[np.triu_indices(r)]]) for r in (2, 3, 6))
+    turned = [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]
+    variables = (
+        Variables("se2", np.array([x]), np.array([[1.0, 2.0, 0.5]])),
+        Variables("se3", np.array([y, y + 1]), np.array([turned, turned])),
+        Variables("point2", np.array([l]), np.array([[3.0, 4.0]])),
+        Variables("point3", np.array([p]), np.array([[5.0, 6.0, 7.0]])),
+    )
+    factors = (
+        Factors("prior_se2", np.array([[x]]), np.array([[1.0, 2.0, 0.5]]), unit3),
+        Factors("prior_se3", np.array([[y]]), np.array([turned]), unit6),
+        Factors("prior_point2", np.array([[l]]), np.array([[3.0, 4.0]]), unit2),
+        Factors("prior_point3", np.array([[p]]), np.array([[5.0, 6.0, 7.0]]), unit3),
+        Factors("between_se3", np.array([[y, y + 1]]), np.array([[0.0, 0, 0, 0, 0, 0, 1]]), unit6),
+        Factors("landmark_se2", np.array([[x, l]]), np.array([[2.0, 1.0]]), unit2),
+        Factors("landmark_se3", np.array([[y, p]]), np.array([[4.0, 4.0, 4.0]]), unit3),
+        Factors("bearing_range_se2", np.array([[x, l]]), np.array([[0.25, 2.5]]), unit2),
+    )
+    return Batch(variables, factors)
+
+
+def _plain(content: Any, name: str = "") -> Any:
+    if isinstance(content, dict):
+        return {key: _plain(value, key) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_plain(item) for item in content]
+    if isinstance(content, bytes):
+        if name not in _COLUMNS:
+            return {"msgpack": _plain(msgpack.unpackb(content))}
+        dtype = _COLUMNS[name]
+        return {dtype: np.frombuffer(content, "<i8" if dtype == "i64" else "<f8").tolist()}
+    return content
+
+
+if __name__ == "__main__":
+    main()

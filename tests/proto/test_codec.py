@@ -1,0 +1,379 @@
+"""Messages to bytes and back: golden bytes, round trips, and decoders that take anything without harm."""
+
+import json
+import runpy
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from factorbus.proto import codec
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.limits import Limits
+from factorbus.proto.messages import (
+    Accepted,
+    Batch,
+    Chi2,
+    Delta,
+    Estimate,
+    Factors,
+    Graph,
+    Insert,
+    Job,
+    JobDone,
+    Optimum,
+    Variables,
+)
+from factorbus.proto.problems import BadMessage, Problem, Refused, TooLarge, UnknownKind, UnknownMap
+
+VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
+MAKE = runpy.run_path(str(VECTORS / "make.py"))
+GOLDEN: dict[str, bytes] = MAKE["vectors"]()
+
+ENCODERS: dict[str, Callable[[Any], bytes]] = {
+    "insert": codec.encode_insert,
+    "accepted": codec.encode_accepted,
+    "estimate": codec.encode_estimate,
+    "delta": codec.encode_delta,
+    "graph": codec.encode_graph,
+    "chi2": codec.encode_chi2,
+    "job_done": codec.encode_job_done,
+    "job": codec.encode_job,
+    "optimum": codec.encode_optimum,
+    "problem": codec.encode_problem,
+    "ask_estimate": codec.encode_keys_asked,
+}
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "insert": codec.decode_insert,
+    "accepted": codec.decode_accepted,
+    "estimate": codec.decode_estimate,
+    "delta": codec.decode_delta,
+    "graph": codec.decode_graph,
+    "chi2": codec.decode_chi2,
+    "job_done": codec.decode_job_done,
+    "job": codec.decode_job,
+    "optimum": codec.decode_optimum,
+    "problem": codec.decode_problem,
+    "ask_estimate": codec.decode_keys_asked,
+    "map": codec.decode_map,
+}
+
+
+def message_of(vector: str) -> str | None:
+    """The message that a golden file holds: the longest name it begins with."""
+    return max((name for name in ENCODERS if vector.startswith(name)), key=len, default=None)
+
+
+# ---- golden bytes -------------------------------------------------------------------------------------------------
+
+
+def test_every_vector_is_in_the_tree_and_no_other() -> None:
+    assert {path.stem for path in VECTORS.glob("*.msgpack")} == set(GOLDEN)
+    assert {path.stem for path in VECTORS.glob("*.json")} == set(GOLDEN)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_the_bytes_of_a_message_never_change(name: str) -> None:
+    assert GOLDEN[name] == (VECTORS / f"{name}.msgpack").read_bytes()
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_the_description_says_what_is_in_the_bytes(name: str) -> None:
+    description = json.loads((VECTORS / f"{name}.json").read_text())
+    assert msgpack.packb(from_description(description)) == (VECTORS / f"{name}.msgpack").read_bytes()
+
+
+@pytest.mark.parametrize("name", [name for name in GOLDEN if message_of(name)])
+def test_decoding_and_encoding_gives_the_golden_bytes_again(name: str) -> None:
+    message = message_of(name)
+    assert message is not None
+    assert ENCODERS[message](DECODERS[message](GOLDEN[name])) == GOLDEN[name]
+
+
+def test_every_kind_has_a_golden_message() -> None:
+    batches = [codec.decode_insert(data).batch for name, data in GOLDEN.items() if name.startswith("insert")]
+    assert {group.kind for batch in batches for group in batch.variables} == set(VARIABLE_KINDS)
+    assert {group.kind for batch in batches for group in batch.factors} == set(FACTOR_KINDS)
+
+
+def from_description(content: Any) -> Any:
+    """What a client in another language does with a .json."""
+    if isinstance(content, dict):
+        match content:
+            case {"i64": numbers}:
+                return np.array(numbers, "<i8").tobytes()
+            case {"f64": numbers}:
+                return np.array(numbers, "<f8").tobytes()
+            case {"msgpack": inner}:
+                return msgpack.packb(from_description(inner))
+        return {key: from_description(value) for key, value in content.items()}
+    return [from_description(item) for item in content] if isinstance(content, list) else content
+
+
+# ---- round trips --------------------------------------------------------------------------------------------------
+
+NUMBERS = st.integers(0, 2**63 - 1)
+DOUBLES = st.floats(allow_nan=True, allow_infinity=True, width=64)
+NAMES = st.text(max_size=12)
+REPORTS = st.dictionaries(NAMES, st.one_of(st.floats(allow_nan=False), st.integers(-5, 5), NAMES), max_size=5)
+
+
+@st.composite
+def variables(draw: st.DrawFn, valued: bool = False) -> Variables:
+    kind = VARIABLE_KINDS[draw(st.sampled_from(sorted(VARIABLE_KINDS)))]
+    count = draw(st.integers(0, 4))
+    keys = draw(arrays("<i8", (count,), elements=st.integers(-(2**63), 2**63 - 1)))
+    has_values = valued or draw(st.booleans())
+    values = draw(arrays("<f8", (count, kind.size), elements=DOUBLES)) if has_values else None
+    return Variables(kind.name, keys, values, draw(st.booleans()))
+
+
+@st.composite
+def factors(draw: st.DrawFn) -> Factors:
+    kind = FACTOR_KINDS[draw(st.sampled_from(sorted(FACTOR_KINDS)))]
+    count = draw(st.integers(0, 4))
+    return Factors(
+        kind.name,
+        draw(arrays("<i8", (count, len(kind.connects)), elements=st.integers(0, 2**62))),
+        draw(arrays("<f8", (count, kind.size), elements=DOUBLES)),
+        draw(arrays("<f8", (count, kind.information_size), elements=DOUBLES)),
+    )
+
+
+BATCHES = st.builds(Batch, st.lists(variables(), max_size=3).map(tuple), st.lists(factors(), max_size=3).map(tuple))
+VALUES = st.lists(variables(valued=True), max_size=3).map(tuple)
+MESSAGES = {
+    "insert": st.builds(Insert, st.integers(1, 2**63 - 1), BATCHES, st.booleans(), NUMBERS),
+    "accepted": st.builds(Accepted, NUMBERS, NUMBERS, NUMBERS, NUMBERS, NUMBERS, REPORTS),
+    "estimate": st.builds(Estimate, NUMBERS, NUMBERS, VALUES),
+    "delta": st.builds(Delta, NUMBERS, NUMBERS, NUMBERS, VALUES, REPORTS),
+    "graph": st.builds(Graph, NUMBERS, NUMBERS, BATCHES),
+    "chi2": st.builds(Chi2, NUMBERS, NUMBERS, st.floats(), st.floats(), NAMES, st.floats()),
+    "job": st.builds(Job, NAMES, NAMES, st.binary(max_size=40)),
+    "job_done": st.builds(JobDone, NAMES, NAMES, st.binary(max_size=40), st.floats()),
+    "optimum": st.builds(Optimum, st.floats(), NUMBERS, VALUES),
+}
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+@settings(max_examples=40)
+@given(data=st.data())
+def test_a_message_survives_the_wire_bit_for_bit(name: str, data: st.DataObject) -> None:
+    message = data.draw(MESSAGES[name])
+    sent = ENCODERS[name](message)
+    arrived = DECODERS[name](sent)
+    assert repr(arrived) == repr(message)
+    assert ENCODERS[name](arrived) == sent  # the repr of an array is rounded, its bytes are not
+
+
+def test_arrays_arrive_as_read_only_views() -> None:
+    group = codec.decode_estimate(GOLDEN["estimate"]).variables[0]
+    assert not group.keys.flags.writeable
+    assert not group.values.flags.owndata
+    with pytest.raises(ValueError, match="read-only"):
+        group.values[0, 0] = 1.0
+
+
+def test_columns_of_any_layout_are_sent_in_row_order() -> None:
+    values = np.asfortranarray(np.arange(12.0).reshape(4, 3))[::2]
+    sent = codec.encode_estimate(Estimate(1, 1, (Variables("se2", np.array([1, 2], np.int32), values),)))
+    arrived = codec.decode_estimate(sent).variables[0]
+    assert arrived.keys.tolist() == [1, 2]
+    assert arrived.values.tolist() == [[0, 1, 2], [6, 7, 8]]
+
+
+def test_a_problem_arrives_with_its_code_and_detail() -> None:
+    refused = codec.decode_problem(codec.encode_problem(UnknownMap("attic")))
+    assert isinstance(refused, Refused)
+    assert (refused.code, refused.detail) == ("unknown_map", {"map": "attic"})
+    assert str(refused) == f"{UnknownMap('attic').message} [unknown_map]"
+
+
+def test_what_messagepack_has_no_type_for_is_told_all_the_same() -> None:
+    odd = Problem("odd", count=np.int64(3), path=Path("/a"))
+    assert codec.decode_problem(codec.encode_problem(odd)).detail == {"count": 3, "path": "/a"}
+    assert codec.decode_map(codec.encode_map({"x": np.float64(0.5)})) == {"x": 0.5}
+
+
+def test_no_bytes_are_an_empty_question() -> None:
+    assert codec.decode_map(b"") == {}
+    assert codec.decode_keys_asked(b"") is None
+
+
+# ---- what is not a message ----------------------------------------------------------------------------------------
+
+GROUP = {"kind": "se2", "keys": b"\0" * 8, "values": b"\0" * 24}
+EDGE = {"kind": "between_se2", "keys": b"\0" * 16, "measured": b"\0" * 24, "information": b"\0" * 48}
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        ({}, "sequence: missing; wanted an integer from 1"),
+        ({"sequence": 0}, "sequence: is an integer 0"),
+        ({"sequence": True}, "sequence: is a boolean True"),
+        ({"sequence": 1.0}, "sequence: is a float 1.0"),
+        ({"sequence": 2**63}, "sequence: is an integer"),
+        ({"sequence": 1, "epoch": -1}, "epoch: is an integer -1"),
+        ({"sequence": 1, "settle": 1}, "settle: is an integer 1; wanted true or false"),
+        ({"sequence": 1, "variables": {}}, "variables: is a map; wanted an array of maps"),
+        ({"sequence": 1, "variables": [1]}, "variables[0]: is an integer; wanted a map"),
+        ({"sequence": 1, "variables": [{}]}, "variables[0].kind: missing"),
+        ({"sequence": 1, "variables": [GROUP, GROUP | {"kind": 3}]}, "variables[1].kind: not a string"),
+        ({"sequence": 1, "variables": [GROUP | {"keys": "x1"}]}, "variables[0].keys: is a string 'x1'"),
+        ({"sequence": 1, "variables": [GROUP | {"keys": b"1234567"}]}, "keys: 7 bytes; wanted a multiple of 8"),
+        ({"sequence": 1, "variables": [GROUP | {"values": b"1"}]}, "variables[0].values: 1 bytes; wanted 24 (1 rows"),
+        ({"sequence": 1, "variables": [GROUP | {"values": [0.0]}]}, "variables[0].values: is an array"),
+        ({"sequence": 1, "variables": [GROUP | {"fixed": None}]}, "variables[0].fixed: is nil"),
+        (
+            {"sequence": 1, "factors": [EDGE, EDGE | {"keys": b"0" * 17}]},
+            "factors[1].keys: 17 bytes; wanted a multiple",
+        ),
+        ({"sequence": 1, "factors": [EDGE | {"measured": b"0" * 16}]}, "factors[0].measured: 16 bytes; wanted 24"),
+        ({"sequence": 1, "factors": [EDGE | {"information": b""}]}, "factors[0].information: 0 bytes; wanted 48"),
+        ({"sequence": 1, "factors": [{"kind": "between_se2", "keys": b""}]}, "factors[0].measured: missing"),
+    ],
+)
+def test_what_is_wrong_is_named_by_its_place(content: dict[str, Any], text: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        codec.decode_insert(msgpack.packb(content))
+    assert text in caught.value.message
+    assert caught.value.code == "bad_message"
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", "not readable"),
+        (b"\xc1", "not readable"),
+        (b"\x93\x01", "not readable"),
+        (msgpack.packb([1]), "insert: is an array; wanted a map"),
+        (msgpack.packb({"sequence": 1}) + b"\x00", "not readable"),
+        (b"\x81\x01\x02", "not readable"),
+        (b"\x81\xa8sequence" + b"\x91" * 5000, "nested too deep"),
+        (b"\x81\xa1x\xdd\xff\xff\xff\xff", "not readable"),
+        (b"\x81\xa1x\xc6\xff\xff\xff\xff", "not readable"),
+        (b"\x81\xa1x\xa1\xff", "not readable"),
+        (b"\x81\xa1x\xc7\x03\xff\x00\x00\x00", "not readable"),
+    ],
+)
+def test_bytes_that_are_no_map_are_refused(data: bytes, text: str) -> None:
+    with pytest.raises(BadMessage, match=text):
+        codec.decode_insert(data)
+
+
+def test_a_kind_that_is_not_known_is_refused_in_an_insert() -> None:
+    with pytest.raises(UnknownKind, match="'idp' is not known here; wanted one of se2, se3") as caught:
+        codec.decode_insert(msgpack.packb({"sequence": 1, "variables": [GROUP | {"kind": "idp"}]}))
+    assert (caught.value.code, caught.value.detail["kind"]) == ("unknown_kind", "idp")
+    with pytest.raises(UnknownKind, match="between_se9"):
+        codec.decode_graph(msgpack.packb({"epoch": 1, "revision": 1, "factors": [EDGE | {"kind": "between_se9"}]}))
+
+
+def test_an_older_client_reads_the_values_of_a_kind_it_does_not_know() -> None:
+    group = {"kind": "idp", "keys": b"\0" * 16, "values": np.arange(12.0).tobytes()}
+    estimate = codec.decode_estimate(msgpack.packb({"epoch": 1, "revision": 2, "variables": [group]}))
+    assert estimate.variables[0].kind == "idp"
+    assert estimate.variables[0].values.shape == (2, 6)
+
+
+def test_fields_that_are_not_known_are_skipped() -> None:
+    plain = {"sequence": 1, "variables": [GROUP], "factors": [EDGE]}
+    newer = plain | {"priority": [1, {"a": None}], "variables": [GROUP | {"covariance": b"xyz"}]}
+    assert codec.encode_insert(codec.decode_insert(msgpack.packb(newer))) == codec.encode_insert(
+        codec.decode_insert(msgpack.packb(plain))
+    )
+
+
+@pytest.mark.parametrize(
+    ("limits", "what", "size"),
+    [
+        (Limits(max_bytes=298, max_variables=9, max_factors=9), "insert has 299 bytes", 299),
+        (Limits(max_bytes=999, max_variables=1, max_factors=9), "the batch has 2 variables", 2),
+        (Limits(max_bytes=999, max_variables=2, max_factors=0), "the batch has 1 factors", 1),
+    ],
+)
+def test_what_is_over_a_limit_is_refused_with_its_size(limits: Limits, what: str, size: int) -> None:
+    with pytest.raises(TooLarge, match=what) as caught:
+        codec.decode_insert(GOLDEN["insert"], limits)
+    assert caught.value.detail["size"] == size
+
+
+def test_a_message_cannot_make_itself_large_in_memory() -> None:
+    bomb = msgpack.packb({"sequence": 1, "x": [[{}] * 250] * 250})
+    assert len(bomb) < 64_000
+    codec.decode_insert(bomb)  # small enough to do no harm
+    with pytest.raises(TooLarge, match="4097 arrays and maps"):
+        codec.decode_insert(msgpack.packb({"sequence": 1, "x": [[[{}] * 250] * 250] * 250}))
+
+
+# ---- fuzz: whatever arrives, BadMessage or TooLarge, and soon -----------------------------------------------------
+
+
+@pytest.mark.parametrize("decoder", DECODERS)
+@settings(max_examples=60)
+@given(data=st.binary(max_size=200))
+def test_no_bytes_do_harm(decoder: str, data: bytes) -> None:
+    decodes_or_refuses(DECODERS[decoder], data)
+
+
+@pytest.mark.parametrize("name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds"])
+@settings(max_examples=150)
+@given(data=st.data())
+def test_no_mutation_of_a_valid_message_does_harm(name: str, data: st.DataObject) -> None:
+    original = GOLDEN[name]
+    mutant = bytearray(original)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(mutant) - 1))
+        match data.draw(st.sampled_from(("set", "cut", "insert", "end"))):
+            case "set":
+                mutant[at] = data.draw(st.integers(0, 255))
+            case "cut":
+                del mutant[at : at + data.draw(st.integers(1, 9))]
+            case "insert":
+                mutant[at:at] = data.draw(st.binary(min_size=1, max_size=9))
+            case "end":
+                del mutant[max(at, 1) :]
+        assume(mutant)
+    decodes_or_refuses(DECODERS[message_of(name) or "map"], bytes(mutant))
+
+
+@settings(max_examples=100)
+@given(
+    st.recursive(
+        st.one_of(
+            st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), NAMES, st.binary(max_size=30)
+        ),
+        lambda inner: st.one_of(
+            st.lists(inner, max_size=4),
+            st.dictionaries(
+                st.sampled_from(
+                    ("sequence", "epoch", "variables", "factors", "kind", "keys", "values", "report", "chi2")
+                ),
+                inner,
+                max_size=5,
+            ),
+        ),
+        max_leaves=20,
+    )
+)
+def test_no_structure_does_harm(content: Any) -> None:
+    data = msgpack.packb(content)
+    for decode in DECODERS.values():
+        decodes_or_refuses(decode, data)
+
+
+def decodes_or_refuses(decode: Callable[[bytes], Any], data: bytes) -> None:
+    start = time.process_time()
+    try:
+        decode(data)
+    except (BadMessage, TooLarge) as problem:
+        codec.decode_problem(codec.encode_problem(problem))  # and it can be told
+    assert time.process_time() - start < 0.1
