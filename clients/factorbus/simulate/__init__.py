@@ -1,0 +1,20 @@
+"""Simulated worlds with known truth: streams of steps, from the same seed always the same, of any length.
+
+Each world is a function of (poses, seed, ...) and gives a `Step` a pose.  A longer run begins with the shorter one.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+
+from factorbus.simulate.city_trees import city_trees
+from factorbus.simulate.manhattan import manhattan
+from factorbus.simulate.parameters import BadParameter
+from factorbus.simulate.sphere import sphere
+from factorbus.simulate.step import Step
+
+WORLDS: Mapping[str, Callable[..., Iterator[Step]]] = {
+    "manhattan": manhattan,
+    "city_trees": city_trees,
+    "sphere": sphere,
+}
+
+__all__ = ["WORLDS", "BadParameter", "Step", "city_trees", "manhattan", "sphere"]

@@ -1,0 +1,111 @@
+"""Streets of a grid, driven with odometry and with closures of loops at places seen before."""
+
+import math
+from collections.abc import Iterator
+from itertools import islice
+from random import Random
+
+import numpy as np
+
+from factorbus.proto.arrays import F64
+from factorbus.simulate.noise import diagonal_information, noisy_se2, relative_se2
+from factorbus.simulate.parameters import checked_at_least, checked_run, checked_share, checked_sigma
+from factorbus.simulate.step import BLOCK, POSE, FactorBlock, Step, steps_of
+from factorbus.simulate.walk import Place, drive
+
+_VISITS = 2  # visits a place remembers: the first, for loops over the whole drive, and the last
+
+
+def manhattan(
+    poses: int = 3500,
+    seed: int = 1,
+    *,
+    sigma_xy_m: float = 0.0225,
+    sigma_theta_rad: float = 0.0225,
+    loop_share: float = 0.5,
+    loops: int = 2,
+    loop_radius_m: float = 2.0,
+    loop_gap: int = 40,
+    block_m: int = 5,
+) -> Iterator[Step]:
+    """A drive on a grid of streets: `se2` poses a metre apart, `between_se2` odometry and loop closures.
+
+    loop_share: the share of poses that look for a place within loop_radius_m which they passed loop_gap or more poses
+    ago; loops: closures such a pose finds at most.  Noise is independent in x, y (metres) and theta (radians).  As
+    they stand, densities and noise are like those of the manhattan3500 data set.  Raises BadParameter.
+    """
+    checked_run(poses, seed)
+    checked_sigma("sigma_xy_m", sigma_xy_m)
+    checked_sigma("sigma_theta_rad", sigma_theta_rad, 0.5)
+    checked_share("loop_share", loop_share)
+    checked_at_least("loops", loops, 0)
+    checked_at_least("loop_radius_m", loop_radius_m, 0)
+    checked_at_least("loop_gap", loop_gap, 2)
+    checked_at_least("block_m", block_m, 1)
+    places = drive(Random(f"streets {seed}"), block_m, straight=0.5)
+    closures = _Closures(Random(f"closures {seed}"), loop_share, loops, loop_radius_m, loop_gap)
+    sigmas = np.array([sigma_xy_m, sigma_xy_m, sigma_theta_rad])
+    return islice(_blocks(places, closures, np.random.default_rng([seed, 1]), sigmas), poses)
+
+
+def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Generator, sigmas: F64) -> Iterator[Step]:
+    first, before = 0, None
+    while True:
+        block = list(islice(places, BLOCK))
+        pairs, starts, ends = [], [], []
+        for number, place in enumerate(block, first):
+            if before is not None:
+                pairs.append((number - 1, number))
+                starts.append(before)
+            for partner, where in closures.at(number, place):
+                pairs.append((partner, number))
+                starts.append(where)
+            ends.append(len(pairs))
+            before = place
+        truth = true_poses(block)
+        ids = np.array(pairs, np.int64)
+        T = relative_se2(true_poses(starts), truth[ids[:, 1] - first])
+        z = noisy_se2(T, rng.normal(size=T.shape) * sigmas)
+        edges = FactorBlock("between_se2", POSE + ids, z, diagonal_information(sigmas, len(z)), np.array(ends))
+        yield from steps_of("se2", first, truth, [edges])
+        first += len(block)
+
+
+def true_poses(places: list[Place]) -> F64:
+    """Poses (n, 3) of places; headings in [-π, π)."""
+    table = np.array(places, float).reshape(-1, 3)
+    table[:, 2] = ((table[:, 2] + 2) % 4 - 2) * (math.pi / 2)
+    return table
+
+
+class _Closures:
+    """Remembers what a closure needs: per place of the grid its first and last visit."""
+
+    def __init__(self, chance: Random, share: float, most: int, radius: float, gap: int) -> None:
+        self._chance, self._share, self._most, self._gap = chance, share, most, gap
+        reach = range(-int(radius), int(radius) + 1)
+        self._around = [(dx, dy) for dx in reach for dy in reach if dx * dx + dy * dy <= radius * radius]
+        self._visits: dict[tuple[int, int], list[tuple[int, int]]] = {}
+
+    def at(self, number: int, place: Place) -> list[tuple[int, Place]]:
+        """Earlier poses that pose `number` recognises, with their places; `number` is remembered from now on."""
+        x, y, heading = place
+        found: list[tuple[int, Place]] = []
+        if self._chance.random() < self._share:
+            latest = number - self._gap
+            for dx, dy in self._around:
+                for visitor, turned in self._visits.get((x + dx, y + dy), ()):
+                    if visitor <= latest:
+                        found.append((visitor, (x + dx, y + dy, turned)))
+            found = self._some(found)
+        visits = self._visits.setdefault((x, y), [])
+        del visits[_VISITS - 1 :]
+        visits.append((number, heading))
+        return found
+
+    def _some(self, found: list[tuple[int, Place]]) -> list[tuple[int, Place]]:
+        """At most so many of those found, by chance, oldest first; no pose twice."""
+        picked: list[tuple[int, Place]] = []
+        while found and len(picked) < self._most:
+            picked.append(found.pop(int(self._chance.random() * len(found))))
+        return sorted(picked)
