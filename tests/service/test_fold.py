@@ -1,0 +1,226 @@
+"""Inserts into a real solver: the good ones go in, the guilty are refused, a fault leaves the map as it was."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
+from factorbus.proto.problems import BadMessage, Problem
+from factorbus.proto.symbols import parse_symbol
+from factorbus.service.config import Limits
+from factorbus.service.events import Folded, Waiting
+from factorbus.service.fold import Folder
+from factorbus.service.questions import Question
+from factorbus.solver import Options, Solver
+
+EPOCH = 9
+INFORMATION = [100.0, 0, 0, 100, 0, 400]
+
+
+def keys_of(*names: str) -> np.ndarray:
+    return np.array([parse_symbol(name) for name in names], np.int64)
+
+
+def edge(i: str, j: str, x: float = 1.0) -> Factors:
+    return Factors("between_se2", keys_of(i, j)[None], np.array([[x, 0.0, 0.1]]), np.array([INFORMATION]))
+
+
+def start() -> Batch:
+    return Batch((Variables("se2", keys_of("x0"), np.zeros((1, 3)), fixed=True),))
+
+
+def pose(name: str, after: str, x: float = 1.0) -> Batch:
+    return Batch((Variables("se2", keys_of(name)),), (edge(after, name, x),))
+
+
+def waiting(content: Batch | Problem, client: str = "a", sequence: int = 1, settle: bool = False) -> Waiting:
+    insert = content if isinstance(content, Problem) else Insert(sequence, content, settle)
+    return Waiting(client, sequence, 100, 0, insert)
+
+
+def codes(folded: Folded) -> list[str]:
+    return [getattr(o.answer, "code", "accepted") for o in folded.outcomes]
+
+
+def accepted(folded: Folded) -> list[Accepted]:
+    return [codec.decode_accepted(o.answer) for o in folded.outcomes if isinstance(o.answer, bytes)]
+
+
+def deltas(folded: Folded) -> list[Delta]:
+    return [codec.decode_delta(step.delta) for step in folded.steps]
+
+
+def values(folder: Folder) -> dict[int, bytes]:
+    taken = folder.snapshot([Question("estimate")])
+    return {
+        int(key): row.tobytes() for g in taken.variables if g.values is not None
+        for key, row in zip(g.keys, g.values, strict=True)
+    }  # fmt: skip
+
+
+def make() -> Solver:
+    return Solver(Options(clock=time.perf_counter))
+
+
+@pytest.fixture
+def folder() -> Folder:
+    made = Folder(make, EPOCH, Limits())
+    made.fold([waiting(start())])
+    return made
+
+
+def test_several_inserts_in_one_step(folder: Folder) -> None:
+    folded = folder.fold([waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2)])
+    assert codes(folded) == ["accepted"] * 3
+    assert [(a.revision, a.first_factor, a.folded, a.epoch) for a in accepted(folded)] == [
+        (2, 0, 3, EPOCH),
+        (2, 1, 3, EPOCH),
+        (2, 2, 3, EPOCH),
+    ]
+    (delta,) = deltas(folded)
+    assert (delta.revision, delta.previous, delta.epoch) == (2, 1, EPOCH)
+    assert sorted(int(k) for g in delta.variables for k in g.keys) == sorted(keys_of("x1", "x2", "x3").tolist())
+    assert (folded.variables, folded.factors) == (4, 3)
+    assert delta.report["solver_ms"] > 0
+
+
+def test_a_bad_insert_is_refused_and_the_others_go_on(folder: Folder) -> None:
+    folded = folder.fold(
+        [
+            waiting(pose("x1", "x0")),
+            waiting(pose("x1", "x0"), "b"),
+            waiting(pose("x2", "x9"), "c"),
+            waiting(BadMessage("insert", "garbage", "sense"), "d"),
+            waiting(pose("x2", "x1"), "e"),
+        ]
+    )
+    by_client = dict(zip([o.insert.client for o in folded.outcomes], codes(folded), strict=True))
+    assert by_client == {
+        "a": "accepted",
+        "b": "duplicate_variable",
+        "c": "unknown_variable",
+        "d": "bad_message",
+        "e": "accepted",
+    }
+    assert len(folded.steps) == 1
+
+
+def test_nothing_accepted_means_no_step_and_not_a_bit_changed(folder: Folder) -> None:
+    folder.fold([waiting(pose("x1", "x0"))])
+    before = values(folder)
+    folded = folder.fold([waiting(pose("x1", "x0")), waiting(pose("x2", "x7"), "b")])
+    assert codes(folded) == ["duplicate_variable", "unknown_variable"]
+    assert folded.steps == ()
+    assert values(folder) == before
+    assert folder.snapshot([Question("chi2")]).revision == 2
+
+
+def test_when_the_step_fails_only_the_guilty_are_refused(folder: Folder) -> None:
+    alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
+    folded = folder.fold([waiting(pose("x1", "x0")), waiting(alone, "b"), waiting(pose("x2", "x1"), "c")])
+    assert codes(folded) == ["accepted", "underconstrained", "accepted"]
+    assert [step.revision for step in folded.steps] == [2, 3], "one step each"
+    assert parse_symbol("x8") not in values(folder)
+    assert [a.first_factor for a in accepted(folded)] == [0, 1]
+
+
+def test_a_lonely_guilty_insert_is_tried_once(folder: Folder) -> None:
+    alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
+    folded = folder.fold([waiting(alone)])
+    assert (codes(folded), folded.steps, folded.variables) == (["underconstrained"], (), 1)
+
+
+def test_a_map_has_a_size(folder: Folder) -> None:
+    small = Folder(make, EPOCH, Limits(variables=2, factors=1))
+    folded = small.fold([waiting(start()), waiting(pose("x1", "x0"), "b"), waiting(pose("x2", "x0"), "c")])
+    assert codes(folded)[0] == "too_large"
+    assert [o.answer.detail["limit"] for o in folded.outcomes if isinstance(o.answer, Problem)] == [2]
+
+
+def test_settle_iterates_until_converged(folder: Folder) -> None:
+    folder.fold([waiting(pose("x1", "x0")), waiting(pose("x2", "x1"), "b")])
+    folder.fold([waiting(Batch(factors=(edge("x0", "x2", 2.5),)))])
+    folded = folder.fold([waiting(Batch(), settle=True)])
+    assert deltas(folded)[0].report["converged"] is True
+
+
+class Faulty(Solver):
+    """A real solver with faults in it: the call that is next in `failing` raises, before or after it has done its work.
+
+    A fault named like a variable is brought about by staging that variable, every time.
+    """
+
+    def __init__(self, failing: list[str]) -> None:
+        super().__init__(Options())
+        self._failing = failing
+
+    def stage(self, batch: Any) -> int:
+        staged = {int(key) for group in batch.variables for key in group.keys}
+        if staged & {parse_symbol(name) for name in self._failing if " " not in name}:
+            raise IndexError("a fault of the solver")
+        return self._run("stage", lambda: super(Faulty, self).stage(batch))
+
+    def step(self, settle: bool = False) -> Any:
+        return self._run("step", lambda: super(Faulty, self).step(settle))
+
+    def changed(self) -> Any:
+        return self._run("changed", super().changed)
+
+    def graph(self) -> Any:
+        return self._run("graph", super().graph)
+
+    def _run(self, name: str, call: Callable[[], Any]) -> Any:
+        if self._failing and self._failing[0] == f"before {name}":
+            self._failing.pop(0)
+            raise IndexError("a fault of the solver")
+        result = call()
+        if self._failing and self._failing[0] == f"after {name}":
+            self._failing.pop(0)
+            raise ZeroDivisionError("a fault of the solver")
+        return result
+
+
+def with_faults() -> tuple[Folder, list[str]]:
+    failing: list[str] = []
+    folder = Folder(lambda: Faulty(failing), EPOCH, Limits())
+    for sequence, batch in enumerate((start(), pose("x1", "x0"), pose("x2", "x1")), 1):
+        folder.fold([waiting(batch, sequence=sequence)])
+    return folder, failing
+
+
+@pytest.mark.parametrize("fault", ["before stage", "after stage", "before step", "after step", "before changed"])
+def test_a_fault_of_the_solver_refuses_its_insert_and_keeps_what_was_accepted(fault: str) -> None:
+    folder, failing = with_faults()
+    held = set(values(folder))
+    failing.append(fault)
+    folded = folder.fold([waiting(pose("x3", "x2"))])
+    assert codes(folded) == ["internal"]
+    assert set(values(folder)) == held
+    (delta,) = deltas(folded)
+    assert (delta.previous, delta.revision) == (3, 4), "readers are told of everything again"
+    assert {int(k) for g in delta.variables for k in g.keys} == held
+    assert codes(folder.fold([waiting(pose("x3", "x2"), sequence=2)])) == ["accepted"]
+
+
+def test_a_fault_among_several_inserts_hits_only_the_one_that_brings_it() -> None:
+    folder, failing = with_faults()
+    failing.append("x13")
+    folded = folder.fold([waiting(pose("x3", "x2")), waiting(pose("x13", "x2"), "b"), waiting(pose("x4", "x2"), "c")])
+    assert codes(folded) == ["accepted", "internal", "accepted"]
+    assert set(values(folder)) == set(keys_of("x0", "x1", "x2", "x3", "x4").tolist())
+    assert [d.revision - d.previous for d in deltas(folded)] == [1] * len(folded.steps)
+
+
+def test_what_cannot_be_brought_back_is_said_for_good() -> None:
+    folder, failing = with_faults()
+    failing += ["before step", "before graph"]
+    assert codes(folder.fold([waiting(pose("x3", "x2"))])) == ["internal"]
+    folded = folder.fold([waiting(pose("x4", "x2"))])
+    assert codes(folded) == ["internal"]
+    assert "drop it" in folded.outcomes[0].answer.message
+    with pytest.raises(Problem, match="drop it"):
+        folder.snapshot([Question("estimate")])
