@@ -27,11 +27,11 @@ from typing import Any
 import llvmlite
 import llvmlite.binding
 import numba
+import numba.extending
 import numpy as np
 from llvmlite import ir
 from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 __all__ = [
@@ -51,6 +51,8 @@ __all__ = [
     "types",
     "vector_lanes",
 ]
+
+intrinsic: Any = numba.extending.intrinsic
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -194,7 +194,7 @@ def _by_group(group: I64) -> tuple[I64, I64]:
 
 
 @inline_kernel
-def _open_group(members: I64, weight: I64, degree: I64, head: I64, after: I64, before: I64) -> tuple[int, int]:
+def _open_group(members: I64, weight: I64, degree: I64, head: I64, after: I64, before: I64) -> tuple:
     """Queue the nodes of a group; gives the least degree and the weight of all."""
     lowest, waiting = head.size - 1, 0
     for i in members:
@@ -226,7 +226,7 @@ def _drop(i: int, degree: I64, head: I64, after: I64, before: I64) -> None:
 @inline_kernel
 def _update(
     i: int, me: int, clock: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, kind: I64, mark: I64
-) -> tuple[int, int]:
+) -> tuple:
     """Rewrite the list of i without what is absorbed and with `me`; gives its degree outside Lₚ and a hash."""
     first = begin[i]
     put, external, hashed = first, 0, 0
@@ -287,7 +287,7 @@ def _merge_twins(
 
 
 @inline_kernel
-def _compact(need: int, begin: I64, length: I64, kind: I64, weight: I64, lists: I64) -> tuple[I64, int]:
+def _compact(need: int, begin: I64, length: I64, kind: I64, weight: I64, lists: I64) -> tuple:
     """Copy the living lists together, with room for `need` more."""
     alive = 0
     for i in range(begin.size):

@@ -16,8 +16,9 @@ from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, at, pu
 DEPTH = 128  # rows of a panel: with WIDTH columns they fit the second level cache
 WIDTH = 192
 
-# A pivot is what is left of Λₖₖ after cancellation, and its rounding error is a small multiple of ε·Λₖₖ (backward
-# stability bounds it by n·ε·Λₖₖ for a row of n nonzeros; measured, it stays below 1e-14).  Below 1e-13 of Λₖₖ what is left is noise.
+# A pivot is what cancellation leaves of the diagonal entry Λₖₖ, with a rounding error of some ε·Λₖₖ.  Measured: the
+# pivots of a free grid of 100 poses, zero in truth, come out at 4e-15·Λₖₖ or below zero, while the least pivot of a
+# chain of 30,000 poses held at one end only and eliminated from there, poor but real, is 1e-11·Λₖₖ.
 PIVOT_TOLERANCE = 1e-13
 
 

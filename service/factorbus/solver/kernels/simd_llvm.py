@@ -1,15 +1,15 @@
-"""The LLVM side of `simd`: intrinsics without range checks.  Sizes of tiles are chosen at run time by a switch."""
+"""The functions of `simd` as LLVM, without range checks.  The size of a tile is chosen at run time by a switch."""
 
 from typing import Any
 
 from factorbus.solver.kernels._jit import cgutils, intrinsic, ir, types, vector_lanes
+from factorbus.solver.kernels.simd_plain import TRIANGLE
 
 LANES = vector_lanes()
 _F64 = ir.DoubleType()
 _I64 = ir.IntType(64)
 _PTR = _F64.as_pointer()
 _VEC = ir.VectorType(_F64, LANES)
-_PAIR = {(0, 1): 4, (0, 2): 5, (1, 2): 6, (0, 3): 7, (1, 3): 8, (2, 3): 9}
 _INT = types.int64
 
 
@@ -64,7 +64,7 @@ def add_run(_typing: Any, a: Any, _i: Any, _j: Any, _count: Any) -> Any:
 def tile(
     _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, _x: Any, _y: Any, _ld: Any, _depth: Any
 ) -> Any:
-    """C −= XᵀY in registers: see `simd.tile`"""
+    """C −= XᵀY in registers: see `simd_plain.tile`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, rows, vectors, c, ldc, x, y, ld, depth = args
@@ -79,7 +79,7 @@ def tile(
 
 @intrinsic
 def solve_rows(_typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ld: Any, _t: Any) -> Any:
-    """C = T⁻ᵀ C: see `simd.solve_rows`"""
+    """C = T⁻ᵀ C: see `simd_plain.solve_rows`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, rows, vectors, c, ld, t = args
@@ -122,7 +122,7 @@ def _build_tile(builder: Any, shape: tuple[int, int], c: Any, ldc: Any, x: Any, 
 
 def _build_solve(builder: Any, shape: tuple[int], c: Any, ld: Any, t: Any, vectors: Any) -> None:
     (rows,) = shape
-    entry = {key: _spread(builder, builder.load(builder.gep(t, [_I64(where)]))) for key, where in _PAIR.items()}
+    entry = {key: _spread(builder, builder.load(builder.gep(t, [_I64(where)]))) for key, where in TRIANGLE.items()}
     inverse = [_spread(builder, builder.load(builder.gep(t, [_I64(i)]))) for i in range(rows)]
     with _loop(builder, _I64(0), vectors, 1) as (k, _carried):
         start = builder.mul(k, _I64(LANES))
