@@ -174,13 +174,6 @@ def test_another_epoch_starts_over() -> None:
     assert (following.live, following.epoch, following.revision, following.count()) == (True, 8, 1, 1)
 
 
-@pytest.mark.parametrize(("epoch", "revision", "live"), [(7, 3, True), (7, 2, True), (7, 4, False), (8, 3, False)])
-def test_a_probe_shows_what_was_missed(epoch: int, revision: int, live: bool) -> None:
-    following = started()
-    following.probe(epoch, revision)
-    assert following.live is live
-
-
 @given(
     losses=st.lists(st.booleans(), min_size=1, max_size=30),
     answers=st.lists(st.integers(0, 3), min_size=30, max_size=30),

@@ -126,7 +126,7 @@ class Service:
         if self.ask_fault == "silence":
             return None
         if question == "stats":
-            return codec.encode_map({"steps": self.revision})
+            return codec.encode_map({"epoch": self.epoch, "revision": self.revision})
         wanted = codec.decode_keys_asked(payload)
         chosen = list(self.values) if wanted is None else wanted.tolist()
         return codec.encode_estimate(Estimate(self.epoch, self.revision, self._columns(chosen)))
@@ -189,7 +189,7 @@ def test_inserts_are_answered_and_seen_in_the_mirror(start: Callable[..., Servic
         assert same(kitchen.estimate, service)
         assert not kitchen.estimate.stale
         assert kitchen.estimate.age_s < 10
-        assert kitchen.stats() == {"steps": 199}
+        assert kitchen.stats() == {"epoch": 1, "revision": 199}
         assert [row.name for row in bus.maps()] == [MAP]
         with pytest.raises(KeyError, match="x7 is not in map 'kitchen'"):
             kitchen.estimate["x7"]

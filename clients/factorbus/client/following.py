@@ -2,7 +2,7 @@
 
     lost ──estimate──▶ live ──delta whose `previous` is our revision──▶ live
       ▲                  │
-      └── gap, other epoch, owner gone, a probe that knows a newer revision
+      └── gap, other epoch, owner gone, a newer revision heard of
 
 While lost, deltas are kept aside, the last values stay readable, and the estimate is asked for; when it comes, the
 deltas that go on from it are applied.  So no change is ever skipped, and what is old says so.
@@ -57,11 +57,6 @@ class Following:
             if delta.epoch == self.epoch:
                 news += self.delta(delta)
         return news
-
-    def probe(self, epoch: int, revision: int) -> None:
-        """The owner says where the map is: if that is not where we are, we missed something."""
-        if epoch != self.epoch or revision > self.revision:
-            self.live = False
 
     def lost(self) -> None:
         """Nobody owns the map at the moment, or nobody answers: what we hold may be old."""

@@ -11,10 +11,12 @@ from typing import Any
 
 from factorbus.client.following import Following, tables_of
 from factorbus.client.link import Link
-from factorbus.client.replies import Answer, Reply, pause
-from factorbus.proto import keys
+from factorbus.client.replies import Answer, Reply, TimedOut, pause
+from factorbus.proto import fields, keys
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_asked
+from factorbus.proto.fields import read_map
+from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
 from factorbus.proto.problems import BadSymbol, Problem, Unavailable
 from factorbus.proto.symbols import format_symbol, parse_symbol
@@ -24,6 +26,8 @@ log = logging.getLogger("factorbus.client")
 # Without deltas for this long the owner is asked for its revision: a last delta that got lost leaves no gap to see.
 PROBE_S = 1.0
 _ANSWER_S = 5.0
+# A revision heard of by another way may be ahead of its delta by so much.
+_GRACE_S = 0.1
 # Messages that may wait for this thread before they are given up for the whole estimate.
 _BACKLOG = 4096
 # A waiting reader has the owner asked this soon.
@@ -202,7 +206,9 @@ class Mirror:
                 self._ask()
 
     def _patience(self) -> float:
-        if self._following.live or self._asking:
+        if self._following.live:
+            return _GRACE_S if self._following.revision < self._expected else PROBE_S
+        if self._asking:
             return PROBE_S
         return min(max(self._ask_at - time.monotonic(), 0.0), PROBE_S)
 
@@ -218,9 +224,8 @@ class Mirror:
                 self._take_probe(content)
             case "owner":
                 self._take_owner(*content)
-            case "probe" if self._following.live and not self._probing:
-                self._probing = True
-                self._query(encode_keys_asked(_NO_KEYS), "probed")
+            case "probe" if self._following.live:
+                self._probe()
             case "stop":
                 self._closing = True
 
@@ -252,15 +257,29 @@ class Mirror:
             self._silences += 1
             self._ask_at = time.monotonic() + pause(self._silences)
 
+    def _probe(self) -> None:
+        """Nothing came for a while: what we know to be missing got lost; otherwise ask where the map is."""
+        if self._following.revision < self._expected:
+            self._lose()
+        elif not self._probing:
+            self._probing = True
+            self._query("stats", b"", "probed")
+
     def _take_probe(self, reply: Reply) -> None:
         self._probing = False
+        if isinstance(reply, TimedOut):
+            return  # the service is there and busy
         if not isinstance(reply, Answer):
             self._lose()
             return
-        told = decode_estimate(reply.payload)
+        told = read_map("stats", reply.payload, ANSWER_LIMITS)
+        epoch, revision = fields.integer("stats", told, "epoch"), fields.integer("stats", told, "revision")
         with self._changed:
-            self._following.probe(told.epoch, told.revision)
-            self._confirm()
+            if epoch != self._following.epoch:
+                self._following.lost()
+            self._expected = max(self._expected, revision)
+            if not self.stale:
+                self._confirm()
 
     def _take_owner(self, token: str, alive: bool) -> None:
         if alive:
@@ -293,11 +312,8 @@ class Mirror:
     def _ask(self) -> None:
         if not self._asking and time.monotonic() >= self._ask_at and not self._closing:
             self._asking = True
-            self._query(encode_keys_asked(None), "estimate")
+            self._query("estimate", encode_keys_asked(None), "estimate")
 
-    def _query(self, question: bytes, word: str) -> None:
-        key = keys.ask_key(self._map, "estimate")
-        self._link.ask(key, question, _ANSWER_S, lambda reply: self._inbox.put((word, reply)))
-
-
-_NO_KEYS: Any = ()
+    def _query(self, question: str, payload: bytes, word: str) -> None:
+        key = keys.ask_key(self._map, question)
+        self._link.ask(key, payload, _ANSWER_S, lambda reply: self._inbox.put((word, reply)))
