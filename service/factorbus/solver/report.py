@@ -1,7 +1,7 @@
 """The account of a step: what was done, why, and how long each part took."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 
@@ -43,7 +43,8 @@ class StepReport:
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
-        return asdict(self)
+        # By hand: asdict copies deeply and costs 50 µs, a third of a small step.
+        return {name: getattr(self, name) for name in self.__slots__} | {"phases_ms": dict(self.phases_ms)}
 
 
 class Stopwatch:
