@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.cli.exits import EXTRAS, Stopped
+from factorbus.cli.exits import Stopped, lacking
 from factorbus.cli.options import DEFAULT_ENDPOINT
 from factorbus.cli.version import LIBRARIES, installed
 from factorbus.proto.problems import Problem
@@ -41,11 +41,10 @@ def libraries() -> Finding:
     """the libraries"""
     have = {name: installed(name) for name in LIBRARIES}
     seen = ", ".join([f"factorbus {__version__}", *(f"{name} {version}" for name, version in have.items() if version)])
-    lacking = [extra for extra, names in EXTRAS.items() if any(find_spec(name) is None for name in names)]
-    if "service" in lacking:
+    if lacking("service"):
         mend = "fine for a front end; for solver and workers: pip install 'factorbus[service]'"
         return Finding("libraries", "warn", f"{seen}; a light client without the solver", mend)
-    if lacking:
+    if lacking("viz"):
         return Finding("libraries", "warn", f"{seen}; no pictures", "pip install 'factorbus[viz]'")
     return Finding("libraries", "ok", seen)
 
@@ -109,7 +108,7 @@ def port() -> Finding:
 
 def bus() -> Finding:
     """a round trip over the bus"""
-    if any(find_spec(name) is None for name in EXTRAS["service"]):
+    if lacking("service"):
         return Finding("bus", "warn", "not tried: it needs a solver process", "pip install 'factorbus[service]'")
     from factorbus.cli.children import service
     from factorbus.client import connect

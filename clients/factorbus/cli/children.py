@@ -8,6 +8,7 @@ import queue
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import IO
@@ -16,6 +17,7 @@ from factorbus.cli.exits import Stopped
 
 READY = "ready "
 _STOP_S = 20.0
+_LONG_S = 3.0
 
 
 class Child:
@@ -23,7 +25,8 @@ class Child:
 
     def __init__(self, name: str, arguments: Sequence[str], say: Callable[[str], None] | None = None) -> None:
         self.name = name
-        self._say = say  # gets what it prints on standard error, until it is ready
+        self._say = say  # gets what it prints on standard error until it is ready, once that takes long
+        self._started = time.monotonic()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "factorbus.cli", *arguments],
             stdin=subprocess.PIPE,
@@ -102,7 +105,7 @@ class Child:
     def _listen(self, stream: IO[str]) -> None:
         for line in stream:
             self._said.append(line.rstrip("\n"))
-            if self._say is not None:
+            if self._say is not None and time.monotonic() - self._started > _LONG_S:
                 self._say(self._said[-1])
 
     def _died(self) -> Stopped:
@@ -128,7 +131,7 @@ def service(
 ) -> Iterator[tuple[Child, str]]:
     """A solver process of our own on a free port of this machine, and its endpoint.
 
-    say gets what it tells while it starts.  timeout_s allows for compiling every kernel on a cold start.
+    say gets what it tells while it starts, if that takes long.  timeout_s allows for compiling every kernel.
     """
     with child("solver", "serve", "--listen", "tcp/127.0.0.1:0", "--until-eof", *options, say=say) as process:
         yield process, process.ready(timeout_s)[0]

@@ -16,7 +16,7 @@ from factorbus.proto.messages import Batch, Variables
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """One insert that is in: from `revision` on.  bus_ms: waited beyond the step's own time; None without a bus."""
+    """One insert that is in: from `revision` on.  bus_ms: waited beyond the solver's time; None without a bus."""
 
     revision: int
     report: Mapping[str, Any]
@@ -168,6 +168,6 @@ class _Recent:
             self._since, self._poses = now, driven.poses
         recent = driven.steps[-500:]
         if not recent:
-            return f"{rate:.0f} poses/s"
+            return f"{rate:.0f}/s"
         p99 = percentiles([step.report["step_ms"] for step in recent])["p99"]
-        return f"{rate:5.0f} poses/s   χ² {recent[-1].report['chi2']:.6g}   step p99 {p99:.1f} ms"
+        return f"{rate:.0f}/s χ² {recent[-1].report['chi2']:.6g} p99 {p99:.1f} ms"

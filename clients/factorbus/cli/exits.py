@@ -66,14 +66,18 @@ def require(extra: str, what: str) -> None:
 
     Looks without importing.  Raises Stopped.
     """
-    missing = [name for name in EXTRAS[extra] if find_spec(name) is None]
-    if missing:
+    if missing := lacking(extra):
         hint = " (compiles against SuiteSparse: apt-get install libsuitesparse-dev first)" if extra == "service" else ""
         raise Stopped(
             "missing_extra",
             f"{what} needs {', '.join(missing)}, not installed here: pip install 'factorbus[{extra}]'{hint}",
             extra=extra,
         )
+
+
+def lacking(extra: str) -> list[str]:
+    """The libraries of `extra` that are not installed, by import name."""
+    return [name for name in EXTRAS[extra] if find_spec(name) is None]
 
 
 def _exit_code(error: Exception, code: str) -> int:

@@ -63,12 +63,12 @@ class LocalMap:
         return Stepped(self._revision, report, None)
 
 
-def dead_reckoning(batches: Iterable[Batch]) -> tuple[float, tuple[Variables, ...]]:
-    """(χ², variables) of the whole graph before any step: each as composed from the first factor that reaches it."""
-    solver = Solver(Options(clock=time.perf_counter))
+def chi2_unsolved(batches: Iterable[Batch]) -> float:
+    """χ² of the whole graph with every variable as composed from the first factor that reaches it."""
+    solver = Solver(Options(max_iterations=0))
     for batch in batches:
         solver.stage(batch)
-    return solver.chi2(), _variables(solver.estimate())
+    return solver.step().chi2
 
 
 def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:

@@ -10,6 +10,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 MODES = ("auto", "all-batch")
+WORLDS = ("manhattan", "city-trees", "sphere")
 
 
 def json_option(command: F) -> F:

@@ -1,13 +1,15 @@
-"""A map on the bus, driven and mirrored by this process."""
+"""A map on the bus, driven or only looked at by this process, and mirrored in it."""
 
+import threading
 import time
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from factorbus.cli.drive import Compared, Stepped
 from factorbus.client import Map, Ticket
-from factorbus.proto.messages import Accepted, Batch, Delta, Variables
+from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
 
 _ANSWER_S = 600.0
 
@@ -20,10 +22,11 @@ class RemoteMap:
         self._mirror = joined.estimate
         self._out: deque[Ticket] = deque()
         self._start = self._mirror.revision
-        self._received: set[int] = set()
+        self._received: dict[int, Mapping[str, Any]] = {}
+        self._latest: Mapping[str, Any] = {}
+        self._news = threading.Event()
         self._forget = self._mirror.on_delta(self._on_delta)
-        self._comparers = ThreadPoolExecutor(2, thread_name_prefix="compare")
-        self._comparisons: list[Future[Compared]] = []
+        self._comparisons: list[Future[Chi2]] = []
 
     def send(self, batch: Batch) -> list[Stepped]:
         """Insert, waiting with a window of 1; otherwise with up to `window` inserts out."""
@@ -50,12 +53,12 @@ class RemoteMap:
         return _stepped(accepted, time.perf_counter() - start)
 
     def compare(self) -> None:
-        """Ask for the batch optimum in the background; a worker finds it while the drive goes on."""
-        self._comparisons.append(self._comparers.submit(self._compare))
+        """Ask for the batch optimum of the present revision; a worker finds it while the drive goes on."""
+        self._comparisons.append(self._map.ask.chi2(batch=True, timeout_s=_ANSWER_S))
 
     def compared(self) -> list[Compared]:
         """All comparisons, by revision."""
-        done = [comparison.result(_ANSWER_S) for comparison in self._comparisons]
+        done = [_compared(comparison.result(_ANSWER_S)) for comparison in self._comparisons]
         return sorted(done, key=lambda each: each.revision)
 
     def estimate(self) -> tuple[Variables, ...]:
@@ -76,20 +79,35 @@ class RemoteMap:
             "deltas": len(self._received),
         }
 
+    @property
+    def reports(self) -> list[Mapping[str, Any]]:
+        """The account of every step whose delta came here, by revision."""
+        return [self._received[revision] for revision in sorted(self._received)]
+
+    @property
+    def latest(self) -> Mapping[str, Any]:
+        """The account of the last step whose delta came here; empty when there is none."""
+        return self._latest
+
+    def wait_for(self, revision: int) -> None:
+        """Until the estimate of `revision` is here."""
+        self._mirror.wait_for(revision)
+
+    def await_news(self, timeout_s: float) -> int:
+        """Wait for a delta, or until time is up; gives the revision that the estimate here is of."""
+        self._news.wait(timeout_s)
+        self._news.clear()
+        return self._mirror.revision
+
     def close(self) -> None:
-        """Stop listening; comparisons not begun are dropped."""
+        """Stop listening."""
         self._forget()
-        self._comparers.shutdown(cancel_futures=True)
 
     def _on_delta(self, delta: Delta) -> None:
         """Count a step's own delta; a resynchronisation (previous 0, everything in one) is not one."""
         if delta.previous == delta.revision - 1 and delta.revision > self._start:
-            self._received.add(delta.revision)
-
-    def _compare(self) -> Compared:
-        answer = self._map.chi2(batch=True, timeout_s=_ANSWER_S)
-        batch = float("nan") if answer.batch is None else answer.batch
-        return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds)
+            self._received[delta.revision] = self._latest = delta.report
+        self._news.set()
 
     def _collect(self, wait: bool) -> list[Stepped]:
         steps = []
@@ -101,4 +119,9 @@ class RemoteMap:
 
 
 def _stepped(accepted: Accepted, seconds: float) -> Stepped:
-    return Stepped(accepted.revision, accepted.report, seconds * 1e3 - accepted.report["step_ms"])
+    return Stepped(accepted.revision, accepted.report, seconds * 1e3 - accepted.report["solver_ms"])
+
+
+def _compared(answer: Chi2) -> Compared:
+    batch = float("nan") if answer.batch is None else answer.batch
+    return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds)

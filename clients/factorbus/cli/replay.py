@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.exits import Stopped, input_file, require
+from factorbus.cli.exits import Stopped, input_file, lacking, require
 from factorbus.cli.options import MODES, file_argument, json_option, out_option
 
 
@@ -71,9 +71,9 @@ def command(as_json: bool, **asked: Any) -> None:
 
     \b
     In the result, per insert or step:
-      step_ms      the solver's own time
-      bus_ms       from sending the insert to having its answer and its delta here, beyond step_ms; with --window
-                   above 1, from sending to the answer, queueing included
+      step_ms      the step in the solver
+      bus_ms       from sending the insert to having its answer and its delta here, beyond the solver's own time
+                   (staging and step); with --window above 1, from sending to the answer, queueing included
       chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
     """
     request = Request(**asked)
@@ -94,6 +94,8 @@ def replay(request: Request) -> dict[str, Any]:
     from factorbus.cli.drive import drive
     from factorbus.formats import read
 
+    if request.plot:
+        require("viz", "--plot")
     with input_file(request.file):
         graph = read(request.file)
     for text in graph.notes:
@@ -108,9 +110,8 @@ def replay(request: Request) -> dict[str, Any]:
         compared = target.compared()
         after = target.account()
         _write(request, target)
-        start = _start(request, steps)
         if request.plot:
-            _draw(request.plot, request.file.name, target, start)
+            _draw(request.plot, request.file.name, driven, target, steps)
     measured = driven.measures()
     return {
         "file": str(request.file),
@@ -119,7 +120,7 @@ def replay(request: Request) -> dict[str, Any]:
         "revision": last.revision,
         "chi2": last.report["chi2"],
         "chi2_unsettled": unsettled,
-        "chi2_initial": start[0] if start else None,
+        "chi2_initial": _chi2_initial(steps),
         "settled": bool(request.settle and last.report["converged"]),
         "settle_iterations": last.report["iterations"] if request.settle else 0,
         "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
@@ -168,36 +169,36 @@ def _target(request: Request) -> Iterator[Any]:
 
 def _write(request: Request, target: Any) -> None:
     from factorbus.formats import write_g2o, write_tum
+    from factorbus.proto.messages import Batch
 
     if request.out:
         write_g2o(request.out, target.graph())
     if request.tum:
-        write_tum(request.tum, _poses(target))
+        write_tum(request.tum, Batch(target.estimate()))
 
 
-def _poses(target: Any) -> Any:
-    from factorbus.proto.messages import Batch
+def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
+    from factorbus.cli.picture import course_of, draw
 
-    return Batch(target.estimate())
+    reports = [step.report for step in driven.steps]
+    draw(path, steps, target.estimate(), course_of(reports, target.compared()), title)
 
 
-def _start(request: Request, steps: Any) -> Any:
-    """Dead reckoning, by the solver where it is installed; a light client does without."""
-    try:
-        from factorbus.cli.local import dead_reckoning
-    except ModuleNotFoundError:
+def _chi2_initial(steps: Any) -> float | None:
+    """χ² before any step, by the solver; None in a light client, which has none."""
+    if lacking("service"):
         return None
-    return dead_reckoning(steps)
+    from factorbus.cli.local import chi2_unsolved
+
+    return chi2_unsolved(steps)
 
 
 def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     step, bus = result["step_ms"], result["bus_ms"]
     rows = [
         ("graph", f"{result['poses']} poses, {result['landmarks']} landmarks, {result['factors']} factors"),
-        (
-            "time",
-            f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s; solver CPU {result['solver_cpu_s']:.2f} s",
-        ),
+        ("time", f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s"),
+        ("solver CPU", f"{result['solver_cpu_s']:.2f} s"),
         ("step", _times(step)),
     ]
     if bus:

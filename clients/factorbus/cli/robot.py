@@ -25,6 +25,6 @@ def command(endpoint: str, map_name: str, world: str, poses: int, seed: int, unt
         threading.Thread(target=leave_on_eof, daemon=True).start()
     with connect(endpoint, client="robot") as bus, bus.map(map_name) as joined:
         target = RemoteMap(joined)
-        driven = drive(target, (step.batch for step in WORLDS[world](poses=poses, seed=seed)))
+        driven = drive(target, (step.batch for step in WORLDS[world.replace("-", "_")](poses=poses, seed=seed)))
         document(driven.measures() | target.account())
         target.close()

@@ -1,4 +1,4 @@
-"""What a person sees: progress on standard error, the result on standard output.  rich is imported when it is needed."""
+"""What a person sees: progress on standard error, the result on standard output.  rich is imported when needed."""
 
 import json
 import math
@@ -57,7 +57,7 @@ def _bar() -> "Progress":
 
     return Progress(
         TextColumn("{task.description}"),
-        BarColumn(bar_width=28),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("{task.fields[word]}"),

@@ -1,0 +1,51 @@
+"""The picture that `demo` and `replay --plot` draw."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorbus.cli.columns import merged
+from factorbus.cli.drive import Compared
+from factorbus.proto.messages import Batch, Variables
+from factorbus.viz import Course, Odometry, loops_of, save_map
+
+
+def draw(
+    path: Path,
+    batches: Iterable[Batch],
+    estimate: Sequence[Variables],
+    course: Course,
+    title: str,
+    subtitle: str = "",
+    truth: Sequence[Variables] = (),
+) -> None:
+    """Odometry, estimate, truth, loop closures, and below them how the drive went, into the file `path`."""
+    graph = merged(batches)
+    save_map(
+        path,
+        estimate=estimate,
+        odometry=reckoned(graph),
+        truth=truth,
+        loops=loops_of(graph),
+        course=course,
+        title=title,
+        subtitle=subtitle,
+    )
+
+
+def reckoned(graph: Batch) -> tuple[Variables, ...]:
+    """Where odometry alone puts the poses."""
+    odometry = Odometry()
+    odometry.add(graph)
+    return odometry.variables()
+
+
+def course_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> Course:
+    """χ² and time of every step, and χ² of the batch optimum where it was found."""
+    return Course(
+        np.array([report["chi2"] for report in reports]),
+        np.array([report["step_ms"] for report in reports]),
+        np.array([(each.revision, each.batch) for each in compared]).reshape(-1, 2),
+    )

@@ -1,0 +1,43 @@
+"""`factorbus work`: join the bus as a worker."""
+
+import logging
+import sys
+from typing import Any
+
+import click
+
+from factorbus.cli.children import READY
+from factorbus.cli.exits import require
+from factorbus.cli.options import DEFAULT_ENDPOINT
+
+
+@click.command()
+@click.option(
+    "--connect", multiple=True, metavar="ENDPOINT", help=f"A service, or a router.  [default: {DEFAULT_ENDPOINT}]"
+)
+@click.option("--slots", type=click.IntRange(1, 1024), default=1, show_default=True, help="Jobs at a time.")
+@click.option("--name", default="", metavar="NAME", help="As the bus sees it.  [default: made up]")
+@click.option("--zenoh", default="", metavar="FILE.json5", help="Zenoh configuration: TLS, access control.")
+@click.option("--warm/--no-warm", default=True, help="Compile every kernel before the first job.  [default: warm]")
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+@click.option("--quiet", is_flag=True, help="Log warnings only.")
+def command(until_eof: bool, quiet: bool, connect: tuple[str, ...], **given: Any) -> None:
+    """Take jobs from services until Ctrl-C or SIGTERM; those begun are finished. Waits for a service not yet there.
+
+    Prints `ready NAME` when it takes jobs. A job is for example the batch optimum of a map, found from scratch while
+    the map's own solver goes on. Start as many workers as there are cores to spare, on any machine.
+
+    \b
+    factorbus work
+    factorbus work --connect tcp/solver.local:7447 --slots 4
+    """
+    require("service", "factorbus work")
+    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.workers.app import work
+    from factorbus.workers.config import Config
+
+    level = logging.WARNING if quiet else logging.INFO
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)-7s %(message)s")
+    config = Config(connect=connect or (DEFAULT_ENDPOINT,), **given)
+    with stop_on_signals(until_eof) as stop:
+        work(config, lambda name: click.echo(READY + name), stop)
