@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
@@ -45,7 +46,7 @@ class BlockSystem:
     def sparse(self) -> csc_array:
         """Λ as a symmetric scipy matrix of scalars."""
         start = self.starts
-        values, rows, cols = [], [], []
+        values, rows, cols = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
         for i, j, block in self.blocks():
             row, col = np.meshgrid(np.arange(block.shape[0]), np.arange(block.shape[1]), indexing="ij")
             row, col = (row + start[i]).ravel(), (col + start[j]).ravel()
@@ -157,3 +158,20 @@ def _symmetric(upper: F64, n: int) -> F64:
 
 
 _EDGES = {"EDGE_SE2": _edge_se2, "EDGE_SE2_XY": _edge_se2_xy, "EDGE_SE3:QUAT": _edge_se3}
+
+
+@st.composite
+def systems(draw: st.DrawFn, most: int = 14) -> BlockSystem:
+    """Positive definite systems of a few variables, sizes mixed, chains, stars, unconnected parts and full ones."""
+    dims = draw(st.lists(st.sampled_from([1, 2, 3, 6, 7]), min_size=1, max_size=most))
+    n = len(dims)
+    pair = st.tuples(st.integers(0, n - 1), st.integers(0, n - 1)).filter(lambda p: p[0] < p[1])
+    pairs = set(draw(st.lists(pair, max_size=3 * n))) if n > 1 else set()
+    shape = draw(st.sampled_from(["as drawn", "chain", "star", "full"]))
+    if shape == "chain":
+        pairs |= {(v, v + 1) for v in range(n - 1)}
+    elif shape == "star":
+        pairs |= {(0, v) for v in range(1, n)}
+    elif shape == "full":
+        pairs = {(i, j) for i in range(n) for j in range(i + 1, n)}
+    return random_system(draw(st.integers(0, 2**32 - 1)), dims, sorted(pairs))

@@ -102,7 +102,7 @@ def vector_lanes() -> int:
 
 
 def cache_folder() -> Path:
-    """The folder where kernels of these sources, flags, versions and processor are kept (made on first use)."""
+    """The folder where kernels of these sources, flags, versions and processor are kept."""
     return _FOLDER.path()
 
 
@@ -173,7 +173,7 @@ class _Compilations(event.TimingListener):
 
 
 class _Folder:
-    """The cache folder, made when the first kernel is compiled or loaded."""
+    """The cache folder, made when the first kernel is declared."""
 
     def __init__(self) -> None:
         self._path: Path | None = None

@@ -1,0 +1,121 @@
+"""The dense kernels against NumPy: a front of any size, and the vector functions it is made of."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive.elimination import partial_cholesky
+
+from factorbus.solver.kernels import _jit, simd_plain
+from factorbus.solver.kernels.dense import DEPTH, factor_front
+from factorbus.solver.kernels.fronts import SCRATCH
+from factorbus.solver.kernels.simd import LANES, add_run, solve_rows, tile, zero
+
+
+@given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))
+def test_a_front_is_factorised_like_a_dense_matrix(p, m, seed):
+    assert_front(p, m, seed)
+
+
+@pytest.mark.parametrize(("p", "m"), [(DEPTH, 70), (DEPTH + 1, 0), (3 * DEPTH + 7, 201), (5, 500)])
+def test_fronts_of_several_panels(p, m):
+    assert_front(p, m, seed=p + m)
+
+
+@given(st.integers(1, 30), st.data())
+def test_the_failing_pivot_is_the_one_named(p, data):
+    bad = data.draw(st.integers(0, p - 1))
+    root = np.triu(np.random.default_rng(p).normal(size=(p, p))) + 5.0 * np.eye(p)
+    front = root.T @ root
+    front[bad, bad] -= root[bad, bad] ** 2 * data.draw(st.sampled_from([1.0 + 1e-9, 2.0, 1e9]))
+    assert run(front, p)[0] == bad
+
+
+def test_floors_are_the_least_pivots():
+    front = np.diag([4.0, 9.0, 16.0])
+    assert run(front, 3, np.array([3.9, 8.9, 15.9]))[0] == -1
+    assert run(front, 3, np.array([3.9, 9.0, 15.9]))[0] == 1
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4])
+@pytest.mark.parametrize("vectors", [1, 2, 3])
+@pytest.mark.parametrize("depth", [0, 1, 5])
+def test_tile(rows, vectors, depth):
+    arena = np.random.default_rng(rows).normal(size=900)
+    expected, args = arena.copy(), (rows, vectors, 3, 41, 300, 500, 29, depth)
+    simd_plain.tile(expected, *args)
+    _tile(arena, *args)
+    np.testing.assert_allclose(arena, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4])
+@pytest.mark.parametrize("vectors", [0, 1, 5])
+def test_solve_rows(rows, vectors):
+    arena = np.random.default_rng(rows).normal(size=900)
+    expected, args = arena.copy(), (rows, vectors, 30, 101, 2)
+    simd_plain.solve_rows(expected, *args)
+    _solve_rows(arena, *args)
+    np.testing.assert_allclose(arena, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 7, 8, 30])
+def test_runs(count):
+    arena = np.arange(100.0)
+    _add_run(arena, 3, 50, count)
+    expected = np.arange(100.0)
+    expected[3 : 3 + count] += expected[50 : 50 + count]
+    np.testing.assert_array_equal(arena, expected)
+    _zero(arena, 3, count)
+    expected[3 : 3 + count] = 0.0
+    np.testing.assert_array_equal(arena, expected)
+
+
+def test_lanes_divide_the_padding():
+    assert 8 % LANES == 0
+
+
+def assert_front(p: int, m: int, seed: int) -> None:
+    root = np.random.default_rng(seed).normal(size=(p + m + 3, p + m))
+    front = root.T @ root + np.eye(p + m)
+    failed, rows, update = run(front, p)
+    assert failed == -1
+    expected_rows, expected_update = partial_cholesky(front, p)
+    np.testing.assert_allclose(np.triu(rows), expected_rows, atol=1e-8)
+    np.testing.assert_allclose(np.triu(update), np.triu(expected_update), atol=1e-8)
+
+
+def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[int, np.ndarray, np.ndarray]:
+    """Put a front into an arena as `fronts` says, everything around it NaN, and factorise it."""
+    n = len(front)
+    m, lead = n - p, -p % 8
+    ld, ldu = lead + p + m + -m % 8, m + -m % 8
+    arena = np.full(SCRATCH + p * ld + m * ldu + 8, np.nan)
+    rows = arena[SCRATCH : SCRATCH + p * ld].reshape(p, ld)
+    update = arena[SCRATCH + p * ld : SCRATCH + p * ld + m * ldu].reshape(m, ldu)
+    rows[:], update[:] = 0.0, 0.0
+    rows[:, lead : lead + n] = np.triu(front)[:p]
+    update[:, :m] = np.triu(front[p:, p:])
+    floors = np.zeros(p) if floors is None else floors
+    failed = factor_front(arena, SCRATCH + lead, ld, p, m, SCRATCH + p * ld, ldu, floors, 0)
+    assert np.isnan(arena[-8:]).all()
+    return failed, rows[:, lead : lead + n], update[:, :m]
+
+
+@_jit.kernel
+def _tile(a, rows, vectors, c, ldc, x, y, ld, depth):
+    tile(a, rows, vectors, c, ldc, x, y, ld, depth)
+
+
+@_jit.kernel
+def _solve_rows(a, rows, vectors, c, ld, t):
+    solve_rows(a, rows, vectors, c, ld, t)
+
+
+@_jit.kernel
+def _add_run(a, i, j, count):
+    add_run(a, i, j, count)
+
+
+@_jit.kernel
+def _zero(a, i, count):
+    zero(a, i, count)

@@ -1,0 +1,164 @@
+"""Where compiled kernels are kept, and that a stale one never runs."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorbus.solver.kernels import _jit
+
+JIT = Path(_jit.__file__)
+CALLER = """
+from kernels import _jit
+from kernels.callee import twice
+
+@_jit.kernel("float64(float64[::1])")
+def four_times(a):
+    return twice(twice(a[{index}]))
+"""
+CALLEE = """
+from kernels import _jit
+
+@_jit.inline_kernel
+def twice(x):
+    return {factor} * x
+"""
+SCRIPT = """
+import numpy as np
+from kernels import _jit, caller
+print(caller.four_times(np.ones(3)), _jit.compiled_seconds() > 0.0, _jit.cache_folder().name)
+"""
+
+
+@pytest.fixture
+def kernels(tmp_path: Path) -> Path:
+    """A package with the real decorators and two small kernels."""
+    folder = tmp_path / "kernels"
+    folder.mkdir()
+    shutil.copy(JIT, folder)
+    write(folder)
+    return folder
+
+
+def write(folder: Path, factor: float = 2.0, index: int = 0) -> None:
+    (folder / "caller.py").write_text(CALLER.format(index=index))
+    (folder / "callee.py").write_text(CALLEE.format(factor=factor))
+
+
+def run(folder: Path, script: str = SCRIPT, **environment: str) -> subprocess.CompletedProcess:
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env={**clean, "PYTHONPATH": str(folder.parent), "FACTORBUS_CACHE": str(folder.parent / "cache"), **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def results(folder: Path, **environment: str) -> tuple[float, bool, str]:
+    done = run(folder, **environment)
+    assert done.returncode == 0, done.stderr
+    value, compiled, name = done.stdout.split()
+    return float(value), compiled == "True", name
+
+
+def test_kernels_come_from_disk_until_a_callee_in_another_file_is_edited(kernels):
+    value, compiled, first = results(kernels)
+    assert (value, compiled) == (4.0, True)
+    value, compiled, again = results(kernels)
+    assert (value, compiled, again) == (4.0, False, first)
+    write(kernels, factor=3.0)
+    value, compiled, after = results(kernels)
+    assert (value, compiled) == (9.0, True)
+    assert after != first
+    write(kernels, factor=2.0)
+    assert results(kernels) == (4.0, False, first)
+
+
+def test_bounds_checked_kernels_are_others(kernels):
+    write(kernels, index=3)
+    assert run(kernels).returncode == 0
+    checked = run(kernels, NUMBA_BOUNDSCHECK="1")
+    assert checked.returncode != 0
+    assert "IndexError" in checked.stderr
+
+
+def test_without_compilation_nothing_is_compiled(kernels):
+    value, compiled, _ = results(kernels, NUMBA_DISABLE_JIT="1")
+    assert (value, compiled) == (4.0, False)
+
+
+def test_a_folder_that_cannot_be_written_is_said_and_replaced(kernels, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    done = run(kernels, FACTORBUS_CACHE=str(tmp_path / "file"))
+    assert done.returncode == 0
+    assert done.stdout.split()[:2] == ["4.0", "True"]
+    assert "set FACTORBUS_CACHE to one that is" in done.stderr
+    assert run(kernels, FACTORBUS_CACHE=str(tmp_path / "file")).stdout.split()[1] == "True"
+
+
+def test_old_folders_go_and_the_newest_stay(kernels, tmp_path):
+    base = tmp_path / "cache" / "kernels"
+    for age in range(10):
+        (base / f"old{age}").mkdir(parents=True)
+        os.utime(base / f"old{age}", (1e9 - age, 1e9 - age))
+    _, _, name = results(kernels)
+    assert {path.name for path in base.iterdir()} == {name, *(f"old{age}" for age in range(5))}
+
+
+def test_the_hash_sees_names_and_contents(kernels):
+    first = _jit.sources_hash(kernels)
+    assert _jit.sources_hash(kernels) == first
+    (kernels / "more.py").write_text("")
+    second = _jit.sources_hash(kernels)
+    (kernels / "more.py").rename(kernels / "another.py")
+    assert len({first, second, _jit.sources_hash(kernels)}) == 3
+
+
+@_jit.kernel("float64(float64[::1])")
+def first_of(a):
+    return a[0]
+
+
+@_jit.kernel
+def any_first(a):
+    return a[0]
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without compilation there are no types to refuse")
+def test_a_kernel_with_a_signature_takes_nothing_else():
+    assert first_of(np.ones(3)) == 1.0
+    for wrong in (np.ones((2, 2)), np.ones(6)[::2], np.ones(3, np.float32), np.ones(3, np.int64)):
+        with pytest.raises(TypeError, match="No matching definition"):
+            first_of(wrong)
+    assert any_first(np.ones(6)[::2]) == 1.0
+
+
+def test_first_calls_from_many_threads():
+    start, answers = threading.Barrier(4), []
+
+    @_jit.kernel("float64(float64[::1])")
+    def last_of(a):
+        return a[a.size - 1]
+
+    def call() -> None:
+        start.wait(30)
+        answers.append(last_of(np.arange(3.0)))
+
+    threads = [threading.Thread(target=call) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert answers == [2.0] * 4
+
+
+def test_compiling_ahead_names_each_kernel():
+    assert list(_jit.iter_compile(first_of)) == ["first_of"]
+    assert first_of(np.ones(1)) == 1.0
