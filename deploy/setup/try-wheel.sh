@@ -34,16 +34,23 @@ EOF
 }
 
 light_client_works() {
-    venv/bin/factorbus --help | grep -q "factorbus demo"
-    venv/bin/factorbus version | grep -q "^factorbus "
+    says "factorbus demo" venv/bin/factorbus --help
+    says "factorbus 0." venv/bin/factorbus version
     venv/bin/python -c 'import sys, factorbus.client; assert not {"numba", "scipy", "sksparse"} & set(sys.modules)'
 }
 
 service_says_what_it_needs() {
-    local code=0 said
-    said=$(venv/bin/factorbus serve 2>&1) || code=$?
-    [ "$code" != 0 ] && grep -q "pip install 'factorbus\[service\]'" <<<"$said" || {
-        echo "wheel: factorbus serve without its extra said: $said (exit $code)" >&2
+    says "pip install 'factorbus[service]'" venv/bin/factorbus serve
+    says "pip install 'factorbus[service]'" venv/bin/factorbus demo
+}
+
+# Whether the output of a command holds a text; the whole output is read first, or the command would die of a closed pipe.
+says() {
+    local wanted=$1 said
+    shift
+    said=$("$@" 2>&1) || true
+    [[ $said == *"$wanted"* ]] || {
+        echo "wheel: wanted '$wanted' from: $*; it said: $said" >&2
         return 1
     }
 }

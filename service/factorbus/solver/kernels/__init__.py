@@ -1,0 +1,1 @@
+"""Compiled kernels: arrays in, arrays filled.  `_jit` says how they are compiled and kept."""
