@@ -1,0 +1,23 @@
+"""How a drive went, for the panels below a map."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorbus.proto.arrays import F64
+
+
+def _none() -> F64:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Per step of a drive: chi2 (n,) and step_ms (n,), either may be empty.
+
+    optimum (m, 2): steps and the χ² of the batch optimum at them.
+    """
+
+    chi2: F64 = field(default_factory=_none)
+    step_ms: F64 = field(default_factory=_none)
+    optimum: F64 = field(default_factory=lambda: np.empty((0, 2)))
