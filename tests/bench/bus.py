@@ -127,10 +127,15 @@ class Client:
         self.payload = codec.encode_insert(Insert(self._sequence, batch))
         self.insert_size = len(self.payload)
         self._bus.get(self._key, Callback(self._on_reply, indirect=False), payload=self.payload)
-        came = dict(self._came.get(timeout=30) for _ in range(2))
-        codec.decode_accepted(came["answer"])
-        delta = codec.decode_delta(came["delta"])
-        return (len(came["answer"]), len(came["delta"])), delta.report["solver_ms"]
+        sizes: dict[str, int] = {}
+        solver_ms = 0.0
+        while len(sizes) < 2:
+            what, message = self._came.get(timeout=30)
+            if what == "problem":
+                raise codec.decode_problem(message)
+            answer = codec.decode_accepted(message) if what == "answer" else codec.decode_delta(message)
+            solver_ms, sizes[what] = answer.report["solver_ms"], len(message)
+        return (sizes["answer"], sizes["delta"]), solver_ms
 
     def _on_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:

@@ -6,7 +6,7 @@ import pytest
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Insert
-from factorbus.proto.problems import UnknownMap
+from factorbus.proto.problems import Internal, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore
 from factorbus.service.events import (
@@ -16,11 +16,12 @@ from factorbus.service.events import (
     Drained,
     Effect,
     Folded,
+    Judged,
     Outcome,
     Publish,
     Refuse,
     Run,
-    Step,
+    Stepped,
     Tell,
 )
 
@@ -43,16 +44,17 @@ def events(effects: list[Effect]) -> list[str]:
     return [codec.decode_map(e.message)["event"] for e in effects if isinstance(e, Publish) and e.channel == "event"]
 
 
-def folded(core: MapCore, run: Run, answer: Any = b"ok") -> list[Effect]:
-    steps = (Step(core.revision + 1, b"delta", "all-batch", 1.5, 2.0),) if run.inserts else ()
-    outcomes = tuple(Outcome(i, answer) for i in run.inserts)
-    return core.folded(Folded(steps, outcomes, 3, 4, 0.5, 2.0))
+def solved(core: MapCore, run: Run, answer: Any = b"ok") -> list[Effect]:
+    effects = core.judged(Judged(tuple(Outcome(i, answer) for i in run.inserts)))
+    if run.inserts and isinstance(answer, bytes):
+        effects += core.stepped(Stepped(core.revision + 1, b"delta", "all-batch", 1.5, 2.0))
+    return effects + core.folded(Folded(3, 4, 0.5, 2.0))
 
 
 def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: MapCore) -> None:
     run = run_of(core.insert(insert("a", 1)))
     assert [core.insert(insert("a", s)) for s in (2, 3, 4)] == [[], [], []]
-    effects = folded(core, run)
+    effects = solved(core, run)
     assert effects[:2] == [Answer("a1", b"ok"), Publish("delta", b"delta")]
     assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `fold` at a time"
     assert core.revision == 1
@@ -61,7 +63,7 @@ def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: Ma
 def test_a_refusal_is_answered_and_counted(core: MapCore) -> None:
     problem = UnknownMap("x")
     run = run_of(core.insert(insert("a", 1)))
-    assert core.folded(Folded((), (Outcome(run.inserts[0], problem),), 0, 0, 0.0, 2.0)) == [Refuse("a1", problem)]
+    assert solved(core, run, problem) == [Refuse("a1", problem)]
     assert core.revision == 0
     assert core.stats(3.0)["inserts"] == {"accepted": 0, "refused": 1, "busy": 0}
 
@@ -70,7 +72,7 @@ def test_questions_are_answered_between_two_steps(core: MapCore) -> None:
     run = run_of(core.insert(insert("a", 1)))
     assert core.ask(Asked("q", "estimate", b""), 1.0) == []
     core.insert(insert("a", 2))
-    following = run_of(folded(core, run))
+    following = run_of(solved(core, run))
     assert [read.asker for read in following.reads] == ["q"]
     assert [i.sequence for i in following.inserts] == [2]
 
@@ -123,7 +125,7 @@ def test_a_keyframe_now_and_then(limits: Limits) -> None:
     core = MapCore("m", "auto", 5, limits, now=0.0)
     due = 3  # the third step, or the third delta of five bytes
     for sequence in range(1, due + 1):
-        effects = folded(core, run_of(core.insert(insert("a", sequence))))
+        effects = solved(core, run_of(core.insert(insert("a", sequence))))
         keyframes = [r.question.name for e in effects if isinstance(e, Run) for r in e.reads]
         assert keyframes == (["keyframe"] if sequence == due else [])
 
@@ -138,9 +140,9 @@ def test_stopping_answers_everything_accepted_and_takes_nothing_new(core: MapCor
     (refused,) = core.insert(insert("a", 3))
     assert isinstance(refused, Refuse)
     assert refused.problem.code == "shutting_down"
-    effects = folded(core, run)
+    effects = solved(core, run)
     assert Drained() not in effects
-    effects = folded(core, run_of(effects))
+    effects = solved(core, run_of(effects))
     assert [e.asker for e in effects if isinstance(e, Answer)] == ["a2"]
     assert effects[-1] == Drained()
     assert core.ask(Asked("q", "stats", b""), 3.0)[0].problem.code == "shutting_down"  # type: ignore[union-attr]
@@ -161,8 +163,21 @@ def test_dropping_refuses_what_waits_but_not_what_is_being_solved(core: MapCore)
         ("q", "unknown_map"),
     ]
     assert events(dropping) == ["dropped"]
-    effects = folded(core, run)
+    effects = solved(core, run)
     assert effects == [Answer("a1", b"ok"), Publish("delta", b"delta"), Drained()]
+
+
+def test_when_the_thread_of_a_map_fails_nobody_is_left_waiting(core: MapCore) -> None:
+    core.insert(insert("a", 1))
+    core.insert(insert("a", 2))
+    core.insert(insert("b", 2))
+    core.ask(Asked("q", "estimate", b""), 1.0)
+    effects = core.failed(Internal("0123"), 2.0)
+    told = [(e.asker, e.problem.code) for e in effects if isinstance(e, Refuse)]
+    assert sorted(told) == [("a1", "internal"), ("a2", "internal"), ("b2", "internal"), ("q", "internal")]
+    assert effects[-1] == Drained()
+    for later in (core.insert(insert("a", 3)), core.ask(Asked("q", "stats", b""), 3.0)):
+        assert [e.problem.code for e in later if isinstance(e, Refuse)] == ["internal"]
 
 
 def test_a_gap_ends_with_time(core: MapCore) -> None:

@@ -48,7 +48,7 @@ class Admission:
         self._turns: deque[str] = deque()  # clients with something ready, next in turn first
         self._ready = self._parked = self._bytes = 0
         self._pace_s = 0.01  # seconds per insert, smoothed
-        self._closing = False
+        self._closing: Problem | None = None
 
     @property
     def ready(self) -> int:
@@ -94,6 +94,10 @@ class Admission:
             client.answered.popitem(last=False)
         return [_reply(asker, answer) for asker in insert.askers]
 
+    def is_open(self, insert: Waiting) -> bool:
+        """Has `insert` no answer yet?"""
+        return self._clients[insert.client].open.get(insert.sequence) is insert
+
     def expire(self, now: float) -> list[Effect]:
         """Refuse what was parked for too long: its client has not sent what comes before."""
         if not self._parked:
@@ -103,8 +107,8 @@ class Admission:
 
     def close(self, problem: Problem | None = None) -> list[Effect]:
         """Take nothing new and refuse what is parked; with a `problem`, refuse what is ready as well."""
-        self._closing = True
-        effects = [e for c in self._clients.values() for e in self._unpark(c, problem or ShuttingDown())]
+        self._closing = problem or ShuttingDown()
+        effects = [e for c in self._clients.values() for e in self._unpark(c, self._closing)]
         if problem is not None:
             for insert in self.take(self._ready):
                 effects += self.answer(insert, problem)
@@ -127,8 +131,8 @@ class Admission:
             return self._ask_again(client.open[arrived.sequence], arrived, client.next)
         if arrived.sequence < client.next:
             return [_reply(arrived.asker, _remembered(client, arrived))]
-        if self._closing:
-            raise ShuttingDown
+        if self._closing is not None:
+            raise self._closing
         if arrived.sequence == client.next:
             self._admit_next(client, arrived)
         else:

@@ -20,11 +20,12 @@ from factorbus.service.events import (
     Drained,
     Effect,
     Folded,
+    Judged,
     Publish,
     Read,
     Refuse,
     Run,
-    Step,
+    Stepped,
     Tell,
 )
 from factorbus.service.questions import Question, parse
@@ -89,19 +90,44 @@ class MapCore:
         self._reads.append(Read(question, asked.asker))
         return self._go_on([], now)
 
+    def judged(self, judged: Judged) -> list[Effect]:
+        """The solver's word on some of what it has."""
+        effects: list[Effect] = []
+        for outcome in judged.outcomes:
+            effects += self._admission.answer(outcome.insert, outcome.answer)
+            self._counts["accepted" if isinstance(outcome.answer, bytes) else "refused"] += 1
+        return effects
+
+    def stepped(self, stepped: Stepped) -> list[Effect]:
+        """The solver made a step."""
+        self.revision = stepped.revision
+        self._chi2 = stepped.chi2
+        self._solver_ms += stepped.solver_ms
+        self._strategies[stepped.strategy] += 1
+        self._since_keyframe[0] += 1
+        self._since_keyframe[1] += len(stepped.delta)
+        steps, size = self._since_keyframe
+        if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
+            self._since_keyframe = [0, 0]
+            self._reads.append(_KEYFRAME)
+        return [Publish("delta", stepped.delta)]
+
     def folded(self, folded: Folded) -> list[Effect]:
         """The solver is free again."""
         taken = self._running.inserts if self._running else ()
         self._running = None
         self._admission.took(len(taken), folded.now - self._started)
-        effects: list[Effect] = [e for o in folded.outcomes for e in self._admission.answer(o.insert, o.answer)]
-        effects += [Publish("delta", step.delta) for step in folded.steps]
-        for step in folded.steps:
-            self._stepped(step)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
-        self._counts["accepted"] += sum(isinstance(o.answer, bytes) for o in folded.outcomes)
-        self._counts["refused"] += sum(not isinstance(o.answer, bytes) for o in folded.outcomes)
-        return self._go_on(effects, folded.now)
+        return self._go_on([], folded.now)
+
+    def failed(self, problem: Problem, now: float) -> list[Effect]:
+        """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
+        effects = self.drop(now, problem)
+        for insert in self._running.inserts if self._running else ():
+            if self._admission.is_open(insert):
+                effects += self._admission.answer(insert, problem)
+        self._running = None
+        return self._go_on(effects, now)
 
     def tick(self, now: float) -> list[Effect]:
         """Time went by."""
@@ -112,9 +138,9 @@ class MapCore:
         self._closing = ShuttingDown()
         return self._go_on([*self._admission.close(), self._event("stopping")], now)
 
-    def drop(self, now: float) -> list[Effect]:
+    def drop(self, now: float, why: Problem | None = None) -> list[Effect]:
         """The map is to go: what waits is refused, what the solver has is still answered."""
-        self._closing = UnknownMap(self.name)
+        self._closing = why or UnknownMap(self.name)
         effects: list[Effect] = [Refuse(read.asker, self._closing) for read in self._reads if read.asker is not None]
         self._reads.clear()
         return self._go_on([*effects, *self._admission.close(self._closing), self._event("dropped")], now)
@@ -148,18 +174,6 @@ class MapCore:
             self._drained = True
             effects.append(Drained())
         return effects
-
-    def _stepped(self, step: Step) -> None:
-        self.revision = step.revision
-        self._chi2 = step.chi2
-        self._solver_ms += step.solver_ms
-        self._strategies[step.strategy] += 1
-        self._since_keyframe[0] += 1
-        self._since_keyframe[1] += len(step.delta)
-        steps, size = self._since_keyframe
-        if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
-            self._since_keyframe = [0, 0]
-            self._reads.append(_KEYFRAME)
 
     def _event(self, what: str) -> Publish:
         return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

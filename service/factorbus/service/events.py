@@ -46,8 +46,23 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One step of the solver and the delta that tells of it."""
+class Outcome:
+    """What became of one insert: the bytes of its Accepted, or why it was refused."""
+
+    insert: "Waiting"
+    answer: bytes | Any
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The solver accepted or refused these inserts."""
+
+    outcomes: tuple[Outcome, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """The solver made a step; the delta tells of it."""
 
     revision: int
     delta: bytes
@@ -57,19 +72,9 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of one insert: the bytes of its Accepted, or why it was refused."""
-
-    insert: "Waiting"
-    answer: bytes | Any
-
-
-@dataclass(frozen=True, slots=True)
 class Folded:
-    """The solver is done with a Run: zero or more steps, an outcome for every insert, and how large the map is now."""
+    """The solver is done with a Run; how large the map is now, and what its thread has used."""
 
-    steps: tuple[Step, ...]
-    outcomes: tuple[Outcome, ...]
     variables: int
     factors: int
     solver_cpu_s: float

@@ -13,8 +13,7 @@ published again; the insert that brought the fault about is refused as internal.
 import logging
 import secrets
 import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -24,7 +23,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
-from factorbus.service.events import Folded, Outcome, Step, Waiting
+from factorbus.service.events import Folded, Judged, Outcome, Stepped, Waiting
 from factorbus.service.questions import Question, Snapshot, as_factors, as_variables, snapshot
 from factorbus.solver.errors import SolverError
 
@@ -64,9 +63,8 @@ class Folder:
         self._make, self._epoch, self._limits = make_solver, epoch, limits
         self._solver = make_solver()
         self._revision = 0
-        self._held: Counter[Column] = Counter()  # accepted rows
+        self._held: dict[Column, int] = {}  # accepted rows
         self._broken = ""
-        self._steps: list[Step] = []
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
@@ -74,25 +72,22 @@ class Folder:
             raise Broken(self._broken)
         return snapshot(self._solver, self._epoch, self._revision, questions)
 
-    def fold(self, inserts: Sequence[Waiting]) -> Folded:
-        """Fold `inserts` in; every one of them gets its outcome, accepted or refused whole."""
-        self._steps = []
-        try:
-            outcomes = self._together(inserts)
-        except _TakenBack:
-            outcomes = [outcome for insert in inserts for outcome in self._together([insert])]
-        solver = self._solver
-        return Folded(
-            tuple(self._steps),
-            tuple(outcomes),
-            solver.variable_count,
-            solver.factor_count,
-            time.thread_time(),
-            time.monotonic(),
-        )
+    def fold(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped | Folded]:
+        """Fold `inserts` in; every one of them is accepted or refused whole.
 
-    def _together(self, inserts: Sequence[Waiting]) -> list[Outcome]:
-        """All of `inserts` in one step.  Raises _TakenBack when several were staged and the step failed."""
+        Yields answers as soon as they are known, so that the delta is made while they travel: Judged, then Stepped,
+        for every step; Folded at the end.
+        """
+        try:
+            yield from self._together(inserts)
+        except _TakenBack:
+            for insert in inserts:
+                yield from self._together([insert])
+        solver = self._solver
+        yield Folded(solver.variable_count, solver.factor_count, time.thread_time(), time.monotonic())
+
+    def _together(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
+        """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
         started = time.perf_counter()
         staged: list[_Staged] = []
         outcomes: list[Outcome] = []
@@ -102,20 +97,23 @@ class Folder:
                     staged.append(self._stage(insert))
                 except (Problem, SolverError) as problem:
                     outcomes.append(Outcome(insert, problem))
-            if staged:
-                settle = any(s.content.settle for s in staged)
-                report = self._solver.step(settle=settle)
-                outcomes += self._stepped(staged, report, started)
+            report = self._solver.step(settle=any(s.content.settle for s in staged)) if staged else None
         except SolverError as problem:
             if len(staged) > 1:
                 raise _TakenBack from problem
+            report = None
             outcomes.append(Outcome(staged[0].insert, problem))
         except Exception:
-            reference = self._replace_solver()
+            reference = self._fault()
+            yield from self._replace_solver(reference)
             if len(inserts) > 1:
                 raise _TakenBack from None
-            return [Outcome(inserts[0], Internal(reference))]
-        return outcomes
+            report = None
+            outcomes = [Outcome(inserts[0], Internal(reference))]
+        if report is None:
+            yield Judged(tuple(outcomes))
+        else:
+            yield from self._stepped(staged, outcomes, report, started)
 
     def _stage(self, insert: Waiting) -> _Staged:
         """Hand one insert to the solver.  Raises Problem, SolverError: then nothing changed."""
@@ -132,73 +130,85 @@ class Folder:
                 raise TooLarge("the map with this insert", count + more, limit, what)
         return _Staged(insert, content, self._solver.stage(content.batch))
 
-    def _stepped(self, staged: Sequence[_Staged], report: Any, started: float) -> list[Outcome]:
-        """The step went well: make the delta and the answers, and only then count what is held."""
-        account = report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
-        step = self._told(self._solver, account)
-        outcomes = [
+    def _stepped(
+        self, staged: Sequence[_Staged], refused: Sequence[Outcome], report: Any, started: float
+    ) -> Iterator[Judged | Stepped]:
+        """The step went well: the answers, then the delta."""
+        account = report.as_dict()
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._revision += 1
+        accepted = [
             Outcome(
                 s.insert,
                 codec.encode_accepted(
-                    Accepted(s.insert.sequence, self._epoch, step.revision, s.first_factor, len(staged), account)
+                    Accepted(s.insert.sequence, self._epoch, self._revision, s.first_factor, len(staged), account)
                 ),
             )
             for s in staged
         ]
-        self._commit(step, (s.content.batch for s in staged))
-        return outcomes
+        for s in staged:
+            _count_rows(s.content.batch, self._held)
+        yield Judged((*accepted, *refused))
+        try:
+            told = self._told(account)
+        except Exception:
+            # The step is done and answered; who misses its delta sees the gap.
+            yield from self._replace_solver(self._fault())
+        else:
+            yield told
 
-    def _told(self, solver: Any, account: dict[str, Any]) -> Step:
-        """The step that `solver` made last, with its delta from the present revision."""
-        revision = self._revision + 1
-        changed = as_variables(solver.changed())
-        delta = codec.encode_delta(Delta(self._epoch, revision, self._revision, changed, account))
-        return Step(revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
+    def _told(self, account: dict[str, Any]) -> Stepped:
+        """The solver's last step, with its delta."""
+        changed = as_variables(self._solver.changed())
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, self._revision - 1, changed, account))
+        return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
-    def _commit(self, step: Step, batches: Iterable[Batch]) -> None:
-        for batch in batches:
-            _count_rows(batch, self._held)
-        self._steps.append(step)
-        self._revision = step.revision
-
-    def _replace_solver(self) -> str:
-        """A new solver with what had been accepted.  Returns the reference under which the fault is logged."""
+    def _fault(self) -> str:
+        """Log what is being handled; the reference under which it is found."""
         reference = secrets.token_hex(4)
         log.exception("fault %s: the solver failed; starting a new one with what had been accepted", reference)
+        return reference
+
+    def _replace_solver(self, reference: str) -> Iterator[Stepped]:
+        """A new solver with what had been accepted, and the step that brought it there."""
         try:
-            self._rebuild()
+            account = self._rebuild()
+            if account is not None:
+                self._revision += 1
+                yield self._told(account)
         except Exception:
             self._broken = reference
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
-        return reference
 
-    def _rebuild(self) -> None:
+    def _rebuild(self) -> dict[str, Any] | None:
         """The accepted rows of every column are its first ones: whatever a failed insert left is behind them."""
         variables, factors = self._solver.graph()
         kept = Batch(
-            tuple(_first(group, self._held[group.kind, group.fixed]) for group in as_variables(variables)),
-            tuple(_first_factors(group, self._held[group.kind, None]) for group in as_factors(factors)),
+            tuple(_first(group, self._held.get((group.kind, group.fixed), 0)) for group in as_variables(variables)),
+            tuple(_first_factors(group, self._held.get((group.kind, None), 0)) for group in as_factors(factors)),
         )
-        found: Counter[Column] = Counter()
+        found: dict[Column, int] = {}
         _count_rows(kept, found)
-        if +found != +self._held:
-            raise ValueError(f"the failed solver holds {dict(found)}; accepted were {dict(self._held)}")
-        fresh = self._make()
+        if {column: n for column, n in found.items() if n} != self._held:
+            raise ValueError(f"the failed solver holds {found}; accepted were {self._held}")
+        fresh, started = self._make(), time.perf_counter()
+        account = None
         if self._held:
-            started = time.perf_counter()
             fresh.stage(kept)
-            report = fresh.step()
-            account = report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
-            self._commit(self._told(fresh, account), ())
+            account = fresh.step().as_dict()
+            account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._solver = fresh
+        return account
 
 
-def _count_rows(batch: Batch, rows: Counter[Column]) -> None:
+def _count_rows(batch: Batch, rows: dict[Column, int]) -> None:
     """Count into `rows` what `batch` adds to each column of a graph."""
     for group in batch.variables:
-        rows[group.kind, group.fixed] += len(group.keys)
+        column = (group.kind, group.fixed)
+        rows[column] = rows.get(column, 0) + len(group.keys)
     for group in batch.factors:
-        rows[group.kind, None] += len(group.keys)
+        column = (group.kind, None)
+        rows[column] = rows.get(column, 0) + len(group.keys)
 
 
 def _first(group: Variables, count: int) -> Variables:

@@ -1,7 +1,7 @@
 """One map at work: its core, its lock, its solver and the thread that the solver runs on.  Knows no bus.
 
 Whoever brings an event takes the lock for the microseconds that the core needs; what the core wants done is done
-after the lock is free again.  Only the solver's thread brings Folded, so deltas leave in order.
+after the lock is free again.  Only the solver's thread brings Stepped, so deltas leave in order.
 """
 
 import logging
@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core import MapCore
-from factorbus.service.events import Arrived, Asked, Effect, Read, Refuse, Run
+from factorbus.service.events import Arrived, Asked, Effect, Judged, Read, Refuse, Run, Stepped
 from factorbus.service.fold import Folder
 from factorbus.service.questions import Snapshot
 from factorbus.solver.errors import SolverError
@@ -72,8 +72,9 @@ class Host:
         self._perform(effects, False)
 
     def end(self) -> None:
-        """End the solver's thread; after Drained."""
+        """End the solver's thread, which may still be sending its last delta; after Drained."""
         self._runs.put(None)
+        self._thread.join()
 
     def _perform(self, effects: list[Effect], on_solver_thread: bool) -> None:
         for effect in effects:
@@ -83,12 +84,27 @@ class Host:
                 self._do(effect, on_solver_thread)
 
     def _solve(self) -> None:
-        while (run := self._runs.get()) is not None:
-            if run.reads:
-                self._read(run.reads)
-            folded = self._folder.fold(run.inserts)
+        try:
+            while (run := self._runs.get()) is not None:
+                self._run(run)
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: map %s has stopped", reference, self.core.name)
             with self._lock:
-                effects = self.core.folded(folded)
+                effects = self.core.failed(Internal(reference), time.monotonic())
+            self._perform(effects, True)
+
+    def _run(self, run: Run) -> None:
+        if run.reads:
+            self._read(run.reads)
+        for event in self._folder.fold(run.inserts):
+            with self._lock:
+                if isinstance(event, Judged):
+                    effects = self.core.judged(event)
+                elif isinstance(event, Stepped):
+                    effects = self.core.stepped(event)
+                else:
+                    effects = self.core.folded(event)
             self._perform(effects, True)
 
     def _read(self, reads: Sequence[Read]) -> None:
