@@ -9,7 +9,7 @@ from factorbus.solver.elimination import Elimination
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.move import differing, move
+from factorbus.solver.kernels.move import differing, inner, move
 from factorbus.solver.report import Stopwatch
 
 _FREE_DIRECTION = (
@@ -55,7 +55,7 @@ class System:
         """(δ, δᵀη) by the factor made last and the present gradient."""
         eta = self.blocks.eta[: self.graph.counts[at.SCALARS]]
         step = self._solve(eta)
-        return step, float(step @ eta)
+        return step, float(inner(step, eta))
 
     def linearise_at(self, step: F64) -> float:
         """χ² at x ⊞ δ, linearised there aside."""

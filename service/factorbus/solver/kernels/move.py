@@ -59,3 +59,12 @@ def gather(picked: I64, var: I64, keys: I64, values: F64, out_keys: I64, out_val
         x = var[v, at.V_AT]
         for c in range(out_values.shape[1]):
             out_values[n, c] = values[x + c]
+
+
+@kernel("float64(float64[::1], float64[::1])")
+def inner(a: F64, b: F64) -> float:
+    """aᵀ b, on one core: a threaded BLAS would wake the others for it."""
+    total = 0.0
+    for k in range(a.size):
+        total += a[k] * b[k]
+    return total
