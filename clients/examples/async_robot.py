@@ -1,6 +1,7 @@
 """A robot under asyncio: inserts in flight while a task prints every change.
 
-python clients/examples/async_robot.py [ENDPOINT] [MAP]
+In one terminal  `factorbus serve`
+in another       `python clients/examples/async_robot.py [ENDPOINT] [MAP]`
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """A robot drives a square and sees its start again: the smallest real integration.
 
-factorbus serve                              in one terminal
-python clients/examples/square.py [ENDPOINT] [MAP] in another
+In one terminal  `factorbus serve`
+in another       `python clients/examples/square.py [ENDPOINT] [MAP]`
 """
 
 import math

@@ -1,6 +1,7 @@
 """Print what changes in a map, as it changes, until interrupted or the map has reached a revision.
 
-python clients/examples/viewer.py [ENDPOINT] [MAP] [UNTIL_REVISION]
+In one terminal  `factorbus serve`
+in another       `python clients/examples/viewer.py [ENDPOINT] [MAP] [UNTIL_REVISION]`
 """
 
 import os

@@ -210,7 +210,7 @@ class Map:
     def _catch_up(self, timeout_s: float | None) -> None:
         """Let the mirror reach what has been accepted; if it does not, it says that it is stale."""
         if self._mirror is not None:
-            self._mirror.try_catch_up(self.timeout_s if timeout_s is None else timeout_s)
+            self._mirror.catch_up(self.timeout_s if timeout_s is None else timeout_s)
 
     def _wait_for_room(self, timeout_s: float) -> None:
         room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)

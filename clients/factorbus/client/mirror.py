@@ -58,6 +58,7 @@ class Mirror:
         self._callbacks: list[Callable[[Delta], None]] = []
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._owners: set[str] = set()
+        self._deserted = False  # the map had an owner, and has none now
         self._expected = 0
         self._confirmed_at = time.monotonic()
         self._asking, self._probing, self._silences = False, False, 0
@@ -132,9 +133,9 @@ class Mirror:
         )
         raise Unavailable(f"revision {revision} of map {self._map!r}", timeout_s, hint)
 
-    def try_catch_up(self, timeout_s: float) -> bool:
-        """Wait until nothing is known that is not here; says whether it came to that."""
-        return self._try_wait(lambda: not self.stale, timeout_s)
+    def catch_up(self, timeout_s: float) -> None:
+        """Wait until every revision known to exist is here, or nobody is there to send it, or time is up."""
+        self._try_wait(lambda: self._following.revision >= self._expected or self._deserted, timeout_s)
 
     def on_delta(self, callback: Callable[[Delta], None]) -> Callable[[], None]:
         """Have `callback` called with every delta after it is applied; returns what takes it off again.
@@ -290,6 +291,9 @@ class Mirror:
             self._owners.discard(token)
             if not self._owners:
                 self._lose()
+        self._deserted = not self._owners
+        with self._changed:
+            self._changed.notify_all()
 
     def _lose(self) -> None:
         with self._changed:
