@@ -2,7 +2,8 @@
 
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
-`inline_kernel`  melts into the kernels that call it; not callable at a cost worth having from Python.
+`inline_kernel`  melts into the kernels that call it; for what runs in their innermost loops.
+`part`           a step of a kernel, called by it and compiled apart: one large function takes far longer to compile.
 
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
 numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
@@ -47,6 +48,7 @@ __all__ = [
     "ir",
     "iter_compile",
     "kernel",
+    "part",
     "sources_hash",
     "types",
     "vector_lanes",
@@ -78,6 +80,13 @@ def inline_kernel(function: Callable[..., Any]) -> Any:
     if DISABLED:
         return function
     return _ours(numba.njit(forceinline=True, **_FLAGS)(function))
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """A step of a kernel, kept on disk with the kernel that calls it."""
+    if DISABLED:
+        return function
+    return _ours(numba.njit(**_FLAGS)(function))
 
 
 def compiled_seconds() -> float:

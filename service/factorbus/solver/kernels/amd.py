@@ -13,7 +13,7 @@ before.  `mark[e]` is |Lₑ ∖ Lₚ| + clock when e was met in this step, and 0
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import I64, inline_kernel, kernel, part
 
 NONE = -1
 NODE, ELEMENT, GONE = 0, 1, 2
@@ -43,7 +43,7 @@ def amd(dims: I64, rows: I64, cols: I64, group: I64) -> I64:
     members, member_from = _by_group(group)
     perm = np.empty(n, np.int64)
 
-    placed, clock, widest = 0, 2, 0
+    placed, clock, widest = 0, np.int64(2), 0
     for g in range(member_from.size - 1):
         lowest, waiting = _open_group(members[member_from[g] : member_from[g + 1]], weight, degree, head, after, before)
         while waiting > 0:
@@ -143,7 +143,7 @@ def amd(dims: I64, rows: I64, cols: I64, group: I64) -> I64:
     return perm
 
 
-@inline_kernel
+@part
 def _graph(n: int, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
     """Neighbour lists, with room for the elements to come."""
     length = np.zeros(n, np.int64)
@@ -166,7 +166,7 @@ def _graph(n: int, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
     return begin, length, lists
 
 
-@inline_kernel
+@part
 def _first_degrees(begin: I64, length: I64, lists: I64, weight: I64) -> I64:
     degree = np.zeros(begin.size, np.int64)
     for i in range(begin.size):
@@ -175,7 +175,7 @@ def _first_degrees(begin: I64, length: I64, lists: I64, weight: I64) -> I64:
     return degree
 
 
-@inline_kernel
+@part
 def _by_group(group: I64) -> tuple[I64, I64]:
     """Nodes sorted by group, and where each group starts."""
     groups = 0
@@ -193,7 +193,7 @@ def _by_group(group: I64) -> tuple[I64, I64]:
     return members, start
 
 
-@inline_kernel
+@part
 def _open_group(members: I64, weight: I64, degree: I64, head: I64, after: I64, before: I64) -> tuple:
     """Queue the nodes of a group; gives the least degree and the weight of all."""
     lowest, waiting = head.size - 1, 0
@@ -261,7 +261,7 @@ def _absorb(i: int, into: int, kind: I64, weight: I64, next_member: I64, last_me
     next_member[last_member[into]], last_member[into] = i, last_member[i]
 
 
-@inline_kernel
+@part
 def _merge_twins(
     i: int, clock: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, kind: I64, mark: I64,
     group: I64, chain: I64, next_member: I64, last_member: I64,
@@ -286,7 +286,7 @@ def _merge_twins(
         j = following
 
 
-@inline_kernel
+@part
 def _compact(need: int, begin: I64, length: I64, kind: I64, weight: I64, lists: I64) -> tuple:
     """Copy the living lists together, with room for `need` more."""
     alive = 0

@@ -196,6 +196,7 @@ def _define(builder: Any, name: str, kinds: list[Any], build: Any) -> Any:
     function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
     if not function.blocks:
         function.linkage = "linkonce_odr"
+        function.attributes.add("noinline")  # inlined at each call they would only make compilation slow
         inner = ir.IRBuilder(function.append_basic_block("entry"))
         build(inner, *function.args)
         inner.ret_void()

@@ -8,7 +8,7 @@ joined so far, or a chain would collapse into one giant front.
 import numpy as np
 
 from factorbus.solver.kernels import fronts as fr
-from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 
 NONE = -1
 SMALL_PIVOTS, SMALL_ZEROS = 12, 1.0 / 3.0
@@ -55,7 +55,7 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     return order, place, records, runs, border, blocks, sizes, work
 
 
-@inline_kernel
+@part
 def _by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
     """Off-diagonal blocks sorted by the end that is eliminated later; gives the other ends."""
     begin = np.zeros(n + 2, np.int64)
@@ -73,7 +73,7 @@ def _by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
     return begin, earlier
 
 
-@inline_kernel
+@part
 def _tree(n: int, begin: I64, earlier: I64) -> I64:
     """The elimination tree: parent[k] is the first off-diagonal entry in row k of R."""
     parent, ancestor = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -89,7 +89,7 @@ def _tree(n: int, begin: I64, earlier: I64) -> I64:
     return parent
 
 
-@inline_kernel
+@part
 def _counts(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I64, I64]:
     """Off-diagonal variables and scalars in row k of R."""
     variables, scalars, seen = np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n, np.int64)
@@ -105,7 +105,7 @@ def _counts(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I6
     return variables, scalars
 
 
-@inline_kernel
+@part
 def _join(n: int, parent: I64, dim: I64, border: I64) -> tuple[I64, I64]:
     """Join columns into fronts: the last column of each column's front, and the pivot scalars of that front."""
     into, pivots, entries = np.empty(n, np.int64), dim.copy(), np.empty(n, np.int64)
@@ -137,7 +137,7 @@ def _top(into: I64, k: int) -> int:
     return k
 
 
-@inline_kernel
+@part
 def _arrange(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64, I64]:
     """Number the fronts in postorder, their columns one after another.
 
@@ -174,7 +174,7 @@ def _arrange(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64
     return order, home, tops[:fronts], front_of
 
 
-@inline_kernel
+@part
 def _work(n: int, dim: I64, border: I64) -> F64:
     """Nonzeros of R and the flops to make it (the sum of squared row lengths), zeros of joined fronts not counted."""
     work = np.zeros(2)
@@ -186,7 +186,7 @@ def _work(n: int, dim: I64, border: I64) -> F64:
     return work
 
 
-@inline_kernel
+@part
 def _records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, border: I64, first_scalar: I64) -> I64:
     """The front records without places and maps."""
     records = np.zeros((tops.size, fr.FRONT), np.int64)
@@ -203,7 +203,7 @@ def _records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, bord
     return records
 
 
-@inline_kernel
+@part
 def _place(records: I64) -> I64:
     """Give the rows of R and the update matrices their places; gives the doubles of R and of the whole arena.
 
@@ -234,7 +234,7 @@ def _place(records: I64) -> I64:
     return sizes
 
 
-@inline_kernel
+@part
 def _borders(n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: I64, records: I64) -> tuple[I64, I64]:
     """The border variables of each front, ascending: walk the tree of fronts from every entry of every row."""
     fronts = tops.size
@@ -254,7 +254,7 @@ def _borders(n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: 
     return at, of
 
 
-@inline_kernel
+@part
 def _border_scalars(records: I64, border_at: I64, border_of: I64, dim: I64, first_scalar: I64) -> I64:
     """The border scalars of each front, ascending."""
     total = 0
@@ -269,7 +269,7 @@ def _border_scalars(records: I64, border_at: I64, border_of: I64, dim: I64, firs
     return border
 
 
-@inline_kernel
+@part
 def _maps(
     label: I64, rows: I64, cols: I64, dim: I64, first_scalar: I64, border_at: I64, border_of: I64, records: I64
 ) -> tuple[I64, I64]:
@@ -304,7 +304,7 @@ def _maps(
     return runs[:run].copy(), blocks
 
 
-@inline_kernel
+@part
 def _by_earlier(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
     """Blocks sorted by the end that is eliminated first."""
     begin = np.zeros(n + 2, np.int64)
