@@ -403,7 +403,7 @@ def test_a_map_nobody_owns_is_unavailable(start: Callable[..., Service], endpoin
             bus.map(MAP, mirror=False).stats()
         with pytest.raises(Unavailable, match="mirror=True"):
             _ = bus.map(MAP, mirror=False).estimate
-        with pytest.raises(Unavailable, match="the mirror is stale"):
+        with pytest.raises(Unavailable, match=r"the mirror is stale"):
             bus.map(MAP)
 
 

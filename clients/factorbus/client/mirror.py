@@ -131,7 +131,7 @@ class Mirror:
         hint = (
             f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
         )
-        raise Unavailable(f"revision {revision} of map {self._map!r}", timeout_s, hint)
+        raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
 
     def catch_up(self, timeout_s: float) -> None:
         """Wait until every revision known to exist is here, or nobody is there to send it, or time is up."""

@@ -1,0 +1,96 @@
+"""`proto/README.md` says what the code does: every kind, problem, key and message field is in it."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from factorbus.proto import keys, messages, problems
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.symbols import symbol
+
+CONTRACT = (Path(__file__).parents[2] / "proto" / "README.md").read_text()
+CLIENT_SIDE = {"bad_symbol", "bad_endpoint", "bad_information", "problem"}
+
+
+def every_problem(base: type[problems.Problem]) -> set[str]:
+    """The codes of a part of the tree; Refused carries somebody else's."""
+    below = {
+        code for kind in base.__subclasses__() if kind.__module__ == base.__module__ for code in every_problem(kind)
+    }
+    return {base.code} | below
+
+
+def test_every_kind_is_explained() -> None:
+    for name in [*VARIABLE_KINDS, *FACTOR_KINDS]:
+        assert f"| `{name}` |" in CONTRACT
+
+
+def test_every_code_is_explained() -> None:
+    for code in every_problem(problems.Problem) - CLIENT_SIDE:
+        assert f"`{code}`" in CONTRACT
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        messages.Insert,
+        messages.Accepted,
+        messages.Estimate,
+        messages.Delta,
+        messages.Graph,
+        messages.Chi2,
+        messages.Job,
+        messages.JobDone,
+        messages.Optimum,
+        messages.Variables,
+        messages.Factors,
+    ],
+)
+def test_every_field_is_explained(message: type) -> None:
+    names = {field.name for field in fields(message)} - {"batch"}
+    assert not {name for name in names if f"`{name}`" not in CONTRACT}
+
+
+@pytest.mark.parametrize(
+    ("key", "pattern"),
+    [
+        (keys.insert_key("m", "c"), "map/<map>/in/<client>"),
+        (keys.ask_key("m", "chi2"), "map/<map>/ask/<question>"),
+        (keys.delta_key("m"), "map/<map>/out/delta"),
+        (keys.keyframe_key("m"), "map/<map>/out/keyframe"),
+        (keys.event_key("m"), "map/<map>/out/event"),
+        (keys.service_token("m", "s"), "map/<map>/live/service/<id>"),
+        (keys.client_token("m", "c"), "map/<map>/live/client/<client>"),
+        (keys.admin_key("maps"), "admin/maps"),
+        (keys.job_key("w"), "worker/<id>/job"),
+        (keys.worker_token("w", 2), "worker/<id>/live/<slots>"),
+    ],
+)
+def test_every_key_is_where_the_contract_says(key: str, pattern: str) -> None:
+    assert f"`{pattern}`" in CONTRACT
+    assert re.fullmatch(f"{keys.PREFIX}/" + re.sub("<[a-z]+>", "[^/]+", pattern), key)
+
+
+def test_the_example_of_a_key_is_right() -> None:
+    assert symbol("x", 12) == 0x78000000_0000000C
+    assert "`0x78000000_0000000c`" in CONTRACT
+
+
+def test_the_bytes_shown_are_those_of_the_golden_insert() -> None:
+    """The hexadecimal of the walk-through, ellipses and repetitions aside, is in the message in that order."""
+    golden = (Path(__file__).parents[2] / "proto" / "vectors" / "insert.msgpack").read_bytes()
+    walk = CONTRACT.split("```")[1]
+    at = 0
+    for token in re.findall(r'"([a-z0-9_]+)"|((?:\b[0-9a-f]{2}\b ?){8})', walk):
+        part = token[0].encode() or bytes.fromhex(token[1])
+        found = golden.find(part, at)
+        assert found >= 0, token
+        at = found + len(part)
+    assert at > len(golden) - 10
+
+
+def test_every_question_is_explained() -> None:
+    for question in keys.QUESTIONS:
+        assert f"| `{question}` |" in CONTRACT
