@@ -22,8 +22,18 @@ from zenoh.handlers import Callback
 from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, courier
 from factorbus.client.mirror import Mirror
 from factorbus.proto import codec, keys
-from factorbus.proto.messages import Accepted, Delta, Estimate, Variables
-from factorbus.proto.problems import BadEndpoint, BadName, BadSequence, Busy, Problem, UnknownMap, WrongEpoch
+from factorbus.proto.messages import Accepted, Batch, Delta, Estimate, Variables
+from factorbus.proto.problems import (
+    BadEndpoint,
+    BadName,
+    BadSequence,
+    BadSetting,
+    Busy,
+    Problem,
+    TooLarge,
+    UnknownMap,
+    WrongEpoch,
+)
 
 pytestmark = pytest.mark.timeout(40)
 MAP = "kitchen"
@@ -69,6 +79,10 @@ class Service:
             self._session.put(
                 keys.delta_key(MAP), codec.encode_delta(delta), congestion_control=zenoh.CongestionControl.BLOCK
             )
+
+    def publish_raw(self, data: bytes) -> None:
+        """Something on the delta's key that is none."""
+        self._session.put(keys.delta_key(MAP), data, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def _run(self) -> None:
         while (query := self._inbox.get()) is not None:
@@ -411,6 +425,46 @@ def test_a_map_nobody_owns_is_unavailable(start: Callable[..., Service], endpoin
 def test_an_address_that_cannot_be_read_is_refused_at_once(bad: str) -> None:
     with pytest.raises(BadEndpoint, match=r"tcp/127\.0\.0\.1:7447"):
         connect(bad)
+
+
+@pytest.mark.parametrize("setting", [{"no/such/thing": 1}, {"mode": "king"}, {"mode": object()}])
+def test_a_setting_the_bus_does_not_take_is_refused_at_once(endpoint: str, setting: dict[str, Any]) -> None:
+    with pytest.raises(BadSetting, match=next(iter(setting))):
+        connect(endpoint, settings=setting)
+
+
+def test_a_setting_reaches_the_bus(start: Callable[..., Service], endpoint: str) -> None:
+    start()
+    with connect(endpoint, settings={"transport/link/tx/lease": 2000}) as bus:
+        assert [row.name for row in bus.maps()] == [MAP]
+
+
+def test_an_insert_the_bus_would_drop_is_refused_here_and_uses_up_no_number(
+    start: Callable[..., Service], endpoint: str
+) -> None:
+    start()
+    large = Batch((Variables("point2", np.arange(2_800_000), np.zeros((2_800_000, 2))),))
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        with pytest.raises(TooLarge, match="limit is 67108864 bytes"):
+            kitchen.insert(large)
+        assert kitchen.insert(point("l1", 1)).sequence == 1
+
+
+@pytest.mark.parametrize("junk", [b"", b"\xc1", codec.encode_map({"epoch": 1, "revision": 2, "previous": 1})[:-1]])
+def test_a_delta_nobody_can_read_costs_the_whole_estimate_and_no_more(
+    start: Callable[..., Service], endpoint: str, junk: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        kitchen.insert(point("l1", 1))
+        whole = threading.Event()
+        kitchen.estimate.on_delta(lambda delta: whole.set() if delta.previous == 0 else None)
+        service.publish_raw(junk)
+        service.step({2: (2, 2)})
+        kitchen.estimate.wait_for(2)
+        assert whole.wait(5)
+        assert same(kitchen.estimate, service)
+    assert "cannot follow after this delta" in caplog.text
 
 
 def test_names_are_checked(start: Callable[..., Service], endpoint: str) -> None:

@@ -11,7 +11,7 @@ from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.symbols import symbol
 
 CONTRACT = (Path(__file__).parents[2] / "proto" / "README.md").read_text()
-CLIENT_SIDE = {"bad_symbol", "bad_endpoint", "bad_information", "problem"}
+CLIENT_SIDE = {"bad_symbol", "bad_endpoint", "bad_information", "bad_setting", "problem"}
 
 
 def every_problem(base: type[problems.Problem]) -> set[str]:

@@ -120,7 +120,7 @@ class Map:
         try:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(ticket.future)), timeout_s)
         except TimeoutError:
-            raise NoAnswerYet(ticket, ticket.errand.what, timeout_s) from None
+            raise NoAnswerYet(ticket, timeout_s) from None
 
     async def flush(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered.  Raises Unavailable, and the first refusal nobody has looked at."""

@@ -24,7 +24,7 @@ def connect(
     endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
     the service's lists.  timeout_s: also the default for everything done over this connection.
     settings: further zenoh configuration, path to value.
-    Raises Unavailable, BadEndpoint, BadName.
+    Raises Unavailable, BadEndpoint, BadName, BadSetting.
     """
     keys.checked_name("client", f"{client}-00000000")
     endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
@@ -61,7 +61,7 @@ class Bus:
             window,
             lambda: self.create(name, mode) if create else self._existing(name),
         )
-        self._maps.append(joined)
+        self._maps = [*(each for each in self._maps if not each.closed), joined]
         try:
             joined.watch_owner()
             if mirror:

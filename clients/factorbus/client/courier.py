@@ -44,6 +44,7 @@ class Errand:
         self.future: Future[Any] = Future()
         self.future.set_running_or_notify_cancel()  # so that an asyncio wrapper cannot cancel what is on its way
         self.attempt = 0
+        self.because = "the first try is out"
         self.sent_at = self.answered_at = 0.0
 
 
@@ -115,10 +116,10 @@ class Courier:
             self._finish(errand, verdict)
 
     def _put_back(self, errand: Errand, again: Again) -> None:
+        errand.because = f"{again.because} on {errand.key} ({len(errand.payload)} bytes sent, {errand.attempt} tries)"
         at = time.monotonic() + again.pause_s
         if errand.deadline is not None and at >= errand.deadline:
-            hint = f"{again.because} on {errand.key} ({len(errand.payload)} bytes sent, {errand.attempt} tries)"
-            self._finish(errand, Unavailable(errand.what, self._waited(errand), hint))
+            self._finish(errand, Unavailable(errand.what, self._waited(errand), errand.because))
             return
         with self._changed:
             if errand in self._open:

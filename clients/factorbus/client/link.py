@@ -15,7 +15,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
-from factorbus.proto.problems import BadEndpoint, Unavailable
+from factorbus.proto.problems import BadEndpoint, BadSetting, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
@@ -98,7 +98,7 @@ def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str,
     """A link to the first of `endpoints` that takes us, trying until `timeout_s` has passed.
 
     settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.
-    Raises BadEndpoint at once, Unavailable when time is up.
+    Raises BadEndpoint and BadSetting at once, Unavailable when time is up.
     """
     config = _config(endpoints, settings)
     start, pause = time.monotonic(), _FIRST_PAUSE_S
@@ -122,7 +122,10 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any]) -> zenoh.Conf
             raise BadEndpoint(endpoint)
     config = zenoh.Config()
     for path, value in (_settings(endpoints) | dict(settings)).items():
-        config.insert_json5(path, json.dumps(value))
+        try:
+            config.insert_json5(path, json.dumps(value))
+        except (zenoh.ZError, TypeError) as error:
+            raise BadSetting(path, str(error).split(" at /")[0]) from None
     return config
 
 

@@ -16,8 +16,9 @@ from factorbus.client.questions import Questions
 from factorbus.client.ticket import Ticket
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
+from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
-from factorbus.proto.problems import Problem, Refused, Unavailable
+from factorbus.proto.problems import Problem, Refused, TooLarge, Unavailable
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,11 @@ class Map:
             self.close()
 
     @property
+    def closed(self) -> bool:
+        """This client has left the map."""
+        return self._closed
+
+    @property
     def estimate(self) -> Mirror:
         """The live estimate.  Raises Unavailable for a map opened with mirror=False."""
         if self._mirror is None:
@@ -81,8 +87,10 @@ class Map:
 
         Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
         """
-        accepted = self.send(batch, settle=settle, timeout_s=timeout_s).result(timeout_s)
-        self._catch_up(timeout_s)
+        end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+        ticket = self.send(batch, settle=settle, timeout_s=end - time.monotonic())
+        accepted = ticket.result(max(end - time.monotonic(), 0.0))
+        self._catch_up(max(end - time.monotonic(), 0.0))
         return accepted
 
     def settle(self, timeout_s: float | None = None) -> Accepted:
@@ -92,7 +100,7 @@ class Map:
     def send(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
-        Raises Unavailable if the window stays full for `timeout_s`: `batch` is then not sent.
+        Raises Unavailable if the window stays full for `timeout_s`, TooLarge: `batch` is then not sent.
         """
         batch = batch.batch() if isinstance(batch, Draft) else batch
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
@@ -204,13 +212,15 @@ class Map:
             return refused.code == "bad_sequence" and type(wanted) is int and window.waits_for(insert.sequence, wanted)
 
         payload = codec.encode_insert(insert)
+        if len(payload) > REQUEST_LIMITS.max_bytes:  # the bus would drop it without a word
+            raise TooLarge("the insert", len(payload), REQUEST_LIMITS.max_bytes, "bytes")
         errand = Errand(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
         return Ticket(errand, insert.sequence, timeout_s)
 
-    def _catch_up(self, timeout_s: float | None) -> None:
+    def _catch_up(self, timeout_s: float) -> None:
         """Let the mirror reach what has been accepted; if it does not, it says that it is stale."""
         if self._mirror is not None:
-            self._mirror.catch_up(self.timeout_s if timeout_s is None else timeout_s)
+            self._mirror.catch_up(timeout_s)
 
     def _wait_for_room(self, timeout_s: float) -> None:
         room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)

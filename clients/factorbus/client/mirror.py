@@ -18,7 +18,7 @@ from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_ask
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
-from factorbus.proto.problems import BadSymbol, Problem, Unavailable
+from factorbus.proto.problems import BadSymbol, Unavailable
 from factorbus.proto.symbols import format_symbol, parse_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -200,8 +200,9 @@ class Mirror:
                 word, content = "probe", None
             try:
                 self._handle(word, content)
-            except Problem as unreadable:
-                log.error("map %s: %s from the service: %s", self._map, word, unreadable)
+            except Exception:
+                # Whatever it was, the mirror must not stop and look alive: start over from the whole estimate.
+                log.exception("map %s: cannot follow after this %s; asking for the whole estimate", self._map, word)
                 self._lose()
             if not self._following.live:
                 self._ask()
@@ -250,13 +251,12 @@ class Mirror:
 
     def _take_estimate(self, reply: Reply) -> None:
         self._asking = False
+        self._silences += 1
+        self._ask_at = time.monotonic() + pause(self._silences)  # unless this was it
         if isinstance(reply, Answer):
             self._adopt(reply.payload)
         if self._following.live:
             self._silences = 0
-        else:
-            self._silences += 1
-            self._ask_at = time.monotonic() + pause(self._silences)
 
     def _probe(self) -> None:
         """Nothing came for a while: what we know to be missing got lost; otherwise ask where the map is."""

@@ -42,13 +42,14 @@ class Ticket:
             return self.future.result(timeout_s)
         except TimeoutError:
             self.seen = False
-            raise NoAnswerYet(self, self.errand.what, timeout_s) from None
+            raise NoAnswerYet(self, timeout_s) from None
 
 
 class NoAnswerYet(Unavailable):
     """An insert's answer did not come in time; `ticket` still stands for it."""
 
-    def __init__(self, ticket: Ticket, what: str, waited_s: float) -> None:
+    def __init__(self, ticket: Ticket, waited_s: float) -> None:
         self.ticket = ticket
         hint = "it keeps being sent with its number: wait on .ticket.result() or flush(), do not insert it again"
-        super().__init__(f"{what}, insert {ticket.sequence},", waited_s, hint)
+        what = f"{ticket.errand.what}, insert {ticket.sequence},"
+        super().__init__(what, round(waited_s, 3), f"{ticket.errand.because}; {hint}")

@@ -4,6 +4,7 @@
     ├── BadSymbol            bad_symbol           a variable key that cannot be read
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
+    ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
@@ -65,6 +66,13 @@ class BadEndpoint(Problem):
         super().__init__(
             f"endpoint {endpoint!r} cannot be read; wanted protocol/address, such as tcp/127.0.0.1:7447", seen=endpoint
         )
+
+
+class BadSetting(Problem):
+    code = "bad_setting"
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(f"setting {path!r}: {reason}; wanted a path and value of a zenoh configuration", seen=path)
 
 
 class BadShape(Problem):

@@ -1,6 +1,6 @@
 """Variable keys: one int64 that prints as a letter and a number, packed as GTSAM packs its symbols.
 
-    key = letter << 56 | index,   letter: 0 (none) or an ASCII letter,   0 <= index < 2^56
+key = letter << 56 | index,   letter: 0 (none) or an ASCII letter,   0 <= index < 2^56
 """
 
 from factorbus.proto.problems import BadSymbol
