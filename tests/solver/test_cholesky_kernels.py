@@ -87,8 +87,8 @@ def assert_front(p: int, m: int, seed: int) -> None:
 def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[int, np.ndarray, np.ndarray]:
     """Put a front into an arena as `fronts` says, everything around it NaN, and factorise it."""
     n = len(front)
-    m, lead = n - p, -p % 8
-    ld, ldu = lead + p + m + -m % 8, m + -m % 8
+    m, lead = n - p, -p % LANES
+    ld, ldu = lead + p + m + -m % LANES, m + -m % LANES
     arena = np.full(SCRATCH + p * ld + m * ldu + 8, np.nan)
     rows = arena[SCRATCH : SCRATCH + p * ld].reshape(p, ld)
     update = arena[SCRATCH + p * ld : SCRATCH + p * ld + m * ldu].reshape(m, ldu)

@@ -2,11 +2,12 @@
 
 A front holds p pivot scalars and a border of m scalars, in elimination order.  Its rows of R are p rows over p + m
 columns, column j of row i at `ROWS + i·LD_ROWS + j`; its update matrix is m x m, upper triangle, column j of row i at
-`UPDATE + i·LD_UPDATE + j`.  Both start their border columns at a multiple of 8 doubles and pad rows to one, so that
-whole vectors cover them; what a row of R has before its first column, and behind its last, belongs to nobody.
+`UPDATE + i·LD_UPDATE + j`.  Both start their border columns at a multiple of LANES doubles
+and pad rows to one, so that whole vectors cover them and none lies across a cache line; what a row of R has before
+its first column, and behind its last, belongs to nobody.
 """
 
-from factorbus.solver.kernels._jit import inline_kernel
+from factorbus.solver.kernels._jit import inline_kernel, vector_lanes
 
 COLUMN = 0  # first pivot scalar, in elimination order
 PIVOTS = 1  # p
@@ -36,11 +37,13 @@ STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 
 SCRATCH = 16  # the first doubles of an arena: room for a 4 x 4 triangle
 
+LANES = vector_lanes()
+
 
 @inline_kernel
 def padded(count: int) -> int:
-    """The next multiple of 8: a cache line of doubles, and whole vectors on every processor."""
-    return (count + 7) & ~7
+    """The next multiple of LANES."""
+    return (count + LANES - 1) & ~(LANES - 1)
 
 
 @inline_kernel
