@@ -1,6 +1,6 @@
 """One map, as a client works with it."""
 
-import secrets
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -190,7 +190,7 @@ class Map:
         two processes that use the same name by mistake do not answer for each other.
         """
         self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
-        self.client = f"{self._client}-{secrets.token_hex(4)}"
+        self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)
         self._window: Window[Ticket] = Window(self._size)
         self._presence.close()
