@@ -93,9 +93,7 @@ def folder() -> Folder:
 
 
 def test_several_inserts_in_one_step(folder: Folder) -> None:
-    folded = fold(
-        folder, *[waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2)]
-    )
+    folded = fold(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2))
     assert codes(folded) == ["accepted"] * 3
     assert [(a.revision, a.first_factor, a.folded, a.epoch) for a in accepted(folded)] == [
         (2, 0, 3, EPOCH),

@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 # Up to here the solver's thread sends itself: one batch of the transport, no copying worth a thread switch.
 _SMALL = 16_384
 _TICK_S = 0.25
+_SENDERS = 4096
 
 
 def serve(config: Config, on_ready: Callable[[list[str]], None], stop: threading.Event) -> None:
@@ -97,6 +98,7 @@ class Shell:
         self._decoding = config.limits.message()
         self._maps: dict[str, _Map] = {}
         self._leaving: list[_Map] = []
+        self._senders: dict[str, tuple[str, str]] = {}  # keys of inserts taken apart before
         self._stopping = False
         self._outbox, self._desk = Lane("outbox"), Lane("desk")
         self._jobs = Jobs(self._desk, bus.send_job, reply, refuse, config.job_deadline_s, config.limits.jobs)
@@ -153,21 +155,31 @@ class Shell:
     # ---- callbacks: on Zenoh's threads; they must not call Zenoh and must not raise -------------------------------
 
     def _on_insert(self, query: Asker) -> None:
-        now = time.monotonic()
-        name, client = _chunks(query)
+        key = key_of(query)
+        place = self._senders.get(key)
+        try:
+            name, client = place or self._sender(key)
+        except Problem as problem:
+            self._outbox.hand(refuse, query, problem)
+            return
         found = self._maps.get(name)
         if found is None:
             self._outbox.hand(self._no_map, query, name)
             return
-        try:
-            read = read_insert(query, keys.checked_name("client", client), payload_of(query), self._decoding, now)
-        except Problem as problem:
-            self._outbox.hand(refuse, query, problem)
-            return
+        read = read_insert(query, client, payload_of(query), self._decoding, time.monotonic())
         if isinstance(read, Refuse):
             self._outbox.hand(refuse, query, read.problem)
         else:
             found.host.insert(read)
+
+    def _sender(self, key: str) -> tuple[str, str]:
+        """(map, client) of the key of an insert.  Raises BadName."""
+        parts = key.split("/")
+        sender = keys.checked_name("map", parts[3]), keys.checked_name("client", parts[-1])
+        if len(self._senders) >= _SENDERS:
+            self._senders.clear()
+        self._senders[key] = sender
+        return sender
 
     def _on_question(self, query: Asker) -> None:
         name, question = _chunks(query)

@@ -155,7 +155,8 @@ def key_of(query: zenoh.Query) -> str:
 
 def payload_of(query: zenoh.Query) -> bytes:
     """What was sent along."""
-    return query.payload.to_bytes() if query.payload is not None else b""
+    payload = query.payload
+    return payload.to_bytes() if payload is not None else b""
 
 
 def reply(query: zenoh.Query, message: bytes) -> None:

@@ -1,0 +1,101 @@
+"""Real processes for the tests: started, waited for by what they print, and always ended."""
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+PATIENCE_S = 60.0
+COMPILING_S = 300.0
+
+
+class Process:
+    """A Python process; its standard output comes line by line, its standard error goes to a file."""
+
+    def __init__(self, log: Path, *arguments: str) -> None:
+        self._log = log
+        with log.open("w") as errors:
+            self._popen = subprocess.Popen(
+                [sys.executable, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            )
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def ready(self) -> list[str]:
+        """The words after `ready`: it may have to compile first."""
+        return self.line("ready", COMPILING_S)
+
+    def line(self, beginning: str, patience_s: float = PATIENCE_S) -> list[str]:
+        """The words after `beginning` on the next line that begins so."""
+        while True:
+            try:
+                line = self._lines.get(timeout=patience_s)
+            except queue.Empty:
+                raise AssertionError(f"no line {beginning!r} in {patience_s} s; {self._said()}") from None
+            if line is None:
+                raise AssertionError(f"ended before a line {beginning!r}; {self._said()}")
+            if line.startswith(beginning):
+                return line.removeprefix(beginning).split()
+
+    def tell(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self._popen.stdin is not None
+        self._popen.stdin.write(line + "\n")
+        self._popen.stdin.flush()
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._popen.send_signal(number)
+
+    def wait(self) -> int:
+        """Its exit code, once it has ended."""
+        return self._popen.wait(PATIENCE_S)
+
+    def end(self) -> None:
+        """End it if it runs, whatever state it is in."""
+        if self._popen.poll() is None:
+            self._popen.kill()
+            self._popen.wait(PATIENCE_S)
+        self._reader.join(PATIENCE_S)
+        for pipe in (self._popen.stdin, self._popen.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            self._lines.put(line.rstrip("\n"))
+        self._lines.put(None)
+
+    def _said(self) -> str:
+        return f"its log ends: {self._log.read_text()[-2000:]}"
+
+
+@contextlib.contextmanager
+def processes(folder: Path) -> Iterator[Callable[..., Any]]:
+    """A function that starts Python processes, all of which end with the context."""
+    started: list[Process] = []
+
+    def start(*arguments: str) -> Process:
+        process = Process(folder / f"{len(started)}.log", *arguments)
+        started.append(process)
+        return process
+
+    try:
+        yield start
+    finally:
+        for process in started:
+            process.end()

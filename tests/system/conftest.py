@@ -1,0 +1,32 @@
+"""One service for the tests that leave it running, and a way to start processes for those that do not."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from processes import Process, processes
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A cold machine compiles the kernels first, in the first process that needs them."""
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.timeout(400))
+
+
+@pytest.fixture(scope="session")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Where a service answers that all tests share; each test has maps of its own."""
+    folder = tmp_path_factory.mktemp("service")
+    settings = folder / "service.toml"
+    settings.write_text("[limits]\nmessage_bytes = 200_000\nparked_s = 0.5\n")
+    with processes(folder) as start:
+        service = start("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
+        yield service.ready()[0]
+
+
+@pytest.fixture
+def spawn(tmp_path: pytest.TempPathFactory) -> Iterator[Callable[..., Process]]:
+    """Start Python processes that end with the test."""
+    with processes(tmp_path) as start:  # type: ignore[arg-type]
+        yield start

@@ -1,0 +1,55 @@
+"""What a worker does with a job: the optimum of a graph, or a problem with a code."""
+
+import numpy as np
+import pytest
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
+from factorbus.proto.problems import Problem
+from factorbus.service import inplace
+from factorbus.solver import SolverError
+from factorbus.workers import jobs
+from factorbus.workers.config import Config, checked
+
+INFORMATION = np.array([[100.0, 0, 0, 100, 0, 400]] * 3)
+
+
+def triangle() -> Graph:
+    """Three poses in a row whose three edges do not agree: 1 + 1 ≠ 2.3."""
+    start = Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True)
+    free = Variables("se2", np.array([1, 2]), np.array([[1.0, 0, 0], [2, 0, 0]]))
+    measured = np.array([[1.0, 0, 0], [1, 0, 0], [2.3, 0, 0]])
+    edges = Factors("between_se2", np.array([[0, 1], [1, 2], [0, 2]]), measured, INFORMATION)
+    return Graph(1, 1, Batch((start, free), (edges,)))
+
+
+def test_the_batch_job_finds_the_optimum() -> None:
+    optimum = codec.decode_optimum(jobs.do("batch", codec.encode_graph(triangle())))
+    # Three springs of one stiffness share the gap of 0.3 evenly: χ² = 3 · 100 · 0.1².
+    assert optimum.chi2 == pytest.approx(3.0, rel=1e-9)
+    places = {int(k): row for g in optimum.variables for k, row in zip(g.keys, g.values, strict=True)}  # type: ignore[arg-type]
+    np.testing.assert_allclose([places[1], places[2]], [[1.1, 0, 0], [2.2, 0, 0]], atol=1e-9)
+
+
+def test_the_service_in_place_finds_the_same_bits() -> None:
+    payload = codec.encode_graph(triangle())
+    done = inplace.do(Job("j", "batch", payload))
+    assert done.payload == jobs.do("batch", payload)
+
+
+def test_what_cannot_be_done_has_a_code() -> None:
+    loose = Graph(1, 1, Batch((Variables("se2", np.array([0]), np.zeros((1, 3))),)))
+    for kind, payload, code in (
+        ("bake", b"", "unknown_kind"),
+        ("batch", b"\xc1", "bad_message"),
+        ("batch", codec.encode_graph(loose), "underconstrained"),
+    ):
+        with pytest.raises((Problem, SolverError)) as refused:
+            jobs.do(kind, payload)
+        assert refused.value.code == code  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("config", [Config(connect=()), Config(slots=0), Config(name="a/b")])
+def test_a_configuration_that_cannot_work_is_refused(config: Config) -> None:
+    with pytest.raises(Problem):
+        checked(config)
