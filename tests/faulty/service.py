@@ -1,4 +1,4 @@
-"""A service that fails in every way the bus allows, over real zenoh on a local socket: what the client is tried against.
+"""A service that fails in every way the bus allows, over real zenoh on a local socket: the client is tried against it.
 
 It is small (it stores point2 values as they come) but keeps the contract of `proto/README.md`: epochs, numbering, first
 answers repeated, deltas with their previous revision.  What it does wrong, it is told to.
