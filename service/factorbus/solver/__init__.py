@@ -1,4 +1,6 @@
-"""The solver of factorbus: pure mathematics, no bus, clock, thread, file or print.  `service/MATH.md` has the equations.
+"""The solver of factorbus: pure mathematics, no bus, clock, thread, file or print.
+
+`service/MATH.md` has the equations.
 
     solver = Solver(Options(clock=time.perf_counter))
     solver.stage(batch)

@@ -1,4 +1,4 @@
-"""Order, analysis and factorisation of Λ for a graph; what depends on the pattern only is kept while it stays.  MATH §5."""
+"""Order, analysis and factorisation of Λ.  What depends on its pattern only is kept while that stays.  MATH §5."""
 
 import numpy as np
 

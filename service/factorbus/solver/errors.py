@@ -119,7 +119,9 @@ class BadRange(SolverError):
     code = "bad_range"
 
     def __init__(self, where: str, seen: float) -> None:
-        super().__init__(f"{where}: the range is {seen:g}, wanted more than 0; measured is (bearing, range)", where=where)
+        super().__init__(
+            f"{where}: the range is {seen:g}, wanted more than 0; measured is (bearing, range)", where=where
+        )
 
 
 class NotPositiveDefinite(SolverError):

@@ -11,8 +11,9 @@ from factorbus.solver.kernels._jit import F64
 _FIRST_DAMPING = 1e-5
 _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e12
-# Below this share of χ² a predicted decrease is lost in the rounding of χ² itself.
+# A predicted decrease below this share of χ², or below this, may be lost in the rounding of χ² itself.
 _ROUNDING = 1e-11
+_ROUNDING_FLOOR = 1e-12
 
 
 class Problem(Protocol):
@@ -82,7 +83,7 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule) -> Cours
             return course
         reached = problem.linearise_at(step)
         if not reached <= course.chi2:
-            if undamped and decrease <= _ROUNDING * course.chi2:
+            if undamped and decrease <= _ROUNDING * course.chi2 + _ROUNDING_FLOOR:
                 course.converged = True
                 return course
             if not _damp_more(course):
@@ -90,9 +91,10 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule) -> Cours
             continue
         problem.accept()
         course.iterations += 1
-        _damp_less(course, gained=course.chi2 - reached, expected=decrease)
+        gained = course.chi2 - reached
+        _damp_less(course, gained, expected=decrease)
         course.chi2 = reached
-        if undamped and rule.is_negligible(problem.step()[1], reached):
+        if undamped and (gained == 0.0 or rule.is_negligible(problem.step()[1], reached)):
             course.converged = True
             return course
     return course

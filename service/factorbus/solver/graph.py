@@ -67,7 +67,7 @@ class Graph:
         return int(find_variable(key, self.table, self.keys))
 
     def variables(self, picked: I64 | None = None) -> list[Group]:
-        """Values of all variables, or of those at the indices `picked`: a copy, at most one group per kind and fixed."""
+        """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness."""
         var = self.var[: self.counts[at.VARIABLES]]
         if picked is not None:
             var = var[picked]

@@ -15,6 +15,8 @@ class Options:
     mode            "all-batch": every step solves the whole system anew; "auto" is that at present
     clock           seconds, for the phases in the report; without one they are zero
     tolerance       an ordinary step stops when the next one would lower χ² by less than this share of it
+    negligible      a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A step whose new
+                    factors add less solves nothing, and no step goes on for less
     max_iterations  at most this many tries (accepted or not) in an ordinary step; the next step goes on from there
     settle_tolerance, settle_iterations   the same for a step that is to converge
     last_pose_last  constrain the ordering: the last pose last, the landmarks it sees right before it
@@ -23,6 +25,7 @@ class Options:
     mode: str = "auto"
     clock: Callable[[], float] | None = None
     tolerance: float = 1e-6
+    negligible: float = 1e-12
     max_iterations: int = 10
     settle_tolerance: float = 1e-14
     settle_iterations: int = 500

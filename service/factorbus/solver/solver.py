@@ -16,9 +16,6 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.system import System
 
-# New factors whose χ² is below this have nothing to say: it is a millionth of a standard deviation, squared.
-_NOTHING_NEW = 1e-12
-
 
 @dataclass(frozen=True, slots=True)
 class _Done:
@@ -83,10 +80,7 @@ class Solver:
             watch.lap("check")
             # 3. Solve, if there is anything to solve.
             because = self._reason_to_solve(added, settle, suspects)
-            if because:
-                course = self._solve(added, settle, suspects, watch)
-            else:
-                course = self._extend(added)
+            course = self._solve(added, settle, suspects, watch) if because else self._extend(added)
         except BaseException:
             self._take_back()
             raise
@@ -136,16 +130,16 @@ class Solver:
             return f"{suspects.size} new variables are held only by several factors together"
         if not np.isfinite(self._done.unsolved):
             return "the last step had not converged"
-        if self._done.unsolved + added > _NOTHING_NEW:
+        if self._done.unsolved + added > self._options.negligible:
             return f"new factors add {added:.3g} to χ²"
         return ""
 
     def _solve(self, added: float, settle: bool, suspects: I64, watch: Stopwatch) -> Course:
         """Gauss-Newton from the present values."""
         options = self._options
-        rule = Rule(options.tolerance, _NOTHING_NEW, options.max_iterations)
+        rule = Rule(options.tolerance, options.negligible, options.max_iterations)
         if settle:
-            rule = Rule(options.settle_tolerance, 0.0, options.settle_iterations)
+            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
         self._system.begin(suspects, watch)
         course = minimise(self._system, self._done.chi2 + added, self._done.damping, rule)
         if course.failed >= 0 and course.iterations == 0:

@@ -1,4 +1,4 @@
-"""The least-squares problem of a graph as Gauss-Newton sees it: a point, the normal equations there, a step, a trial."""
+"""The least-squares problem of a graph as Gauss-Newton sees it: a point, normal equations, a step, a trial."""
 
 import numpy as np
 
@@ -92,9 +92,7 @@ class System:
 
     def underconstrained(self, variable: int, missing: str = _FREE_DIRECTION) -> errors.Underconstrained:
         """The error that names `variable`, its factors, and what is missing."""
-        return errors.Underconstrained(
-            int(self.graph.keys[variable]), self.graph.factors_of(variable), missing
-        )
+        return errors.Underconstrained(int(self.graph.keys[variable]), self.graph.factors_of(variable), missing)
 
     def variable_of(self, column: int) -> int:
         """The variable that has this block column."""

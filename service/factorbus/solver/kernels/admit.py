@@ -37,7 +37,7 @@ def slot_of(key: int, table: I64, keys: I64) -> int:
 @kernel("int64(int64, int64[::1], int64[::1])")
 def find_variable(key: int, table: I64, keys: I64) -> int:
     """Index of the variable `key`, or −1."""
-    return table[slot_of(key, table, keys)] - 1
+    return int(table[slot_of(key, table, keys)]) - 1
 
 
 @kernel("void(int64, int64[::1], int64[::1])")
@@ -61,7 +61,7 @@ def remove_keys(first: int, last: int, table: I64, keys: I64) -> None:
 def admit_variables(
     kind: int, fixed: bool, new: I64, given: F64, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
 ) -> tuple:
-    """Append variables of one kind; `given` (n, size) has their values, or (0, size) none.  Gives (row, what is wrong)."""
+    """Append variables of one kind; `given` (n, size) has their values, or (0, size) none.  Gives (row, fault)."""
     size = given.shape[1]
     dim = 6 if kind == at.SE3 else size
     for n in range(new.size):
@@ -100,7 +100,7 @@ def admit_variables(
 def admit_factors(
     kind: int, ends: I64, z: F64, info: F64, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64
 ) -> tuple:
-    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle).  Gives (row, what is wrong)."""
+    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle).  Gives (row, fault)."""
     size, triangle = z.shape[1], info.shape[1]
     dim = 6 if size == 7 else size
     first, second = kinds_of_ends(kind)

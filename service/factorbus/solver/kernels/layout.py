@@ -1,5 +1,6 @@
 """How the arenas are laid out that every kernel of the nonlinear side reads: column numbers, kind codes, sizes.
 
+The arenas are:
     var      (n, 5) int64    one row per variable, in insertion order
     fac      (m, 8) int64    one row per factor, in insertion order
     values   float64         the variables' values, packed one after the other

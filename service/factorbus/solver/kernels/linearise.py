@@ -40,7 +40,9 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
     return chi2
 
 
-@kernel("void(int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])")
+@kernel(
+    "void(int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])"
+)
 def evaluate_one(f: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, A: F64, B: F64) -> None:
     """Residual and Jacobians of factor `f` alone: r (6,), A and B (6, 6), upper left corners filled."""
     evaluate(f, var, fac, values, payload, r, A, B)

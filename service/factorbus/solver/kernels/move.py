@@ -44,7 +44,7 @@ def differing(old: int, count: int, var: I64, before: I64, values: I64, out: I64
 @inline_kernel
 def differs(x: int, size: int, a: I64, b: I64) -> bool:
     """Whether any of `size` numbers from offset x on differ."""
-    for c in range(size):
+    for c in range(size):  # noqa: SIM110  (compiled)
         if a[x + c] != b[x + c]:
             return True
     return False

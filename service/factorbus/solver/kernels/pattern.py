@@ -36,7 +36,7 @@ def block_of(row: int, column: int, size: int, table: I64, pattern: I64, fill: I
         table[slot] = b + 1
         fill[0] += 1
         fill[1] += size
-    return pattern[2, table[slot] - 1]
+    return int(pattern[2, table[slot] - 1])
 
 
 @kernel(

@@ -20,12 +20,8 @@ _NOTHING = -1
 _WAITS = -2
 
 
-@kernel(
-    "int64(boolean, int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])"
-)
-def reach(
-    compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64
-) -> int:
+@kernel("int64(boolean, int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
+def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64) -> int:
     """Mark in `reached` (one entry per variable from v0 on, 1: reached) what factors f0 .. f1−1 lead to.
 
     Variables before v0 are reached.  With `compose` the first factor that reaches a variable gives it its value.

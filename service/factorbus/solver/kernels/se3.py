@@ -76,9 +76,7 @@ def between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
     r[0] = z0 * ex + z3 * ey + z6 * ez
     r[1] = z1 * ex + z4 * ey + z7 * ez
     r[2] = z2 * ex + z5 * ey + z8 * ez
-    qx, qy, qz, qw = quat_product(
-        -x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6]
-    )
+    qx, qy, qz, qw = quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
     vx, vy, vz, w = quat_product(-p[k + 3], -p[k + 4], -p[k + 5], p[k + 6], qx, qy, qz, qw)
     if w < 0.0:
         vx, vy, vz, w = -vx, -vy, -vz, -w

@@ -1,0 +1,81 @@
+"""Residuals and increments written with matrices and scipy's rotations, one factor at a time: the twin of the kernels.
+
+Nothing here shares a formula with them: poses are homogeneous matrices, Jacobians are central differences.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
+
+
+def pose_matrix(x: np.ndarray) -> np.ndarray:
+    """Homogeneous matrix of an SE2 (3 numbers) or SE3 (7 numbers) pose."""
+    n = 2 if len(x) == 3 else 3
+    T = np.eye(n + 1)
+    T[:n, n] = x[:n]
+    T[:n, :n] = plane_rotation(x[2]) if n == 2 else Rotation.from_quat(x[3:]).as_matrix()
+    return T
+
+
+def plane_rotation(theta: float) -> np.ndarray:
+    return np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+
+
+def pose_vector(T: np.ndarray) -> np.ndarray:
+    """The inverse of `pose_matrix`; the quaternion has qw >= 0."""
+    if len(T) == 3:
+        return np.array([T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])])
+    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True)])
+
+
+def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
+    """x ⊞ δ for a kind of variable."""
+    if kind.startswith("point"):
+        return x + delta
+    n = 2 if kind == "se2" else 3
+    step = np.eye(n + 1)
+    step[:n, n] = delta[:n]
+    step[:n, :n] = plane_rotation(delta[2]) if n == 2 else Rotation.from_rotvec(delta[3:]).as_matrix()
+    return pose_vector(pose_matrix(x) @ step)
+
+
+def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
+    """r of a kind of factor at the values of its variables."""
+    if kind.startswith("prior_point"):
+        return ends[0] - z
+    if kind.startswith("prior"):
+        return _pose_error(np.linalg.inv(pose_matrix(z)) @ pose_matrix(ends[0]))
+    if kind.startswith("between"):
+        relative = np.linalg.inv(pose_matrix(ends[0])) @ pose_matrix(ends[1])
+        return _pose_error(np.linalg.inv(pose_matrix(z)) @ relative)
+    seen = (np.linalg.inv(pose_matrix(ends[0])) @ np.append(ends[1], 1.0))[:-1]
+    if kind == "bearing_range_se2":
+        turn = np.angle(np.exp(1j * (np.arctan2(seen[1], seen[0]) - z[0])))
+        return np.array([turn, np.hypot(*seen) - z[1]])
+    return seen - z
+
+
+def _pose_error(E: np.ndarray) -> np.ndarray:
+    return pose_vector(E)[: 3 if len(E) == 3 else 6]
+
+
+def jacobians(
+    kind: str, end_kinds: list[str], ends: list[np.ndarray], z: np.ndarray, h: float = 1e-5
+) -> list[np.ndarray]:
+    """∂r/∂x of every end by central differences of fourth order."""
+    found = []
+    for e, end_kind in enumerate(end_kinds):
+        columns = []
+        for c in range(TANGENT[end_kind]):
+
+            def at(t: float, e: int = e, c: int = c, end_kind: str = end_kind) -> np.ndarray:
+                delta = np.zeros(TANGENT[end_kind])
+                delta[c] = t
+                moved = list(ends)
+                moved[e] = boxplus(end_kind, ends[e], delta)
+                return residual(kind, moved, z)
+
+            columns.append((8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h))
+        found.append(np.stack(columns, axis=1))
+    return found

@@ -1,0 +1,105 @@
+"""A factor graph solved with dense matrices: the twin of the solver."""
+
+import numpy as np
+from naive.dense_factors import TANGENT, boxplus, jacobians, residual
+
+CONNECTS = {
+    "prior_se2": ["se2"],
+    "prior_se3": ["se3"],
+    "prior_point2": ["point2"],
+    "prior_point3": ["point3"],
+    "between_se2": ["se2", "se2"],
+    "between_se3": ["se3", "se3"],
+    "landmark_se2": ["se2", "point2"],
+    "landmark_se3": ["se3", "point3"],
+    "bearing_range_se2": ["se2", "point2"],
+}
+
+
+class DenseGraph:
+    """Variables by key in insertion order, factors in a list."""
+
+    def __init__(self) -> None:
+        self.kinds: dict[int, str] = {}
+        self.fixed: set[int] = set()
+        self.values: dict[int, np.ndarray] = {}
+        self.factors: list[tuple[str, list[int], np.ndarray, np.ndarray]] = []
+
+    def add(self, batch) -> None:
+        """Take in a batch; values come by `put`."""
+        for group in batch.variables:
+            for key in group.keys.tolist():
+                self.kinds[key] = group.kind
+                if group.fixed:
+                    self.fixed.add(key)
+        for group in batch.factors:
+            for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True):
+                self.factors.append((group.kind, keys, z, full(upper)))
+
+    def put(self, groups) -> None:
+        """Take over values."""
+        for group in groups:
+            self.values.update(zip(group.keys.tolist(), group.values, strict=True))
+
+    def chi2(self) -> float:
+        total = 0.0
+        for kind, keys, z, information in self.factors:
+            r = residual(kind, [self.values[key] for key in keys], z)
+            total += r @ information @ r
+        return float(total)
+
+    def starts(self) -> dict[int, int]:
+        """First scalar of every free variable."""
+        found, n = {}, 0
+        for key, kind in self.kinds.items():
+            if key not in self.fixed:
+                found[key] = n
+                n += TANGENT[kind]
+        return found
+
+    def system(self) -> tuple[np.ndarray, np.ndarray]:
+        """(Λ, η) at the present values."""
+        starts = self.starts()
+        n = sum(TANGENT[self.kinds[key]] for key in starts)
+        information, eta = np.zeros((n, n)), np.zeros(n)
+        for kind, keys, z, W in self.factors:
+            ends = [self.values[key] for key in keys]
+            r = residual(kind, ends, z)
+            H = np.zeros((len(r), n))
+            for key, J in zip(keys, jacobians(kind, CONNECTS[kind], ends, z), strict=True):
+                if key in starts:
+                    H[:, starts[key] : starts[key] + J.shape[1]] = J
+            information += H.T @ W @ H
+            eta -= H.T @ W @ r
+        return information, eta
+
+    def gauss_newton(self, iterations: int = 12) -> float:
+        """Iterate until nothing moves; gives the length of the last step."""
+        length = np.inf
+        for _ in range(iterations):
+            information, eta = self.system()
+            delta = np.linalg.solve(information, eta)
+            length = float(np.abs(delta).max())
+            for key, start in self.starts().items():
+                kind = self.kinds[key]
+                self.values[key] = boxplus(kind, self.values[key], delta[start : start + TANGENT[kind]])
+            if length < 1e-12:
+                break
+        return length
+
+
+def full(upper: np.ndarray) -> np.ndarray:
+    """The symmetric matrix with this upper triangle, row by row."""
+    n = int((np.sqrt(8 * len(upper) + 1) - 1) / 2)
+    matrix = np.zeros((n, n))
+    matrix[np.triu_indices(n)] = upper
+    return matrix + np.triu(matrix, 1).T
+
+
+def distance(kind: str, a: np.ndarray, b: np.ndarray) -> float:
+    """How far two values of a kind are apart; angles modulo 2π, quaternions up to sign."""
+    if kind == "se2":
+        return float(max(np.abs(a[:2] - b[:2]).max(), abs(np.angle(np.exp(1j * (a[2] - b[2]))))))
+    if kind == "se3":
+        return float(max(np.abs(a[:3] - b[:3]).max(), min(np.abs(a[3:] - b[3:]).max(), np.abs(a[3:] + b[3:]).max())))
+    return float(np.abs(a - b).max())

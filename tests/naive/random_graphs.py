@@ -1,0 +1,104 @@
+"""Random graphs that grow step by step, with every kind of variable and factor in them, and single random factors."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from naive.dense_factors import TANGENT, boxplus, pose_matrix, pose_vector, residual
+from naive.dense_least_squares import CONNECTS
+
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.symbols import symbol
+
+
+def random_value(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """A value anywhere within a few metres."""
+    if kind == "se2":
+        return np.array([*rng.normal(0, 3, 2), rng.uniform(-np.pi, np.pi)])
+    if kind == "se3":
+        q = rng.normal(size=4)
+        return np.concatenate([rng.normal(0, 3, 3), q / np.linalg.norm(q)])
+    return rng.normal(0, 3, 2 if kind == "point2" else 3)
+
+
+def random_information(dim: int, rng: np.random.Generator) -> np.ndarray:
+    """The upper triangle of a full positive definite matrix."""
+    J = rng.normal(size=(dim, dim))
+    return (J @ J.T + dim * np.eye(dim))[np.triu_indices(dim)]
+
+
+def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
+    """What a factor of a kind would measure at these values, with noise."""
+    if kind.startswith("prior_point"):
+        return ends[0] + noise * rng.normal(size=len(ends[0]))
+    if kind.startswith(("prior", "between")):
+        relative = pose_matrix(ends[0])
+        if len(ends) == 2:
+            relative = np.linalg.inv(relative) @ pose_matrix(ends[1])
+        space = CONNECTS[kind][0]
+        return boxplus(space, pose_vector(relative), noise * rng.normal(size=TANGENT[space]))
+    zero = np.zeros(FACTOR_KINDS[kind].size)
+    return residual(kind, ends, zero) + noise * rng.normal(size=len(zero))
+
+
+def factor(kind: str, keys: list[int], truth: dict[int, np.ndarray], noise: float, rng: np.random.Generator) -> Factors:
+    """One factor of a kind between known true values."""
+    z = measured(kind, [truth[key] for key in keys], noise, rng)
+    information = random_information(FACTOR_KINDS[kind].dim, rng)
+    return Factors(kind, np.array([keys]), z[None], information[None])
+
+
+def random_steps(seed: int, steps: int = 7, noise: float = 0.03) -> Iterator[Batch]:
+    """Steps of a robot in the plane and one in space that share a map; every kind occurs, and edges run both ways."""
+    rng = np.random.default_rng(seed)
+    truth: dict[int, np.ndarray] = {}
+
+    def new(kind: str, letter: str, index: int, value: np.ndarray, fixed: bool = False) -> Variables:
+        truth[symbol(letter, index)] = value
+        keys = np.array([symbol(letter, index)])
+        return Variables(kind, keys, value[None] if fixed else None, fixed)
+
+    def between(kind: str, i: int, j: int) -> Factors:
+        keys = [i, j] if rng.random() < 0.7 else [j, i]
+        return factor(kind, keys, truth, noise, rng)
+
+    for n in range(steps):
+        variables, factors = [], []
+        start = random_value("se2", rng)
+        if n:
+            start = boxplus("se2", truth[symbol("x", n - 1)], np.array([1.0, 0.1, rng.normal(0, 0.6)]))
+        variables.append(new("se2", "x", n, start, fixed=n == 0))
+        if n:
+            factors.append(between("between_se2", symbol("x", n - 1), symbol("x", n)))
+        if n > 2 and rng.random() < 0.6:
+            factors.append(between("between_se2", symbol("x", int(rng.integers(n - 2))), symbol("x", n)))
+        if rng.random() < 0.5 or n == 0:
+            variables.append(new("point2", "l", n, start[:2] + rng.uniform(1, 3, 2)))
+            factors.append(factor("landmark_se2", [symbol("x", n), symbol("l", n)], truth, noise, rng))
+            if rng.random() < 0.4:
+                factors.append(factor("prior_point2", [symbol("l", n)], truth, noise, rng))
+        else:
+            old = [key for key in truth if key >> 56 == ord("l")]
+            key = old[int(rng.integers(len(old)))]
+            factors.append(factor("bearing_range_se2", [symbol("x", n), key], truth, noise, rng))
+        if n and rng.random() < 0.3:
+            factors.append(factor("prior_se2", [symbol("x", n)], truth, noise, rng))
+
+        place = random_value("se3", rng)
+        if n:
+            place = boxplus("se3", truth[symbol("y", n - 1)], np.array([1, 0, 0.1, *rng.normal(0, 0.4, 3)]))
+        variables.append(new("se3", "y", n, place))
+        if n == 0:
+            factors.append(factor("prior_se3", [symbol("y", 0)], truth, noise, rng))
+        else:
+            factors.append(between("between_se3", symbol("y", n - 1), symbol("y", n)))
+        if n > 2 and rng.random() < 0.6:
+            factors.append(between("between_se3", symbol("y", int(rng.integers(n - 2))), symbol("y", n)))
+        if n % 2 == 0:
+            variables.append(new("point3", "p", n, place[:3] + rng.uniform(1, 3, 3)))
+            factors.append(factor("landmark_se3", [symbol("y", n), symbol("p", n)], truth, noise, rng))
+            if rng.random() < 0.4:
+                factors.append(factor("prior_point3", [symbol("p", n)], truth, noise, rng))
+        else:
+            factors.append(factor("landmark_se3", [symbol("y", n), symbol("p", n - 1)], truth, noise, rng))
+        yield Batch(tuple(variables), tuple(factors))

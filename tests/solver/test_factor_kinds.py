@@ -1,0 +1,86 @@
+"""Every kind of factor: its residual and Jacobians against the dense twin, its names and sizes against the wire's."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive.dense_factors import jacobians, residual
+from naive.random_graphs import random_information, random_value
+
+from factorbus.proto import kinds as wire
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.solver.admission import admit
+from factorbus.solver.factors import FACTOR_KINDS, FactorKind
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels.linearise import evaluate_one
+from factorbus.solver.variables import VARIABLE_KINDS
+
+seeds = st.integers(0, 2**32 - 1)
+every_kind = pytest.mark.parametrize("kind", FACTOR_KINDS.values(), ids=str)
+
+
+def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Graph]:
+    """Values of the ends, a measurement far from them, and a graph of that one factor."""
+    rng = np.random.default_rng(seed)
+    ends = [random_value(end.name, rng) for end in kind.connects]
+    z = random_value({2: "point2", 3: "se2", 7: "se3"}[kind.size], rng)
+    if kind.name == "bearing_range_se2":
+        z = np.array([z[0] % 3.0, abs(z[1]) + 0.1])
+    graph = Graph()
+    admit(
+        graph,
+        Batch(
+            tuple(Variables(end.name, np.array([k]), ends[k][None]) for k, end in enumerate(kind.connects)),
+            (Factors(kind.name, np.arange(len(ends))[None], z[None], random_information(kind.dim, rng)[None]),),
+        ),
+    )
+    return ends, z, graph
+
+
+def evaluate(kind: FactorKind, graph: Graph) -> tuple[np.ndarray, list[np.ndarray]]:
+    r, A, B = np.full(6, np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan)
+    evaluate_one(0, graph.var, graph.fac, graph.values, graph.payload, r, A, B)
+    return r[: kind.dim], [J[: kind.dim, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
+
+
+@every_kind
+@given(seed=seeds)
+def test_residual_is_the_twins(kind: FactorKind, seed: int) -> None:
+    ends, z, graph = case(kind, seed)
+    r, _ = evaluate(kind, graph)
+    twin = residual(kind.name, ends, z)
+    near_turn = np.abs(np.abs(twin) - np.pi) < 1e-9  # −π and π are the same angle
+    np.testing.assert_allclose(np.where(near_turn, np.abs(r), r), np.where(near_turn, np.abs(twin), twin), atol=1e-9)
+
+
+@every_kind
+@given(seed=seeds)
+def test_jacobians_are_the_twins_central_differences(kind: FactorKind, seed: int) -> None:
+    ends, z, graph = case(kind, seed)
+    r, found = evaluate(kind, graph)
+    if kind.dim == 6 and 1.0 - r[3:] @ r[3:] < 1e-3:
+        return  # half a turn apart: the sign of the error quaternion flips within the differences
+    if kind.dim != 6 and np.abs(np.abs(r) - np.pi).min() < 1e-3:
+        return  # the angle wraps within the differences
+    if kind.name == "bearing_range_se2" and r[1] + z[1] < 0.1:
+        return  # a bearing changes without bound near the pose
+    for J, twin in zip(found, jacobians(kind.name, [end.name for end in kind.connects], ends, z), strict=True):
+        np.testing.assert_allclose(J, twin, atol=3e-7)
+
+
+def test_a_point_on_the_pose_has_no_bearing_but_no_nan_either() -> None:
+    kind = FACTOR_KINDS["bearing_range_se2"]
+    _, _, graph = case(kind, 1)
+    graph.values[3:5] = graph.values[0:2]
+    r, found = evaluate(kind, graph)
+    assert np.isfinite(r).all()
+    assert all((J == 0.0).all() for J in found)
+
+
+def test_the_wire_and_the_solver_mean_the_same_kinds() -> None:
+    assert {k.name: (k.size, k.dim) for k in VARIABLE_KINDS.values()} == {
+        k.name: (k.size, k.dim) for k in wire.VARIABLE_KINDS.values()
+    }
+    assert {k.name: (tuple(map(str, k.connects)), k.size, k.dim, k.triangle) for k in FACTOR_KINDS.values()} == {
+        k.name: (k.connects, k.size, k.dim, k.information_size) for k in wire.FACTOR_KINDS.values()
+    }

@@ -1,0 +1,110 @@
+"""The rules that accept, damp and stop, on small problems without a graph."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from factorbus.solver.gauss_newton import Rule, minimise
+
+SETTLE = Rule(tolerance=1e-14, floor=1e-20, limit=200)
+
+
+class Curve:
+    """Residuals r(x) of a vector with a Jacobian; keeps what was asked of it."""
+
+    def __init__(self, r: Callable, J: Callable, x: list[float]) -> None:
+        self.r, self.J, self.x = r, J, np.array(x)
+        self.chi2s = [self.chi2(self.x)]
+        self.factorised: list[float] = []
+
+    def chi2(self, x: np.ndarray) -> float:
+        return float(self.r(x) @ self.r(x))
+
+    def factorize(self, damping: float) -> int:
+        J = self.J(self.x)
+        self.A = J.T @ J
+        self.A += damping * np.diag(np.diag(self.A))
+        self.factorised.append(damping)
+        return -1 if np.linalg.eigvalsh(self.A)[0] > 1e-12 else 1
+
+    def step(self) -> tuple[np.ndarray, float]:
+        eta = -self.J(self.x).T @ self.r(self.x)
+        delta = np.linalg.solve(self.A, eta)
+        return delta, float(delta @ eta)
+
+    def linearise_at(self, step: np.ndarray) -> float:
+        self.there = self.x + step
+        return self.chi2(self.there)
+
+    def accept(self) -> None:
+        self.x = self.there
+        self.chi2s.append(self.chi2(self.x))
+
+
+def rosenbrock(x: list[float]) -> Curve:
+    return Curve(
+        lambda x: np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]]), lambda x: np.array([[-20 * x[0], 10], [-1.0, 0]]), x
+    )
+
+
+def arctan(x: list[float]) -> Curve:
+    """Gauss-Newton alone diverges from beyond ±1.39."""
+    return Curve(lambda x: np.arctan(x), lambda x: np.array([[1 / (1 + x[0] ** 2)]]), x)
+
+
+def test_a_linear_problem_takes_one_step_and_one_factorisation() -> None:
+    A, b = np.array([[2.0, 1], [0, 3], [1, 1]]), np.array([1.0, 2, 4])
+    problem = Curve(lambda x: A @ x - b, lambda x: A, [0.0, 0.0])
+    course = minimise(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert (course.iterations, course.factorisations, course.converged) == (1, 1, True)
+    np.testing.assert_allclose(problem.x, np.linalg.lstsq(A, b, rcond=None)[0])
+
+
+@pytest.mark.parametrize("start", [1.0, 3.0, 30.0, -1e3])
+def test_damping_saves_what_gauss_newton_would_lose(start: float) -> None:
+    problem = arctan([start])
+    course = minimise(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert course.converged
+    assert abs(problem.x[0]) < 1e-9
+    assert (max(problem.factorised) > 0.0) == (abs(start) > 1.39)
+
+
+@pytest.mark.parametrize("start", [[-1.2, 1.0], [0.0, 0.0], [-3.0, -4.0], [100.0, -50.0]])
+def test_chi2_never_rises(start: list[float]) -> None:
+    problem = rosenbrock(start)
+    course = minimise(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert course.converged
+    np.testing.assert_allclose(problem.x, [1.0, 1.0], atol=1e-8)
+    assert (np.diff(problem.chi2s) <= 0.0).all()
+    assert course.chi2 == problem.chi2s[-1]
+
+
+def test_a_limit_stops_and_the_damping_is_handed_on() -> None:
+    problem = arctan([1e3])
+    course = minimise(problem, problem.chi2s[0], 0.0, Rule(1e-6, 1e-12, limit=2))
+    assert (course.converged, course.factorisations) == (False, 2)
+    assert course.damping > 0.0
+    again = minimise(problem, problem.chi2s[-1], course.damping, SETTLE)
+    assert again.converged
+
+
+def test_the_loop_ends_where_another_step_would_gain_nothing() -> None:
+    problem = rosenbrock([1.0 + 1e-9, 1.0])
+    course = minimise(problem, problem.chi2s[0], 0.0, Rule(1e-6, floor=1e-12, limit=10))
+    assert (course.iterations, course.converged) == (0, True)
+
+
+def test_a_singular_system_is_reported_not_moved() -> None:
+    problem = Curve(lambda x: np.array([x[0] - 1.0]), lambda x: np.array([[1.0, 0.0]]), [5.0, 5.0])
+    course = minimise(problem, 16.0, 0.0, SETTLE)
+    assert (course.failed, course.iterations, course.converged) == (1, 0, False)
+    np.testing.assert_array_equal(problem.x, [5.0, 5.0])
+
+
+def test_nan_beyond_the_step_is_a_step_too_far() -> None:
+    with np.errstate(invalid="ignore"):
+        problem = Curve(lambda x: np.sqrt(x) - 0.1, lambda x: np.array([[0.5 / np.sqrt(x[0])]]), [4.0])
+        course = minimise(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert course.converged
+    assert problem.x[0] == pytest.approx(0.01, rel=1e-6)

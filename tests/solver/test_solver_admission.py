@@ -1,0 +1,219 @@
+"""Every way a batch is refused, and that a refused batch leaves no trace."""
+
+import pickle
+
+import numpy as np
+import pytest
+from naive.random_graphs import random_steps
+
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.solver import Solver, errors
+
+I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
+I2 = np.array([[1.0, 0, 1]])
+I6 = np.eye(6)[np.triu_indices(6)][None]
+IDENTITY = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
+
+
+def poses(*keys: int, values: np.ndarray | None = None) -> Variables:
+    return Variables("se2", np.array(keys), np.zeros((len(keys), 3)) if values is None else values)
+
+
+def edge(i: int, j: int, z: tuple = (1.0, 0, 0), info: np.ndarray = I3) -> Factors:
+    return Factors("between_se2", np.array([[i, j]]), np.array([z], float), info)
+
+
+def seen(i: int, j: int) -> Factors:
+    return Factors("landmark_se2", np.array([[i, j]]), np.ones((1, 2)), I2)
+
+
+def nan_info() -> np.ndarray:
+    info = I3.copy()
+    info[0, 4] = np.nan
+    return info
+
+
+# What every map of these tests holds: pose 0 (fixed), pose 1, landmark 100, and a pose in space 200.
+REFUSED = {
+    "unknown variable kind": ("unknown_kind", Batch((Variables("se4", np.array([2])),))),
+    "unknown factor kind": ("unknown_kind", Batch((), (Factors("behind_se2", np.array([[0, 1]]), I3[:, :3], I3),))),
+    "key taken": ("duplicate_variable", Batch((poses(1),))),
+    "key twice in the batch": ("duplicate_variable", Batch((poses(2, 3, 2),))),
+    "key twice in two groups": ("duplicate_variable", Batch((poses(2), Variables("point2", np.array([2]))))),
+    "first key unknown": ("unknown_variable", Batch((), (edge(9, 1),))),
+    "second key unknown": ("unknown_variable", Batch((), (edge(1, 9),))),
+    "self-loop": ("self_loop", Batch((), (edge(1, 1),))),
+    "pose where a point belongs": (
+        "kind_mismatch", Batch((), (seen(0, 1),)),
+    ),
+    "point where a pose belongs": ("kind_mismatch", Batch((), (edge(0, 100),))),
+    "pose in space where one in the plane belongs": ("kind_mismatch", Batch((), (edge(200, 1),))),
+    "NaN value": ("not_finite", Batch((poses(2, values=np.array([[0, np.nan, 0]])),))),
+    "infinite value": ("not_finite", Batch((poses(2, values=np.array([[np.inf, 0, 0]])),))),
+    "NaN measurement": ("not_finite", Batch((), (edge(0, 1, (np.nan, 0, 0)),))),
+    "NaN information": ("not_finite", Batch((), (edge(0, 1, info=nan_info()),))),
+    "χ² beyond numbers is found in the step": ("not_finite", Batch((), (edge(0, 1, (1e200, 0, 0)),))),
+    "indefinite information": ("not_positive_definite", Batch((), (edge(0, 1, info=I3 + np.eye(6)[1:2] * 2),))),
+    "singular information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.ones((1, 6))),))),
+    "zero information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.zeros((1, 6))),))),
+    "negative information": ("not_positive_definite", Batch((), (edge(0, 1, info=-I3),))),
+    "quaternion of length 2 in a value": (
+        "bad_quaternion", Batch((Variables("se3", np.array([2]), 2 * IDENTITY),)),
+    ),
+    "quaternion of length 0 in a value": (
+        "bad_quaternion", Batch((Variables("se3", np.array([2]), 0 * IDENTITY),)),
+    ),
+    "quaternion of length 0.9 in a measurement": (
+        "bad_quaternion", Batch((), (Factors("prior_se3", np.array([[200]]), 0.9 * IDENTITY, I6),)),
+    ),
+    "range of zero": (
+        "bad_range", Batch((), (Factors("bearing_range_se2", np.array([[0, 100]]), np.zeros((1, 2)), I2),)),
+    ),
+    "variable without value that nothing reaches": (
+        "uninitialised", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
+    ),
+    "pose that only a point could place": (
+        "uninitialised",
+        Batch((Variables("se2", np.array([2])),), (seen(2, 100),)),
+    ),
+    "keys in two dimensions": ("bad_shape", Batch((Variables("se2", np.array([[2]])),))),
+    "keys that are no integers": ("bad_shape", Batch((Variables("se2", np.array([2.0])),))),  # type: ignore[arg-type]
+    "values of another size": ("bad_shape", Batch((Variables("se2", np.array([2]), np.zeros((1, 4))),))),
+    "fewer values than keys": ("bad_shape", Batch((Variables("se2", np.array([2, 3]), np.zeros((1, 3))),))),
+    "factor with three ends": ("bad_shape", Batch((), (Factors("between_se2", np.array([[0, 1, 1]]), I3[:, :3], I3),))),
+    "measurement of another size": ("bad_shape", Batch((), (Factors("between_se2", np.array([[0, 1]]), I3, I3),))),
+    "information of another size": ("bad_shape", Batch((), (edge(0, 1, info=I2),))),
+    "a list": ("bad_shape", Batch((Variables("se2", [2]),))),  # type: ignore[arg-type]
+    "alone": ("underconstrained", Batch((poses(2),))),
+    "two poses joined to each other only": ("underconstrained", Batch((poses(2, 3),), (edge(2, 3),))),
+    "pose seen by one point only": (
+        "underconstrained",
+        Batch((poses(2),), (seen(2, 100),)),
+    ),
+    "new point seen by a new pose only": (
+        "underconstrained",
+        Batch(
+            (poses(2), Variables("point2", np.array([101, 102]), np.ones((2, 2)))),
+            (Factors("landmark_se2", np.array([[2, 101], [2, 102]]), np.ones((2, 2)), np.repeat(I2, 2, 0)),),
+        ),
+    ),
+}  # fmt: skip
+
+
+def small_map() -> Solver:
+    solver = Solver()
+    solver.stage(
+        Batch(
+            (
+                Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True),
+                Variables("se2", np.array([1])),
+                Variables("point2", np.array([100])),
+                Variables("se3", np.array([200]), IDENTITY),
+            ),
+            (
+                edge(0, 1),
+                Factors("landmark_se2", np.array([[0, 100]]), np.ones((1, 2)), I2),
+                Factors("prior_se3", np.array([[200]]), IDENTITY, I6),
+            ),
+        )
+    )
+    solver.step()
+    return solver
+
+
+def everything(solver: Solver) -> bytes:
+    """All there is to see of a solver and of what it keeps, to the bit."""
+    graph, blocks = solver._graph, solver._system.blocks
+    n, m, v, p, _, scalars = graph.counts.tolist()
+    return pickle.dumps(
+        [
+            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.var[:n], graph.fac[:m], graph.values[:v])],
+            [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size, blocks.table.nonzero()[0].size],
+            [a.tobytes() for a in (blocks.fill, blocks.rows, blocks.cols, blocks.offsets)],
+            [blocks.data[: blocks.fill[1]].tobytes(), blocks.eta[:scalars].tobytes()],
+            [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
+        ]
+    )
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_batches_are_refused_whole(name: str) -> None:
+    code, bad = REFUSED[name]
+    solver = small_map()
+    before = everything(solver)
+    good = Batch((poses(50),), (edge(1, 50),))
+    mixed = Batch(good.variables + bad.variables, good.factors + bad.factors)
+    for batch in (bad, mixed):
+        with pytest.raises(errors.SolverError) as caught:  # noqa: PT012
+            solver.stage(batch)
+            solver.step()
+        assert caught.value.code == code
+        assert caught.value.message
+        assert all(isinstance(value, (int, float, str, list)) for value in caught.value.detail.values())
+        assert everything(solver) == before
+    solver.stage(good)
+    solver.step()
+    assert solver.variable_count == 5
+
+
+def test_every_code_is_in_the_table() -> None:
+    codes = {error.code for error in errors.SolverError.__subclasses__()}
+    assert codes - {"unknown_mode"} == {code for code, _ in REFUSED.values()}
+
+
+@pytest.mark.parametrize("position", range(6))
+def test_one_bad_row_among_many_refuses_all_of_them(position: int) -> None:
+    solver = small_map()
+    before = everything(solver)
+    z = np.ones((6, 3))
+    z[position, 1] = np.nan
+    with pytest.raises(errors.NotFinite, match="between_se2"):
+        solver.stage(Batch((), (Factors("between_se2", np.array([[0, 1]] * 6), z, np.repeat(I3, 6, 0)),)))
+    assert everything(solver) == before
+
+
+def test_read_only_and_strided_arrays_are_taken() -> None:
+    def awkward(array: np.ndarray) -> np.ndarray:
+        twice = np.repeat(array, 2, axis=0)[::2]
+        twice.flags.writeable = False
+        return twice
+
+    plain, other = Solver(), Solver()
+    for batch in random_steps(1, steps=3):
+        plain.stage(batch)
+        other.stage(
+            Batch(
+                tuple(
+                    Variables(v.kind, awkward(v.keys), None if v.values is None else awkward(v.values), v.fixed)
+                    for v in batch.variables
+                ),
+                tuple(
+                    Factors(f.kind, awkward(f.keys), awkward(f.measured), awkward(f.information)) for f in batch.factors
+                ),
+            )
+        )
+    plain.step()
+    other.step()
+    assert everything(plain) == everything(other)
+
+
+def test_keys_print_as_symbols_in_messages() -> None:
+    x12 = ord("x") << 56 | 12
+    with pytest.raises(errors.UnknownVariable, match=r"between_se2 \(x12, 1\): there is no variable x12"):
+        small_map().stage(Batch((), (edge(x12, 1),)))
+
+
+def test_angles_are_wrapped_and_quaternions_made_unit() -> None:
+    solver = small_map()
+    nearly = IDENTITY * 1.0001
+    solver.stage(
+        Batch(
+            (
+                Variables("se2", np.array([7]), np.array([[0, 0, 3 * np.pi]]), fixed=True),
+                Variables("se3", np.array([8]), nearly, fixed=True),
+            )
+        )
+    )
+    values = {int(key): v for g in solver.estimate() for key, v in zip(g.keys, g.values, strict=True)}
+    assert -np.pi <= values[7][2] < np.pi
+    assert np.linalg.norm(values[8][3:]) == pytest.approx(1.0, abs=1e-15)
