@@ -29,9 +29,11 @@ demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as
 	@$(BIN)/factorbus demo $(ARGS)
 
 test: $(READY) ## the tests
+	@$(BIN)/factorbus warm
 	$(BIN)/python -m pytest -m "not data" $(ARGS)
 
 test-data: $(READY) ## the long tests on the public data sets (FACTORBUS_DATASETS)
+	@$(BIN)/factorbus warm
 	$(BIN)/python -m pytest -m data $(ARGS)
 
 lint: $(READY) ## ruff, pyright, import contracts

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import IO
 
 from factorbus.cli.exits import Stopped
+from factorbus.proto.problems import Unavailable
 
 READY = "ready "
 _STOP_S = 20.0
@@ -56,7 +57,7 @@ class Child:
         except queue.Empty:
             raise Stopped("child_silent", f"the {self.name} process said nothing for {timeout_s:g} s") from None
         if line is None:
-            raise self._died()
+            raise self.died()
         return line.rstrip("\n")
 
     def ready(self, timeout_s: float) -> list[str]:
@@ -73,12 +74,28 @@ class Child:
         except subprocess.TimeoutExpired:
             raise Stopped("child_silent", f"the {self.name} process did not end within {timeout_s:g} s") from None
         if code != 0:
-            raise self._died()
+            raise self.died()
         return "".join(iter(self._lines.get, None))
 
     def ended(self) -> bool:
         """Whether it has ended, well or not."""
         return self._process.poll() is not None
+
+    def when_ended(self, act: Callable[[], None]) -> None:
+        """Call `act`, on a thread of its own, when it ends."""
+
+        def watch() -> None:
+            self._process.wait()
+            act()
+
+        threading.Thread(target=watch, daemon=True).start()
+
+    def died(self) -> Stopped:
+        """How it ended, and the last that it said."""
+        code = self._process.wait(_STOP_S)
+        self._readers[1].join(_STOP_S)
+        last = next((line for line in reversed(self._said) if line.strip()), "nothing")
+        return Stopped("child_failed", f"the {self.name} process ended with exit code {code}; it said: {last}")
 
     def stop(self) -> None:
         """Close its standard input and wait; what does not go by itself is made to."""
@@ -108,12 +125,6 @@ class Child:
             if self._say is not None and time.monotonic() - self._started > _LONG_S:
                 self._say(self._said[-1])
 
-    def _died(self) -> Stopped:
-        code = self._process.wait(_STOP_S)
-        self._readers[1].join(_STOP_S)
-        last = next((line for line in reversed(self._said) if line.strip()), "nothing")
-        return Stopped("child_failed", f"the {self.name} process ended with exit code {code}; it said: {last}")
-
 
 @contextmanager
 def child(name: str, *arguments: str, say: Callable[[str], None] | None = None) -> Iterator[Child]:
@@ -131,10 +142,17 @@ def service(
 ) -> Iterator[tuple[Child, str]]:
     """A solver process of our own on a free port of this machine, and its endpoint.
 
+    Where the process ends meanwhile, an Unavailable that follows from it is turned into a Stopped that says so.
     say gets what it tells while it starts, if that takes long.  timeout_s allows for compiling every kernel.
     """
     with child("solver", "serve", "--listen", "tcp/127.0.0.1:0", "--until-eof", *options, say=say) as process:
-        yield process, process.ready(timeout_s)[0]
+        endpoint = process.ready(timeout_s)[0]
+        try:
+            yield process, endpoint
+        except Unavailable:
+            if process.ended():
+                raise process.died() from None
+            raise
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.exits import input_file
 from factorbus.cli.options import file_argument
 from factorbus.cli.screen import note
 
@@ -25,8 +24,7 @@ def command(source: Path, target: Path) -> None:
         raise click.BadParameter(f"{target} does not end in {' or '.join(_WRITES)}", param_hint="TARGET")
     from factorbus.formats import read, write_g2o, write_tum
 
-    with input_file(source):
-        graph = read(source)
+    graph = read(source)
     for text in graph.notes:
         note(f"{source}: {text}")
     (write_g2o if target.suffix == ".g2o" else write_tum)(target, graph.batch)

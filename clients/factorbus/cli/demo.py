@@ -85,7 +85,7 @@ def demo(request: Request) -> dict[str, Any]:
             name: w.pid for name, w in zip(names, workers, strict=True)
         }
         note(f"on {endpoint}: " + ", ".join(f"{name} {pid}" for name, pid in processes.items()))
-        _look_on(request, robot, viewer)
+        _look_on(request, solver, robot, viewer)
         driven = json.loads(robot.output(timeout_s=60))
         viewer.wait_for(driven["revision"])
         viewer.compare()
@@ -113,13 +113,15 @@ def demo(request: Request) -> dict[str, Any]:
     return result
 
 
-def _look_on(request: Request, robot: Any, viewer: Any) -> None:
-    """Show how far the robot is, from what arrives here, and have the map compared now and then."""
+def _look_on(request: Request, solver: Any, robot: Any, viewer: Any) -> None:
+    """Show how far the robot is, from what arrives here, and have the map compared now and then.  Raises Stopped."""
     from factorbus.cli.screen import progress
 
     every, asked = max(request.poses // _COMPARISONS, 1), 0
     with progress("the robot drives", request.poses) as show:
         while not robot.ended():
+            if solver.ended():
+                raise solver.died()
             revision = viewer.await_news(timeout_s=0.2)
             show(revision, _word(viewer))
             if revision // every > asked and revision < request.poses:

@@ -11,6 +11,7 @@ from factorbus.cli.drive import Compared, Stepped
 from factorbus.client import Map, Ticket
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
 
+# A step of a large map may take long; a service that is gone is noticed otherwise.
 _ANSWER_S = 600.0
 
 
@@ -32,24 +33,24 @@ class RemoteMap:
         """Insert, waiting with a window of 1; otherwise with up to `window` inserts out."""
         if self._window == 1:
             start = time.perf_counter()
-            accepted = self._map.insert(batch)
-            self._mirror.wait_for(accepted.revision)
+            accepted = self._map.insert(batch, timeout_s=_ANSWER_S)
+            self.wait_for(accepted.revision)
             return [_stepped(accepted, time.perf_counter() - start)]
-        self._out.append(self._map.send(batch))
+        self._out.append(self._map.send(batch, timeout_s=_ANSWER_S))
         return self._collect(wait=False)
 
     def flush(self) -> list[Stepped]:
         """Until all are answered and mirrored."""
         steps = self._collect(wait=True)
         if steps:
-            self._mirror.wait_for(steps[-1].revision)
+            self.wait_for(steps[-1].revision)
         return steps
 
     def settle(self) -> Stepped:
         """Iterate until converged."""
         start = time.perf_counter()
-        accepted = self._map.settle()
-        self._mirror.wait_for(accepted.revision)
+        accepted = self._map.settle(timeout_s=_ANSWER_S)
+        self.wait_for(accepted.revision)
         return _stepped(accepted, time.perf_counter() - start)
 
     def compare(self) -> None:
@@ -68,11 +69,11 @@ class RemoteMap:
 
     def graph(self) -> Batch:
         """The map's graph, from the service."""
-        return self._map.graph().batch
+        return self._map.graph(timeout_s=_ANSWER_S).batch
 
     def account(self) -> dict[str, Any]:
         """What the service says of itself, and the deltas that came here."""
-        stats = self._map.stats()
+        stats = self._map.stats(timeout_s=_ANSWER_S)
         return {
             "solver_cpu_s": stats["solver_cpu_s"],
             "kernels_compiled_s": stats["kernels_compiled_s"],
@@ -91,7 +92,7 @@ class RemoteMap:
 
     def wait_for(self, revision: int) -> None:
         """Until the estimate of `revision` is here."""
-        self._mirror.wait_for(revision)
+        self._mirror.wait_for(revision, timeout_s=_ANSWER_S)
 
     def await_news(self, timeout_s: float) -> int:
         """Wait for a delta, or until time is up; gives the revision that the estimate here is of."""

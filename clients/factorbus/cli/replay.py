@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.exits import Stopped, input_file, lacking, require
+from factorbus.cli.exits import REFUSED, Stopped, lacking, require
 from factorbus.cli.options import MODES, file_argument, json_option, out_option
 
 
@@ -19,6 +19,7 @@ class Request:
     file: Path
     in_process: bool
     connect: str | None
+    wait_s: float
     map_name: str
     mode: str
     every: int
@@ -41,6 +42,15 @@ class Request:
 @file_argument("file")
 @click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
 @click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
+@click.option(
+    "--wait",
+    "wait_s",
+    type=click.FloatRange(0),
+    default=10,
+    show_default=True,
+    metavar="S",
+    help="For ENDPOINT to answer.",
+)
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
 @click.option("--mode", type=click.Choice(MODES), default="auto", show_default=True, help="How the map is solved.")
 @click.option(
@@ -96,8 +106,7 @@ def replay(request: Request) -> dict[str, Any]:
 
     if request.plot:
         require("viz", "--plot")
-    with input_file(request.file):
-        graph = read(request.file)
+    graph = read(request.file)
     for text in graph.notes:
         screen.note(f"{request.file}: {text}")
     steps = graph.steps(use_values=request.use_values)
@@ -147,19 +156,23 @@ def _target(request: Request) -> Iterator[Any]:
 
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        endpoint = request.connect
+        endpoint, solver = request.connect, None
         if endpoint is None:
             require("service", "factorbus replay without --connect")
-            _, endpoint = stack.enter_context(service(say=note))
+            solver, endpoint = stack.enter_context(service(say=note))
+            note(f"solver process {solver.pid} on {endpoint}")
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
-        bus = stack.enter_context(connect(endpoint, client="replay"))
+        bus = stack.enter_context(connect(endpoint, client="replay", timeout_s=request.wait_s))
+        if solver is not None:
+            solver.when_ended(bus.close)
         joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))
         if joined.estimate.revision > 0:
             raise Stopped(
                 "map_not_empty",
                 f"map {request.map_name!r} is at revision {joined.estimate.revision} already; "
                 "a replay needs an empty one: give another --map",
+                REFUSED,
                 map=request.map_name,
             )
         target = RemoteMap(joined, request.window)

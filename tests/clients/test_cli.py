@@ -1,0 +1,202 @@
+"""The command line: what it says, how it ends, and how quickly it is there."""
+
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from factorbus.cli.exits import (
+    BAD_FILE,
+    FAILED,
+    INTERRUPTED,
+    OK,
+    REFUSED,
+    UNAVAILABLE,
+    USAGE,
+    Stopped,
+    lacking,
+    report,
+    require,
+)
+from factorbus.cli.main import COMMANDS, main
+from factorbus.proto.problems import BadName, Refused, Unavailable
+
+FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
+
+
+def factorbus(*arguments: str, folder: Path | None = None) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([FACTORBUS, *arguments], cwd=folder, capture_output=True, text=True, timeout=100, check=False)
+
+
+def test_help_names_every_command_without_importing_any() -> None:
+    program = "import sys; from factorbus.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=True)
+    for name, (module, line) in COMMANDS.items():
+        assert (f"  {name} " in ran.stdout) == bool(line)
+        assert f"factorbus.cli.{module}" not in ran.stderr.split()
+    assert not {"numpy", "zenoh", "rich", "numba", "msgpack", "scipy"} & set(ran.stderr.split())
+
+
+def test_help_is_there_in_less_than_0_4_seconds_of_cpu() -> None:
+    def once() -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert factorbus("--help").returncode == OK
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    assert min(once() for _ in range(5)) < 0.4
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_with_a_real_command_in_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([name, "--help"]) == OK
+    text = capsys.readouterr().out
+    if COMMANDS[name][1]:
+        assert re.search(rf"^  factorbus {name}\b", text, re.M)
+    assert max(len(line) for line in text.splitlines()) <= 120
+
+
+def test_version_names_the_libraries() -> None:
+    said = factorbus("version").stdout
+    assert re.match(r"factorbus \d+\.\d+\.\d+\n", said)
+    assert re.search(r"^  eclipse-zenoh +1\.", said, re.M)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["frobnicate"], USAGE, "there is no command 'frobnicate'; wanted one of demo, serve"),
+        (["replay"], USAGE, "Missing argument 'FILE'"),
+        (["replay", "a.g2o", "--in-process", "--connect", "tcp/127.0.0.1:1"], USAGE, "exclude each other"),
+        (["replay", "a.g2o", "--out", "nowhere/b.g2o"], USAGE, "there is no folder nowhere; make it first"),
+        (
+            ["replay", "missing.g2o", "--in-process"],
+            BAD_FILE,
+            "missing.g2o: it cannot be read (No such file or directory)",
+        ),
+        (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
+        (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--wait", "0.1"], UNAVAILABLE, "[unavailable]"),
+        (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
+        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o or .tum"),
+        (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
+        (["simulate", "manhattan"], USAGE, "there is nothing to write"),
+        (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
+        (["serve", "--config", "missing.toml"], BAD_FILE, "missing.toml cannot be read"),
+        (["serve", "--config", "wrong.toml"], USAGE, "'lisen' is not a setting"),
+        (["work", "--no-warm", "--connect", "nonsense"], USAGE, "[bad_config]"),
+    ],
+)
+def test_ends_with_the_code_and_one_line_that_says_why(
+    arguments: list[str], code: int, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "one.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    (tmp_path / "broken.g2o").write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 zero 1 0 0 1 0 1\n")
+    (tmp_path / "wrong.toml").write_text('lisen = ["tcp/127.0.0.1:0"]\n')
+    ran = factorbus(*arguments, folder=tmp_path)
+    assert (ran.returncode, ran.stdout) == (code, ""), ran.stderr
+    assert said in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+def test_with_json_a_failure_is_one_document_too(tmp_path: Path) -> None:
+    ran = factorbus("replay", "missing.g2o", "--json", folder=tmp_path)
+    assert ran.returncode == BAD_FILE
+    problem = json.loads(ran.stdout)["problem"]
+    assert problem["code"] == "bad_file"
+    assert problem["detail"] == {"file": "missing.g2o", "line": None}
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    ran = factorbus("--debug", "replay", "missing.g2o", folder=tmp_path)
+    assert ran.returncode == BAD_FILE
+    assert "Traceback" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (Unavailable("x", 1.0, "y"), UNAVAILABLE),
+        (Refused("not_finite", "a NaN", {}), REFUSED),
+        (Refused("shutting_down", "bye", {}), UNAVAILABLE),
+        (BadName("map", "a/b"), USAGE),
+        (Stopped("any", "text", BAD_FILE), BAD_FILE),
+        (ValueError("text"), FAILED),
+    ],
+)
+def test_errors_lead_to_codes(error: Exception, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(error, as_json=False, debug=False) == code
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith("factorbus: ")
+    assert shown.err.count("\n") == 1
+
+
+def test_interrupted_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("factorbus.cli.main.cli.main", interrupt)
+    assert main(["doctor"]) == INTERRUPTED
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_a_missing_extra_is_named_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "numba" else object())
+    assert lacking("service") == ["numba"]
+    require("viz", "a picture")
+    with pytest.raises(Stopped, match=r"factorbus serve needs numba.*pip install 'factorbus\[service\]'"):
+        require("service", "factorbus serve")
+
+
+def test_simulate_writes_what_convert_and_read_understand(tmp_path: Path) -> None:
+    from factorbus.formats import read
+
+    made = factorbus("simulate", "city-trees", "--poses", "300", "--out", "c.g2o", "--truth", "c.tum", folder=tmp_path)
+    assert (made.returncode, made.stdout) == (OK, ""), made.stderr
+    graph = read(tmp_path / "c.g2o")
+    assert graph.poses == 300
+    assert graph.landmarks > 0
+    assert len((tmp_path / "c.tum").read_text().splitlines()) == 300
+    again = factorbus("convert", "c.g2o", "d.g2o", folder=tmp_path)
+    assert again.returncode == OK, again.stderr
+    assert (tmp_path / "d.g2o").read_text() == (tmp_path / "c.g2o").read_text()
+
+
+def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [FACTORBUS, "doctor", "--json"],
+        env=os.environ | {"FACTORBUS_CACHE": str(tmp_path)},
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    found = json.loads(ran.stdout)
+    checks = {each["name"]: each for each in found["checks"]}
+    assert found["healthy"], checks
+    assert ran.returncode == OK
+    assert set(checks) == {
+        "python", "libraries", "cholmod", "kernel cache", "machine", "clock", "shared memory", "port", "bus",
+    }  # fmt: skip
+    assert checks["kernel cache"]["state"] == "warn"
+    assert checks["kernel cache"]["mend"] == "factorbus warm compiles ahead"
+    assert "CHOLMOD" in checks["cholmod"]["seen"]
+    assert "answers on loopback" in checks["bus"]["seen"]
+
+
+def test_doctor_fails_where_kernels_cannot_be_kept(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    ran = subprocess.run(
+        [FACTORBUS, "doctor"],
+        env=os.environ | {"FACTORBUS_CACHE": str(tmp_path / "file")},
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert ran.returncode == FAILED
+    assert "make it writable, or set FACTORBUS_CACHE" in ran.stdout
+
+
+def test_warm_says_how_long(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["warm"]) == OK
+    assert re.search(r"kernels ready in \d+\.\d s", capfd.readouterr().out)

@@ -1,0 +1,88 @@
+"""`factorbus demo`: five processes, and what they say at the end."""
+
+import json
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorbus.cli.columns import merged, position_errors, positions
+from factorbus.cli.exits import FAILED, INTERRUPTED, OK
+from factorbus.proto.messages import Batch
+from factorbus.simulate import manhattan
+
+FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
+
+
+@pytest.mark.parametrize("world", ["manhattan", "city-trees", "sphere"])
+def test_every_steps_estimate_reaches_everybody_and_is_the_optimum(world: str, tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [FACTORBUS, "demo", "--world", world, "--poses", "300", "--seed", "4", "--json"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False,
+    )  # fmt: skip
+    assert ran.returncode == OK, ran.stderr
+    found = json.loads(ran.stdout)
+    assert (found["poses"], found["steps"], found["revision"]) == (300, 300, 300)
+    assert found["estimates_received"] == {"viewer": 300, "robot": 300}
+    assert found["every_estimate_received"] is True
+    assert (found["landmarks"] > 0) == (world == "city-trees") == (found["error_landmarks_m"] is not None)
+    assert len(found["against_batch"]) >= 2
+    assert found["against_batch"][-1]["revision"] == 300
+    assert found["chi2"] == pytest.approx(found["chi2_batch"], rel=1e-4)
+    assert found["chi2"] < found["chi2_initial"]
+    assert found["error_m"]["rms"] < found["error_odometry_m"]["rms"]
+    assert {each["worker"] for each in found["against_batch"]} <= {"worker1", "worker2"}
+    assert set(found["processes"]) == {"solver", "robot", "worker1", "worker2"}
+    assert len(set(found["processes"].values()) | {os.getpid()}) == 5
+    assert (tmp_path / found["plot"]).read_bytes().startswith(b"\x89PNG")
+    assert "300/300" in ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "whom", "code"),
+    [
+        (signal.SIGINT, "demo", INTERRUPTED),
+        (signal.SIGKILL, "demo", -signal.SIGKILL),
+        (signal.SIGKILL, "solver", FAILED),
+        (signal.SIGKILL, "robot", FAILED),
+    ],
+)
+def test_no_process_is_left_whoever_is_killed(number: int, whom: str, code: int, tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [FACTORBUS, "demo", "--poses", "100000"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        line = next(line for line in process.stderr if line.startswith("on tcp/"))
+        pids = {name: int(pid) for name, pid in re.findall(r"(\w+) (\d+)", line.partition(": ")[2])}
+        watched = {name: os.pidfd_open(pid) for name, pid in pids.items()}
+        os.kill(process.pid if whom == "demo" else pids[whom], number)
+        _, error = process.communicate(timeout=90)
+        for name, descriptor in watched.items():
+            assert select.select([descriptor], [], [], 30)[0], f"the {name} process is still there"
+            os.close(descriptor)
+    assert process.returncode == code, error
+    assert "Traceback" not in error
+    if code == FAILED:
+        assert f"the {whom} process ended with exit code -9" in error
+
+
+def test_errors_are_distances_of_the_variables_in_both() -> None:
+    truth = merged(_truths(20)).variables
+    assert positions(truth, ("se2",))[1].shape == (20, 2)
+    assert position_errors(truth, truth, ("se2",)).tolist() == [0.0] * 20
+    shorter = merged(_truths(10)).variables
+    moved = [replace(group, values=np.add(group.values, (3.0, 4.0, 0.0))) for group in shorter]
+    assert position_errors(moved, truth, ("se2",)).tolist() == pytest.approx([5.0] * 10)
+    assert position_errors(moved, truth, ("point2",)).size == 0
+
+
+def _truths(poses: int) -> list[Batch]:
+    return [Batch(step.truth) for step in manhattan(poses=poses, seed=1)]

@@ -1,0 +1,172 @@
+"""`factorbus replay`: the same file in this process and over the bus, and what is said and written about it."""
+
+import json
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+from factorbus.cli.children import service
+from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
+from factorbus.cli.main import main
+from factorbus.client import connect
+from factorbus.formats import read
+
+FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
+POSES = 250
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("worlds") / "town.g2o"
+    assert main(["simulate", "manhattan", "--poses", str(POSES), "--seed", "3", "--out", str(path)]) == OK
+    return path
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with service() as (_, endpoint):
+        yield endpoint
+
+
+@pytest.fixture(scope="module")
+def local(town: Path) -> dict[str, Any]:
+    return replayed(town, "--in-process", "--every", "100")
+
+
+def replayed(*arguments: "str | Path") -> dict[str, Any]:
+    """The document, which must be all there is on standard output."""
+    ran = subprocess.run(
+        [FACTORBUS, "replay", *map(str, arguments), "--json"], capture_output=True, text=True, timeout=100, check=False
+    )
+    assert ran.returncode == OK, ran.stderr
+    return json.loads(ran.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+def test_in_process(local: dict[str, Any], town: Path) -> None:
+    graph = read(town)
+    assert (local["poses"], local["landmarks"], local["factors"]) == (POSES, 0, graph.batch.factor_count)
+    assert local["steps"] == local["inserts"] == POSES
+    assert local["revision"] == POSES + 1
+    assert local["settled"]
+    assert local["mode"] == "all-batch"
+    assert sum(local["strategies"].values()) == POSES
+    assert local["strategies"]["all-batch"] > 10
+    for name in ("p50", "p95", "p99", "max"):
+        assert local["step_ms"][name] > 0
+    assert local["step_ms"]["p50"] <= local["step_ms"]["p95"] <= local["step_ms"]["p99"] <= local["step_ms"]["max"]
+    assert local["bus_ms"] is None
+    assert local["seconds"] > local["solver_cpu_s"] * 0.5 > 0
+    assert local["kernels_compiled_s"] >= 0
+    assert local["chi2"] <= local["chi2_unsettled"] < local["chi2_initial"]
+
+
+def test_chi2_along_the_drive_is_the_batch_optimum(local: dict[str, Any]) -> None:
+    assert [each["revision"] for each in local["against_batch"]] == [100, 200]
+    for each in local["against_batch"]:
+        assert each["ratio"] == pytest.approx(1.0, abs=1e-4)
+        assert each["ratio"] == each["chi2"] / each["batch"]
+
+
+def test_over_the_bus_it_ends_at_the_same_optimum(local: dict[str, Any], town: Path, tmp_path: Path) -> None:
+    out, tum, plot = tmp_path / "out.g2o", tmp_path / "out.tum", tmp_path / "out.png"
+    bus = replayed(town, "--every", "100", "--out", out, "--tum", tum, "--plot", plot)
+    assert bus["chi2"] == pytest.approx(local["chi2"], rel=1e-12)
+    assert bus["chi2_initial"] == local["chi2_initial"]
+    for name in ("poses", "landmarks", "factors", "steps", "inserts", "revision", "mode", "strategies", "settled"):
+        assert bus[name] == local[name], name
+    assert bus["deltas"] == bus["revision"]
+    assert set(bus["bus_ms"]) == {"p50", "p95", "p99", "max"}
+    assert bus["bus_ms"]["p50"] > 0
+    assert bus["solver_cpu_s"] > 0
+    assert [each["revision"] for each in bus["against_batch"]] == [100, 200]
+    assert {each["worker"] for each in bus["against_batch"]} == {"worker1"}
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert len(tum.read_text().splitlines()) == POSES
+    again = replayed(out, "--in-process", "--use-values")
+    assert again["chi2_initial"] == pytest.approx(bus["chi2"], rel=1e-9)
+
+
+def test_into_a_running_service_with_inserts_in_flight(endpoint: str, local: dict[str, Any], town: Path) -> None:
+    windowed = replayed(town, "--connect", endpoint, "--map", "windowed", "--window", "16")
+    assert windowed["inserts"] == POSES
+    assert windowed["steps"] <= POSES
+    assert windowed["revision"] == windowed["steps"] + 1 == windowed["deltas"]
+    assert windowed["chi2"] == pytest.approx(local["chi2"], rel=1e-6)
+
+
+def test_a_map_that_is_not_empty_is_refused(endpoint: str, town: Path) -> None:
+    first = replayed(town, "--connect", endpoint, "--map", "once", "--no-settle")
+    assert first["revision"] == POSES
+    assert first["chi2"] == first["chi2_unsettled"]
+    ran = subprocess.run(
+        [FACTORBUS, "replay", str(town), "--connect", endpoint, "--map", "once", "--json"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert ran.returncode == REFUSED
+    assert json.loads(ran.stdout)["problem"]["code"] == "map_not_empty"
+    assert f"revision {POSES} already" in ran.stderr
+
+
+def test_what_a_person_sees(town: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(town), "--in-process"]) == OK
+    shown = capfd.readouterr()
+    assert f"{POSES} poses, 0 landmarks" in shown.out
+    assert "p99" in shown.out
+    assert f"{POSES}/{POSES}" in shown.err
+
+
+def test_intel_ends_at_the_reference_optimum(datasets: Path) -> None:
+    found = replayed(datasets / "intel.g2o")
+    assert found["chi2"] == pytest.approx(546.46111, rel=1e-6)
+    assert found["chi2_initial"] == pytest.approx(205887.287, rel=1e-6)
+    assert (found["poses"], found["factors"]) == (943, 1837)
+
+
+@pytest.mark.parametrize(
+    ("number", "whom", "code", "said"),
+    [
+        (signal.SIGINT, "parent", INTERRUPTED, "interrupted"),
+        (signal.SIGTERM, "parent", INTERRUPTED, "interrupted"),
+        (signal.SIGKILL, "parent", -signal.SIGKILL, ""),
+        (signal.SIGKILL, "solver", FAILED, "the solver process ended with exit code -9"),
+    ],
+)
+def test_no_process_is_left_whoever_is_killed(number: int, whom: str, code: int, said: str, long_drive: Path) -> None:
+    with subprocess.Popen(
+        [FACTORBUS, "replay", str(long_drive)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        pid, endpoint = announced(process.stderr)
+        solver = os.pidfd_open(pid)
+        with connect(endpoint, client="watcher", timeout_s=60) as bus, bus.map("replay") as watched:
+            watched.estimate.wait_for(100, timeout_s=60)
+            os.kill(process.pid if whom == "parent" else pid, number)
+        _, error = process.communicate(timeout=60)
+        assert select.select([solver], [], [], 60)[0], "the solver process is still there"
+        os.close(solver)
+    assert process.returncode == code, error
+    assert said in error
+    assert "Traceback" not in error
+
+
+@pytest.fixture(scope="module")
+def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("worlds") / "long.g2o"
+    assert main(["simulate", "manhattan", "--poses", "20000", "--out", str(path)]) == OK
+    return path
+
+
+def announced(lines: IO[str]) -> tuple[int, str]:
+    """(pid, endpoint) from the line that says so."""
+    for line in lines:
+        if found := re.search(r"solver process (\d+) on (\S+)", line):
+            return int(found[1]), found[2]
+    pytest.fail("the replay did not say where its solver process is")
