@@ -91,7 +91,7 @@ def test_a_pose_in_space_needs_three_points_off_a_line() -> None:
                 (
                     Variables("se3", np.array([0])),
                     Variables("point3", keys, points),
-                    Variables("se3", np.array([1]), origin + [[0.01, 0.02, 0, 0, 0, 0, 0]]),
+                    Variables("se3", np.array([1]), origin + np.eye(7)[:1] * 0.01),
                 ),
                 (Factors("prior_se3", np.array([[0]]), origin, I6), *sights),
             )

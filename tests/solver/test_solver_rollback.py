@@ -62,7 +62,7 @@ def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 200))
 def test_a_failure_anywhere_within_a_step_is_taken_back(seed: int, cut: int) -> None:
-    """The clock is called throughout a step, so a clock that fails interrupts it at any point, also after values moved."""
+    """The clock is called throughout a step, so a clock that fails interrupts it anywhere."""
 
     class Interrupted(Exception):
         pass
