@@ -6,6 +6,7 @@ measurement z has the Jacobians −Ad(z⁻¹) and I, and a landmark those of a r
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,7 @@ def grid(side: int, dim: int = 3) -> BlockSystem:
     return from_edges([dim] * side**2, edges)
 
 
+@cache
 def from_g2o(path: Path) -> BlockSystem:
     """The system of a g2o file with vertex 0 held fixed."""
     edges: list[Edge] = []

@@ -182,6 +182,28 @@ def test_vectors_of_another_length_are_refused():
         Cholesky().solve(np.ones(1))
 
 
+def test_blocks_outside_the_data_are_refused():
+    system = grid(2)
+    symbolic = analysis(system)
+    for data, offsets, what in (
+        (system.data[:-1], system.offsets, "reach from 0 to"),
+        (system.data, system.offsets - 1, "reach from -1"),
+        (system.data, system.offsets[1:], "7 offsets for the 8 blocks"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            KEPT.factorize(symbolic, data, offsets)
+
+
+def test_arrays_that_may_not_be_written_are_taken():
+    system = grid(3)
+    for array in (system.dims, system.rows, system.cols, system.data, system.offsets):
+        array.flags.writeable = False
+    cholesky, symbolic = factorized(system)
+    eta = np.ones(symbolic.size)
+    eta.flags.writeable = False
+    np.testing.assert_allclose(system.sparse() @ cholesky.solve(eta), eta, atol=1e-9)
+
+
 def test_no_variables():
     cholesky, symbolic = factorized(random_system(0, [], []))
     assert symbolic.nnz_r == 0

@@ -81,6 +81,23 @@ def test_no_variables():
     assert order(nothing, nothing, nothing).shape == (0,)
 
 
+@pytest.mark.parametrize(
+    ("dims", "rows", "cols", "group", "what"),
+    [
+        ([3, 0], [0], [1], None, "at least one"),
+        ([3, 3], [0, 1], [1], None, "one of each"),
+        ([3, 3], [0], [2], None, "only 0 to 1"),
+        ([3, 3], [-1], [1], None, "only 0 to 1"),
+        ([3, 3], [0], [1], [0], "2 of 0 or more"),
+        ([3, 3], [0], [1], [0, -1], "2 of 0 or more"),
+        ([[3, 3]], [0], [1], None, "one-dimensional"),
+    ],
+)
+def test_what_the_kernel_could_not_survive_is_refused(dims, rows, cols, group, what):
+    with pytest.raises(ValueError, match=what):
+        order(np.array(dims), np.array(rows), np.array(cols), None if group is None else np.array(group))
+
+
 def fill(system: BlockSystem) -> int:
     return analyze(system.dims, system.rows, system.cols, ordered(system)).nnz_r
 

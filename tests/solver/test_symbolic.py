@@ -126,6 +126,18 @@ def test_hardly_anything(dims):
     assert len(symbolic.fronts) == len(dims)
 
 
+@pytest.mark.parametrize("perm", [[0], [0, 0], [0, 2], [-1, 0], [0, 1, 2]])
+def test_an_order_that_is_no_permutation_is_refused(perm):
+    system = random_system(0, [3, 2], [(0, 1)])
+    with pytest.raises(ValueError, match="not a permutation of 0 to 1"):
+        analyze(system.dims, system.rows, system.cols, np.array(perm))
+
+
+def test_a_missing_diagonal_block_is_refused():
+    with pytest.raises(ValueError, match="variable 1 has no diagonal block"):
+        analyze(np.array([3, 2]), np.array([0, 0]), np.array([0, 1]), np.array([0, 1]))
+
+
 def border_of(symbolic: Symbolic, front: np.ndarray) -> np.ndarray:
     return symbolic.border[front[fr.BORDER_AT] : front[fr.BORDER_AT] + front[fr.BORDER]]
 

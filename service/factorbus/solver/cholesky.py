@@ -8,6 +8,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.backsub import into_elimination_order, into_insertion_order, solve_lower, solve_upper
 from factorbus.solver.kernels.multifrontal import factorize
+from factorbus.solver.ordering import integers
 from factorbus.solver.symbolic import Symbolic
 
 _LINE = 8  # doubles in a cache line
@@ -25,9 +26,11 @@ class Cholesky:
 
         Gives -1, or the variable whose pivot is not above `PIVOT_TOLERANCE` of its diagonal entry in Λ (or not a
         number): Λ is not positive definite there, or singular as far as doubles can tell.  Then there is no factor
-        until the next successful call.
+        until the next successful call.  Raises ValueError when a block lies outside `data`.
         """
         self._symbolic = None
+        data, offsets = np.require(data, float, ("C", "W")), integers(offsets)
+        _check_blocks(symbolic, data, offsets)
         self._reserve(symbolic)
         failed = factorize(
             symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors
@@ -44,7 +47,7 @@ class Cholesky:
     def forward(self, eta: F64) -> F64:
         """d = R⁻ᵀPη, in elimination order."""
         symbolic, d = self._of(eta), np.empty(len(eta))
-        into_elimination_order(symbolic.place, symbolic.starts, symbolic.dims, np.ascontiguousarray(eta, float), d)
+        into_elimination_order(symbolic.place, symbolic.starts, symbolic.dims, np.array(eta, float), d)
         solve_lower(symbolic.fronts, symbolic.border, self._arena, d, self._room)
         return d
 
@@ -86,6 +89,14 @@ class Cholesky:
         self._arena = _grown(self._arena, symbolic.arena)
         self._floors = _grown(self._floors, symbolic.size)
         self._room = _grown(self._room, symbolic.widest)
+
+
+def _check_blocks(symbolic: Symbolic, data: F64, offsets: I64) -> None:
+    if len(offsets) != len(symbolic.areas):
+        raise ValueError(f"{len(offsets)} offsets for the {len(symbolic.areas)} blocks of the analysed pattern")
+    least, end = offsets.min(initial=0), (offsets + symbolic.areas).max(initial=0)
+    if least < 0 or end > data.size or data.ndim != 1:
+        raise ValueError(f"blocks reach from {least} to {end} in data of shape {data.shape}")
 
 
 def _grown(arena: F64, need: int) -> F64:

@@ -7,6 +7,7 @@ import numpy as np
 from factorbus.solver.kernels._jit import I64
 from factorbus.solver.kernels.fronts import BORDER
 from factorbus.solver.kernels.symbolic import analyze_pattern
+from factorbus.solver.ordering import checked_pattern, integers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,7 +17,7 @@ class Symbolic:
     order (n,): the variable eliminated k-th (fill and constraints as in the given order, fronts in postorder).
     place (n,): first scalar of each variable in elimination order.  starts (n + 1,): in insertion order.
     nnz_r: structural scalar nonzeros of R.  flops: to factorise, the sum of squared row lengths of R.
-    widest: scalars of the longest border.
+    areas (nb,): numbers in each block.  widest: scalars of the longest border.
     stored: doubles that hold R, with padding and the zeros of joined fronts.  arena: those and the update matrices.
     """
 
@@ -28,6 +29,7 @@ class Symbolic:
     runs: I64
     border: I64
     blocks: I64
+    areas: I64
     widest: int
     stored: int
     arena: int
@@ -55,12 +57,41 @@ def analyze(dims: I64, rows: I64, cols: I64, perm: I64) -> Symbolic:
 
     dims (n,).  rows, cols (nb,): its blocks, rows[b] <= cols[b], each pair once, the diagonal ones present.
     perm (n,): a permutation, as `order` gives it.
+    Raises ValueError when an index is outside its range, a diagonal block is missing, or perm is no permutation.
     """
-    dims, rows, cols, perm = (np.ascontiguousarray(a, np.int64) for a in (dims, rows, cols, perm))
+    dims, rows, cols = checked_pattern(dims, rows, cols)
+    perm, diagonal = integers(perm), np.zeros(len(dims), bool)
+    diagonal[rows[rows == cols]] = True
+    if not diagonal.all():
+        raise ValueError(f"variable {int(diagonal.argmin())} has no diagonal block: each needs one")
+    if not is_permutation(perm, len(dims)):
+        raise ValueError(f"perm is not a permutation of 0 to {len(dims) - 1}")
     order, place, fronts, runs, border, blocks, sizes, work = analyze_pattern(dims, rows, cols, perm)
     starts = np.zeros(len(dims) + 1, np.int64)
     np.cumsum(dims, out=starts[1:])
-    widest = int(fronts[:, BORDER].max(initial=0))
     stored, arena = (int(size) for size in sizes)
-    nnz_r, flops = int(work[0]), float(work[1])
-    return Symbolic(dims, order, place, starts, fronts, runs, border, blocks, widest, stored, arena, nnz_r, flops)
+    return Symbolic(
+        dims,
+        order,
+        place,
+        starts,
+        fronts,
+        runs,
+        border,
+        blocks,
+        areas=dims[rows] * dims[cols],
+        widest=int(fronts[:, BORDER].max(initial=0)),
+        stored=stored,
+        arena=arena,
+        nnz_r=int(work[0]),
+        flops=float(work[1]),
+    )
+
+
+def is_permutation(perm: I64, n: int) -> bool:
+    """Whether perm holds each of 0 .. n - 1 once."""
+    if len(perm) != n or perm.min(initial=0) < 0 or perm.max(initial=-1) >= n:
+        return False
+    seen = np.zeros(n, bool)
+    seen[perm] = True
+    return bool(seen.all())

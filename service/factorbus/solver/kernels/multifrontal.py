@@ -23,8 +23,7 @@ def factorize(
         m, u, ldu = front[fr.BORDER], front[fr.UPDATE], front[fr.LD_UPDATE]
         clear_front(arena, r, ld, p, m, u, ldu)
         for b in range(front[fr.BLOCKS], front[fr.BLOCKS_END]):
-            block = blocks[b]
-            put_block(arena, block, ld, values, offsets[block[0]], 1.0 + damping)
+            put_block(arena, blocks, b, ld, values, offsets[blocks[b, 0]], 1.0 + damping)
         for i in range(p):
             floors[column + i] = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
         c = front[fr.CHILD]
@@ -50,9 +49,9 @@ def clear_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int) -> No
 
 
 @inline_kernel
-def put_block(a: F64, block: I64, ld: int, values: F64, source: int, on_diagonal: float) -> None:
+def put_block(a: F64, blocks: I64, b: int, ld: int, values: F64, source: int, on_diagonal: float) -> None:
     """Write a block of Λ into the front; `on_diagonal` multiplies the diagonal of a diagonal block."""
-    target, height, width, how = block[1], block[2], block[3], block[4]
+    target, height, width, how = blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 4]
     for i in range(height):
         if how == fr.TURNED:
             for j in range(width):

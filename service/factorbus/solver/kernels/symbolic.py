@@ -292,13 +292,13 @@ def _maps(
         front[fr.BLOCKS] = block
         for e in range(begin[first], begin[last]):
             b = block_of[e]
-            _block(blocks[block], b, label[rows[b]], label[cols[b]], dim, column, front)
+            _block(blocks, block, b, label[rows[b]], label[cols[b]], dim, column, front[fr.ROWS], front[fr.LD_ROWS])
             block += 1
         front[fr.BLOCKS_END] = block
         c = front[fr.CHILD]
         while c != NONE:
             records[c, fr.RUNS] = run
-            run = _runs(runs, run, border_of[border_at[c] : border_at[c + 1]], dim, column, front[fr.PIVOTS])
+            run = _runs(runs, run, border_of, border_at[c], border_at[c + 1], dim, column, front[fr.PIVOTS])
             records[c, fr.RUNS_END] = run
             c = records[c, fr.SIBLING]
     return runs[:run].copy(), blocks
@@ -321,25 +321,26 @@ def _by_earlier(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
 
 
 @inline_kernel
-def _block(out: I64, b: int, i: int, j: int, dim: I64, column: I64, front: I64) -> None:
+def _block(out: I64, at: int, b: int, i: int, j: int, dim: I64, column: I64, r: int, ld: int) -> None:
     """Block b of Λ, between the variables labelled i and j."""
     upper, later = min(i, j), max(i, j)
-    out[0] = b
-    out[1] = front[fr.ROWS] + column[upper] * front[fr.LD_ROWS] + column[later]
-    out[2], out[3] = dim[upper], dim[later]
-    out[4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
+    out[at, 0] = b
+    out[at, 1] = r + column[upper] * ld + column[later]
+    out[at, 2], out[at, 3] = dim[upper], dim[later]
+    out[at, 4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
 
 
 @inline_kernel
-def _runs(runs: I64, run: int, border: I64, dim: I64, column: I64, pivots: int) -> int:
+def _runs(runs: I64, run: int, border_of: I64, begin: int, end: int, dim: I64, column: I64, pivots: int) -> int:
     """Join neighbours of a child's border that stay neighbours in the parent; gives the next free run."""
-    first, end = 0, NONE
-    for v in border:
-        if column[v] == end and end != pivots:
+    first, stop = 0, NONE
+    for e in range(begin, end):
+        v = border_of[e]
+        if column[v] == stop and stop != pivots:
             runs[run - 1, 1] += dim[v]
         else:
             runs[run, 0], runs[run, 1], runs[run, 2] = first, dim[v], column[v]
             run += 1
-        end = column[v] + dim[v]
+        stop = column[v] + dim[v]
         first += dim[v]
     return run
