@@ -122,13 +122,20 @@ class Folder:
             raise Broken(self._broken)
         if isinstance(content, Problem):
             raise content
-        for what, count, more, limit in (
-            ("variables", self._solver.variable_count, content.batch.variable_count, self._limits.variables),
-            ("factors", self._solver.factor_count, content.batch.factor_count, self._limits.factors),
-        ):
-            if count + more > limit:
-                raise TooLarge("the map with this insert", count + more, limit, what)
+        self._check_room(insert.size, content.batch)
         return _Staged(insert, content, self._solver.stage(content.batch))
+
+    def _check_room(self, size: int, batch: Batch) -> None:
+        """Raises TooLarge when the map would grow over its limits."""
+        solver, limits = self._solver, self._limits
+        most = size // 8  # a key is eight bytes: without counting, no more than this can be in it
+        if solver.variable_count + most > limits.variables or solver.factor_count + most > limits.factors:
+            for what, count, more, limit in (
+                ("variables", solver.variable_count, batch.variable_count, limits.variables),
+                ("factors", solver.factor_count, batch.factor_count, limits.factors),
+            ):
+                if count + more > limit:
+                    raise TooLarge("the map with this insert", count + more, limit, what)
 
     def _stepped(
         self, staged: Sequence[_Staged], refused: Sequence[Outcome], report: Any, started: float
@@ -158,9 +165,13 @@ class Folder:
             yield told
 
     def _told(self, account: dict[str, Any]) -> Stepped:
-        """The solver's last step, with its delta."""
-        changed = as_variables(self._solver.changed())
-        delta = codec.encode_delta(Delta(self._epoch, self._revision, self._revision - 1, changed, account))
+        """The solver's last step, with its delta; what it takes to find out what changed is the solver's time, too."""
+        started = time.perf_counter()
+        changed = self._solver.changed()
+        account["solver_ms"] += (time.perf_counter() - started) * 1e3
+        delta = codec.encode_delta(
+            Delta(self._epoch, self._revision, self._revision - 1, as_variables(changed), account)
+        )
         return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
     def _fault(self) -> str:
