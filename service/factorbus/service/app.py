@@ -1,8 +1,8 @@
 """The service at work: what comes over the bus goes to the maps, what they want done is done.
 
     threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand over; never call Zenoh
-              solver <map>     folds and steps; sends small answers and deltas itself when none are queued
-              outbox           the other answers and publications, in order
+              solver <map>     folds and steps, and encodes what comes of it
+              outbox           answers to inserts, and publications, in order
               desk             large answers, maps that come and go, jobs for workers
               in-place jobs    batch optima when there is no worker
 
@@ -37,8 +37,6 @@ from factorbus.service.questions import Snapshot, answer
 
 log = logging.getLogger(__name__)
 
-# Up to here the solver's thread sends itself: one batch of the transport, no copying worth a thread switch.
-_SMALL = 16_384
 _TICK_S = 0.25
 _SENDERS = 4096
 
@@ -211,8 +209,8 @@ class Shell:
         core = MapCore(name, mode, secrets.randbits(62) | 1, self._config.limits, time.monotonic())
         folder = Folder(lambda: Solver(Options(mode=mode, clock=time.perf_counter)), core.epoch, self._config.limits)
 
-        def perform(effect: Effect, on_solver_thread: bool) -> None:
-            self._perform(made, effect, on_solver_thread)
+        def perform(effects: list[Effect]) -> None:
+            self._perform(made, effects)
 
         def answer_reads(reads: Sequence[Read], taken: Snapshot) -> None:
             self._desk.hand(self._answer_reads, made, reads, taken)
@@ -220,29 +218,28 @@ class Shell:
         made = _Map(Host(core, folder, perform, answer_reads), self._bus.place(name, self._service))
         return made
 
-    def _perform(self, found: _Map, effect: Effect, on_solver_thread: bool) -> None:
-        """Send now or queue.  Deltas keep their order: only the solver's thread sends them, and only past none."""
-        call: Callable[..., None]
-        arguments: tuple[Any, ...]
-        match effect:
-            case Answer(asker, message):
-                call, arguments = reply, (asker, message)
-            case Publish(channel, message):
-                call, arguments = found.place.publish, (channel, message)
-            case Refuse(asker, problem):
-                call, arguments, message = refuse, (asker, problem), b""
-            case Tell(asker, content):
-                self._desk.hand(self._tell, asker, content)
-                return
-            case Drained():
+    def _perform(self, found: _Map, effects: list[Effect]) -> None:
+        """Hand on what a map wants done: what is to be sent in one piece to the outbox, in order."""
+        sending: list[Effect] = []
+        for effect in effects:
+            if isinstance(effect, Tell):
+                self._desk.hand(self._tell, effect.asker, effect.content)
+            elif isinstance(effect, Drained):
                 found.on_drained()
-                return
-            case _:
-                raise TypeError(f"no such effect: {effect!r}")
-        if on_solver_thread and len(message) <= _SMALL and self._outbox.idle:
-            call(*arguments)
-        else:
-            self._outbox.hand(call, *arguments)
+            else:
+                sending.append(effect)
+        if sending:
+            self._outbox.hand(self._send, found.place, sending)
+
+    def _send(self, place: Place, effects: list[Effect]) -> None:
+        """On the outbox."""
+        for effect in effects:
+            if isinstance(effect, Answer):
+                reply(effect.asker, effect.message)
+            elif isinstance(effect, Publish):
+                place.publish(effect.channel, effect.message)
+            elif isinstance(effect, Refuse):
+                refuse(effect.asker, effect.problem)
 
     def _no_map(self, query: Asker, name: str) -> None:
         if self._config.connect:

@@ -75,8 +75,8 @@ class Folder:
     def fold(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
 
-        Yields answers as soon as they are known, so that the delta is made while they travel: Judged, then Stepped,
-        for every step; Folded at the end.
+        Yields, for every step, Judged (the answers, which stand whatever becomes of the delta) and Stepped; Folded at
+        the end.
         """
         try:
             yield from self._together(inserts)

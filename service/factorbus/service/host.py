@@ -21,8 +21,8 @@ from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
 
-# perform(effect, on_solver_thread); answer(reads, snapshot) turns snapshots into answers, elsewhere.
-Perform: TypeAlias = Callable[[Effect, bool], None]
+# What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
+Perform: TypeAlias = Callable[[list[Effect]], None]
 AnswerReads: TypeAlias = Callable[[Sequence[Read], Snapshot], None]
 
 
@@ -39,49 +39,49 @@ class Host:
 
     def created(self) -> None:
         """The map is on the bus."""
-        self._perform(self.core.created(), False)
+        self._perform(self.core.created())
 
     def insert(self, arrived: Arrived) -> None:
         """An insert came in."""
         with self._lock:
             effects = self.core.insert(arrived)
-        self._perform(effects, False)
+        self._perform(effects)
 
     def ask(self, asked: Asked) -> None:
         """A question came in."""
         with self._lock:
             effects = self.core.ask(asked, time.monotonic())
-        self._perform(effects, False)
+        self._perform(effects)
 
     def tick(self) -> None:
         """Time went by."""
         with self._lock:
             effects = self.core.tick(time.monotonic())
-        self._perform(effects, False)
+        self._perform(effects)
 
     def stop(self) -> None:
         """Take nothing new; Drained is performed when everything accepted is answered."""
         with self._lock:
             effects = self.core.stop(time.monotonic())
-        self._perform(effects, False)
+        self._perform(effects)
 
     def drop(self) -> None:
         """The map is to go; Drained is performed when the solver is done with what it has."""
         with self._lock:
             effects = self.core.drop(time.monotonic())
-        self._perform(effects, False)
+        self._perform(effects)
 
     def end(self) -> None:
         """End the solver's thread, which may still be sending its last delta; after Drained."""
         self._runs.put(None)
         self._thread.join()
 
-    def _perform(self, effects: list[Effect], on_solver_thread: bool) -> None:
-        for effect in effects:
-            if isinstance(effect, Run):
-                self._runs.put(effect)
-            else:
-                self._do(effect, on_solver_thread)
+    def _perform(self, effects: list[Effect]) -> None:
+        if effects and isinstance(run := effects[-1], Run):
+            self._runs.put(run)
+            effects = effects[:-1]
+        if effects:
+            self._do(effects)
 
     def _solve(self) -> None:
         try:
@@ -92,20 +92,22 @@ class Host:
             log.exception("fault %s: map %s has stopped", reference, self.core.name)
             with self._lock:
                 effects = self.core.failed(Internal(reference), time.monotonic())
-            self._perform(effects, True)
+            self._perform(effects)
 
     def _run(self, run: Run) -> None:
         if run.reads:
             self._read(run.reads)
+        effects: list[Effect] = []
         for event in self._folder.fold(run.inserts):
             with self._lock:
                 if isinstance(event, Judged):
+                    # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
+                    # measured: an answer sent before its delta is encoded makes the delta 0.2 ms later.
                     effects = self.core.judged(event)
-                elif isinstance(event, Stepped):
-                    effects = self.core.stepped(event)
-                else:
-                    effects = self.core.folded(event)
-            self._perform(effects, True)
+                    continue
+                effects += self.core.stepped(event) if isinstance(event, Stepped) else self.core.folded(event)
+            self._perform(effects)
+            effects = []
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:
@@ -120,6 +122,4 @@ class Host:
             self._answer(reads, taken)
 
     def _refuse(self, reads: Sequence[Read], problem: Exception) -> None:
-        for read in reads:
-            if read.asker is not None:
-                self._do(Refuse(read.asker, problem), True)
+        self._do([Refuse(read.asker, problem) for read in reads if read.asker is not None])

@@ -14,21 +14,12 @@ class Lane:
 
     def __init__(self, name: str) -> None:
         self._calls: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
-        self._handed = self._done = 0
-        self._count = threading.Lock()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    @property
-    def idle(self) -> bool:
-        """Everything handed in so far is done."""
-        return self._handed == self._done
-
     def hand(self, call: Callable[..., None], *arguments: Any) -> None:
         """Have `call(*arguments)` run after all that was handed in before.  Never blocks."""
-        with self._count:
-            self._handed += 1
-            self._calls.put((call, arguments))
+        self._calls.put((call, arguments))
 
     def close(self) -> None:
         """Return when all that was handed in is done and the thread has ended."""
@@ -44,5 +35,4 @@ class Lane:
                 # One answer that cannot be given must not silence the lane for all others.
                 log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
             finally:
-                item = call = arguments = None
-                self._done += 1
+                item = call = arguments = None  # a query kept alive keeps its asker waiting
