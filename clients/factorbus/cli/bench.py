@@ -11,11 +11,12 @@ from factorbus.cli.exits import FAILED, OK, Stopped
 from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
-BENCHES = ("cholesky", "bus")
+BENCHES = ("cholesky", "bus")  # what `all` runs, a minute or two
+LONG = ("paper",)  # hours; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("name", type=click.Choice([*BENCHES, "all"]), default="all")
+@click.argument("name", type=click.Choice([*BENCHES, *LONG, "all"]), default="all")
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
 @json_option
 def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
@@ -24,13 +25,16 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     \b
     cholesky   block Cholesky of real systems against CHOLMOD, same matrix and ordering
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
-    all        all of them
+    paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
+               goes on where it was stopped; --quick: two minutes
+    all        cholesky and bus
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
     the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.
 
     \b
     factorbus bench cholesky
+    factorbus bench paper --quick
     factorbus bench all --json > bench.json
     """
     folder = _folder()
@@ -58,7 +62,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
 def _folder() -> Path:
     """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
     folder = Path(__file__).resolve().parents[3] / "tests" / "bench"
-    if not all((folder / f"{name}.py").is_file() for name in BENCHES):
+    if not all((folder / f"{name}.py").is_file() for name in (*BENCHES, *LONG)):
         raise Stopped(
             "no_repository",
             "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",

@@ -1,0 +1,221 @@
+"""The evaluation of the 2013 paper with our solver beside GTSAM's iSAM2 and g2o, on the six data sets of the paper.
+
+    python tests/bench/paper.py [--quick] [--only NAME,...] [--json [FILE]] [--repetitions N] [--fresh] [...]
+
+Every run is a process of its own on one core and is kept in the output folder (out/bench/paper): a second call goes on
+where the first was stopped and measures only what is new or changed.  All of it takes hours, nearly all of them on 10k;
+--quick takes two minutes.  Without data sets (FACTORBUS_DATASETS) it replays simulated worlds.
+
+NAME is a data set (intel, w10000, ...) or a solver (inc-l, all-batch, inc-l-b10, inc-l-b100, auto, isam2-0.1,
+isam2-0.01, isam2-0.1-qr, isam2-0.01-qr, g2o-b1, g2o-b10).  The exit code is 1 when a target is missed.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from bench.replays import problems, runner, summary, table, targets
+from bench.replays.contestants import ENTRIES, QUICK, TABLE_1, Entry
+from bench.replays.problems import Problem
+
+_PIXELS = 360  # of the pictures of R
+_DRAWN = {"intel", "victoria_park", "city_trees"}  # the systems of Figures 1 and 2: one of poses, one with landmarks
+_FIGURE_5 = ("w10000", "manhattan3500", "manhattan")
+
+
+def main() -> None:
+    """Measure what is missing, print, draw; exit 1 when a target is missed."""
+    options = _options()
+    chosen, note = problems.choose(options.quick)
+    chosen, entries, absent = _selection(chosen, options.only, QUICK if options.quick else TABLE_1)
+    settings = runner.Settings(options.out, runner.pick_core(), options.samples, options.limit_s, options.fresh)
+    try:
+        measured = measure(settings, chosen, entries, options.repetitions)
+    except runner.Crashed as problem:
+        sys.exit(f"bench paper: optima or fill-in could not be computed: {problem}")
+    except KeyboardInterrupt:
+        sys.exit(f"bench paper: stopped; what is finished is in {options.out}, and the same call goes on from there")
+    document = conclude(measured, chosen, entries, [note, *absent])
+    if not options.no_figures:
+        document["figures"] = [str(path) for path in draw(options.out, measured, chosen, document.pop("optima"))]
+    document.pop("optima", None)
+    verdicts = document.pop("verdicts")
+    text = table.report(document["rows"], document["fill"], verdicts, document["notes"], document["machine"])
+    _hand_out(document, text, options)
+    if any(target["verdict"] == targets.MISSED for target in document["targets"]):
+        sys.exit(1)
+
+
+def measure(
+    settings: runner.Settings, chosen: Sequence[Problem], entries: Sequence[Entry], repetitions: int
+) -> dict[str, dict[str, Any]]:
+    """Per problem its "runs" by contestant, its "reference" and its "fill".
+
+    The solvers take turns: all of them once on a data set before any of them a second time.
+    """
+    found: dict[str, dict[str, Any]] = {p.key: {"runs": {e.name: [] for e in entries}} for p in chosen}
+    total = len(chosen) * (repetitions * len(entries) + 2)
+    with _bars(total) as (begin, progress):
+        for problem in chosen:
+            begin(f"{problem.key}: optima", problem)
+            found[problem.key]["reference"] = runner.run_reference(settings, problem, progress)
+            begin(f"{problem.key}: fill-in", problem)
+            found[problem.key]["fill"] = runner.run_fill(settings, problem, _PIXELS, progress)
+        for repetition in range(repetitions):
+            for problem in chosen:
+                for entry in entries:
+                    begin(f"{problem.key}: {entry.name}", problem)
+                    run = runner.run_replay(settings, problem, entry, repetition, progress)
+                    found[problem.key]["runs"][entry.name].append(run)
+    return found
+
+
+def conclude(
+    measured: dict[str, dict[str, Any]], chosen: Sequence[Problem], entries: Sequence[Entry], notes: Sequence[str]
+) -> dict[str, Any]:
+    """Rows, fill-in, targets and notes."""
+    rows, optima, said, ends = [], {}, [note for note in notes if note], {}
+    for problem in chosen:
+        found = measured[problem.key]
+        firsts = [runs[0] for runs in found["runs"].values() if runs]
+        batch, remarks = summary.best_known(problem, found["reference"], firsts)
+        said += remarks
+        optima[problem.key], ends[problem.key] = batch, summary.optimum_of(problem, batch)
+        rows += [summary.row_of(problem, entry, found["runs"][entry.name], batch) for entry in entries]
+    fills = {problem.key: {**measured[problem.key]["fill"]} for problem in chosen}
+    verdicts = targets.judge(rows, ends, fills)
+    return {
+        "machine": runner.machine(),
+        "notes": said,
+        "rows": rows,
+        "fill": fills,
+        "targets": [{"what": v.what, "seen": v.seen, "verdict": v.verdict} for v in verdicts],
+        "verdicts": verdicts,
+        "optima": optima,
+    }
+
+
+def draw(
+    folder: Path, measured: dict[str, dict[str, Any]], chosen: Sequence[Problem], optima: dict[str, dict[int, float]]
+) -> list[Path]:
+    """The figures, in `folder`."""
+    from bench.replays import figures, fill_figures
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = [p for p in chosen if p.name in _DRAWN] or list(chosen[:1])
+    systems = [(p.label, measured[p.key]["fill"], Path(measured[p.key]["fill"]["values"])) for p in drawn]
+    paths = [folder / f"figure_{k}.png" for k in range(1, 6)]
+    fill_figures.constraint_figure(paths[0], systems)
+    fill_figures.elements_figure(paths[1], systems)
+    figures.maps_figure(paths[2], [(p, Path(measured[p.key]["reference"]["values"])) for p in chosen])
+    runs = {p.key: [each[0] for each in measured[p.key]["runs"].values() if each] for p in chosen}
+    figures.time_figure(paths[3], runs, {p.key: p.label for p in chosen})
+    along = min(chosen, key=lambda p: _FIGURE_5.index(p.name) if p.name in _FIGURE_5 else len(_FIGURE_5))
+    figures.chi2_figure(paths[4], along.label, runs[along.key], optima[along.key])
+    return paths
+
+
+def _selection(
+    chosen: Sequence[Problem], only: str, usual: Sequence[str]
+) -> tuple[list[Problem], list[Entry], list[str]]:
+    """The problems and contestants asked for, and a line for each that cannot run here."""
+    words = [word for word in only.split(",") if word]
+    names = [word for word in words if word in ENTRIES]
+    wanted = [p for p in chosen if not words or {p.name, p.key} & set(words) or len(names) == len(words)]
+    unknown = [w for w in words if w not in ENTRIES and not any(w in (p.name, p.key) for p in chosen)]
+    if unknown:
+        sys.exit(
+            f"--only {','.join(unknown)}: neither a data set that is here ({', '.join(p.name for p in chosen)}) nor a "
+            f"solver ({', '.join(ENTRIES)})"
+        )
+    entries = [ENTRIES[name] for name in (names or usual)]
+    absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
+    return wanted, [entry for entry in entries if not entry.missing()], absent
+
+
+@contextmanager
+def _bars(total: int) -> Any:
+    """Two bars on standard error: all jobs, and the steps of the present one."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description:34}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[word]}"),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console) as bars:
+        jobs, job = bars.add_task("all", total=total, word=""), bars.add_task("", total=None, word="")
+        begun = [0]
+
+        def begin(what: str, problem: Problem) -> None:
+            bars.update(jobs, completed=begun[0])
+            begun[0] += 1
+            bars.reset(job, description=what, total=_STEPS.get(problem.key, problem.poses) or None, word="")
+            if not console.is_terminal:
+                console.print(f"[{begun[0]}/{total}] {what}", highlight=False)
+
+        def progress(done: int, word: str) -> None:
+            bars.update(job, completed=done, word=word)
+
+        yield begin, progress
+        bars.update(jobs, completed=total)
+
+
+_STEPS = {
+    "manhattan3500": 3500,
+    "w10000": 10000,
+    "citytrees10000": 10000,
+    "intel": 943,
+    "killian": 1941,
+    "victoria_park": 6969,
+}
+
+
+def _hand_out(document: dict[str, Any], text: str, options: argparse.Namespace) -> None:
+    """Markdown and JSON into the output folder, and to where they were asked for."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    content = json.dumps(document, indent=2)
+    (options.out / "paper.md").write_text(text)
+    (options.out / "paper.json").write_text(content)
+    if options.json == "-":
+        print(content)
+        return
+    if options.json:
+        Path(options.json).write_text(content)
+    print(text)
+    print(f"In {options.out}: paper.md, paper.json{'' if options.no_figures else ', figure_1.png to figure_5.png'}")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small or shortened data sets and fewer solvers")
+    parser.add_argument("--only", default="", metavar="NAME,...", help="these data sets and solvers only")
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="the JSON document to FILE, or to -")
+    parser.add_argument("--repetitions", type=_positive, default=1, help="of every run; times are medians")
+    parser.add_argument("--samples", type=_positive, default=100, help="steps at which χ² is held against the optimum")
+    parser.add_argument("--limit-s", type=float, default=1800.0, help="solver CPU seconds after which a run is ended")
+    parser.add_argument("--fresh", action="store_true", help="measure again what the output folder has")
+    parser.add_argument("--out", type=Path, default=Path("out/bench/paper"), help="where results are kept")
+    parser.add_argument("--no-figures", action="store_true", help="tables only")
+    return parser.parse_args()
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number}; wanted 1 or more")
+    return number
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""Who is measured, by name, and what a run asks of each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+from factorbus.proto.messages import Batch
+
+from .columns import Values
+
+
+class Failed(Exception):
+    """A solver gave up: the run ends here, and its row says why."""
+
+
+class Contestant(Protocol):
+    """One solver in one replay.  `step` and `read` are on the clock, the rest is not."""
+
+    def prepare(self, batch: Batch) -> None:
+        """Turn the step's batch into the solver's own objects."""
+        ...
+
+    def step(self) -> None:
+        """Take them in and solve.  Raises Failed."""
+        ...
+
+    def read(self) -> None:
+        """The estimate of all variables, as the solver hands it out.  Raises Failed."""
+        ...
+
+    def values(self) -> Values:
+        """That estimate as arrays."""
+        ...
+
+    def facts(self) -> dict[str, Any]:
+        """At the end: nnz_r, strategies, and what else there is to tell."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A name of the table.
+
+    settings go to the solver; packages are what its version is made of; label is for people; remark explains what
+    the timing has in it.
+    """
+
+    name: str
+    solver: str
+    mode: str
+    label: str
+    settings: dict[str, Any]
+    packages: tuple[str, ...]
+    remark: str
+
+    def missing(self) -> str:
+        """Why it cannot run here; empty when it can."""
+        if self.solver == OURS:
+            from factorbus.solver.options import MODES  # here, so that a peer's process does without our solver
+
+            return "" if self.mode in MODES else f"mode {self.mode} is not in this build"
+        return "" if find_spec(self.packages[0]) else f"{self.packages[0]} is not installed (pip install -e '.[bench]')"
+
+    def versions(self) -> dict[str, str]:
+        """Of its packages."""
+        return {name: metadata.version(name) for name in self.packages}
+
+
+OURS, ISAM2, G2O = "factorbus", "gtsam iSAM2", "g2o"
+OUR_PACKAGES = ("factorbus", "numpy", "numba")
+
+
+def _ours(mode: str, label: str) -> Entry:
+    remark = "stage + step + an estimate of all variables, every step"
+    return Entry(mode, OURS, mode, label, {"mode": mode}, OUR_PACKAGES, remark)
+
+
+def _isam2(threshold: float, factorization: str) -> Entry:
+    short = "" if factorization == "CHOLESKY" else "-qr"
+    remark = "update + calculateEstimate, every step; graph building is outside the clock"
+    return Entry(
+        f"isam2-{threshold:g}{short}",
+        ISAM2,
+        f"{threshold:g} {factorization}",
+        f"GTSAM iSAM2, {threshold:g}{', QR' if short else ''}",
+        {"threshold": threshold, "factorization": factorization},
+        ("gtsam",),
+        remark,
+    )
+
+
+def _g2o(every: int) -> Entry:
+    remark = "initialize_optimization + Gauss-Newton until the gain is below 1e-6 (10 iterations at most)"
+    when = "every step with a loop" if every == 1 else f"every {every} poses, an answer only then"
+    label = "g2o, batch each step" if every == 1 else f"g2o, batch every {every}"
+    return Entry(f"g2o-b{every}", G2O, f"b{every}", label, {"every": every}, ("g2opy",), f"{when}: {remark}")
+
+
+ENTRIES = {
+    entry.name: entry
+    for entry in (
+        _g2o(1),
+        _g2o(10),
+        _isam2(0.1, "CHOLESKY"),
+        _isam2(0.01, "CHOLESKY"),
+        _isam2(0.1, "QR"),
+        _isam2(0.01, "QR"),
+        _ours("all-batch", "all-batch Λ"),
+        _ours("inc-l", "Inc-L"),
+        _ours("inc-l-b10", "Inc-L b10"),
+        _ours("inc-l-b100", "Inc-L b100"),
+        _ours("auto", "auto"),
+    )
+}
+# "auto" is one of the others under another name: only on request.
+TABLE_1 = tuple(name for name in ENTRIES if name != "auto")
+QUICK = ("g2o-b10", "isam2-0.1", "all-batch", "inc-l", "inc-l-b10", "inc-l-b100")
+
+
+def make(name: str) -> Contestant:
+    """A fresh one."""
+    entry = ENTRIES[name]
+    return _makers()[entry.solver](**entry.settings)
+
+
+def _makers() -> dict[str, Callable[..., Contestant]]:
+    """Imports of peers are inside: who is not asked for need not be installed."""
+
+    def ours(mode: str) -> Contestant:
+        from .ours import Ours
+
+        return Ours(mode)
+
+    def isam2(threshold: float, factorization: str) -> Contestant:
+        from .isam2 import Isam2
+
+        return Isam2(threshold, factorization)
+
+    def g2o(every: int) -> Contestant:
+        from .g2o_batch import G2oBatch
+
+        return G2oBatch(every)
+
+    return {OURS: ours, ISAM2: isam2, G2O: g2o}

@@ -1,0 +1,173 @@
+"""GTSAM's iSAM2 as a contestant (relinearizeSkip 1, Gauss-Newton, wildfire threshold as it comes: 1e-3).
+
+Its wheel has no factor for a landmark seen as (x, y), so a sighting goes in as bearing and range with the covariance
+carried over to first order at the measurement,  Σ_br = J Ω⁻¹ Jᵀ,  J = ∂(bearing, range)/∂(x, y).  Its optimum is thus
+close to ours but not the same.  In space a rotation is judged by its rotation vector φ ≈ 2 · (qx, qy, qz), rotation
+first, so the information of the quaternion's vector part is divided by four.
+"""
+
+import math
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factorbus.proto.messages import Batch
+
+from .columns import F64, Values, symmetric
+from .compose import first_values
+from .contestants import Failed
+
+_TIGHT = 1e-4  # metres and radians of the prior that holds the first pose; nothing pulls at it
+
+
+class Isam2:
+    """What is on the clock: `update`, with the back-substitution for the newest pose that it may leave undone; then,
+    as reading, `calculateEstimate`."""
+
+    def __init__(self, threshold: float, factorization: str) -> None:
+        parameters = gtsam.ISAM2Params()
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
+        parameters.setRelinearizeThreshold(threshold)
+        parameters.relinearizeSkip = 1
+        parameters.setFactorization(factorization)
+        self._isam = gtsam.ISAM2(parameters)
+        self._estimate = gtsam.Values()
+        self._last_pose = ("se2", -1)
+        self._kinds: set[str] = set()
+        self._sums = {"relinearised": 0, "eliminated": 0}
+        self._updates = 0
+        self._result: Any = None
+
+    def prepare(self, batch: Batch) -> None:
+        """GTSAM's factors, and first values composed from the present estimate."""
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._count()
+        for key, (kind, value) in first_values(batch, self._known).items():
+            _insert(self._values, kind, key, value)
+            self._kinds.add(kind)
+            if kind in ("se2", "se3"):
+                self._last_pose = (kind, key)
+        for group in batch.variables:
+            if group.fixed:
+                for key in group.keys.tolist():
+                    self._graph.add(_prior(group.kind, key, self._values))
+        for group in batch.factors:
+            make = _FACTORS.get(group.kind)
+            if make is None:
+                raise Failed(f"no factor for {group.kind} in GTSAM's wheel")
+            rows = zip(group.keys.tolist(), group.measured, symmetric(group.information), strict=True)
+            for (i, j), z, information in rows:
+                self._graph.add(make(i, j, z, information))
+
+    def step(self) -> None:
+        """Raises Failed: an indeterminate system comes as RuntimeError."""
+        kind, key = self._last_pose
+        try:
+            self._result = self._isam.update(self._graph, self._values)
+            if kind == "se2":
+                self._isam.calculateEstimatePose2(key)
+            else:
+                self._isam.calculateEstimatePose3(key)
+        except RuntimeError as problem:
+            raise Failed(" ".join(str(problem).split())[:200] or "RuntimeError without words") from problem
+
+    def read(self) -> None:
+        """All variables."""
+        self._estimate = self._isam.calculateEstimate()
+
+    def values(self) -> Values:
+        """Keys in ascending order, as GTSAM keeps them."""
+        keys = np.array(list(self._estimate.keys()), np.int64)
+        letters, found = keys >> 56, {}
+        for kind in self._kinds:
+            extract, letter = _EXTRACT[kind]
+            found[kind] = (keys[letters == letter], extract(self._estimate))
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """nnz_r counts the scalars of all cliques of the Bayes tree."""
+        self._count()
+        return {"nnz_r": int(self._isam.treeNnz()), "strategies": {"update": self._updates}, **self._sums}
+
+    def _count(self) -> None:
+        if self._result is not None:
+            self._sums["relinearised"] += self._result.getVariablesRelinearized()
+            self._sums["eliminated"] += self._result.getVariablesReeliminated()
+            self._updates, self._result = self._updates + 1, None
+
+    def _known(self, kind: str, key: int) -> F64:
+        if kind == "se2":
+            pose = self._estimate.atPose2(key)
+            return np.array([pose.x(), pose.y(), pose.theta()])
+        if kind == "se3":
+            pose = self._estimate.atPose3(key)
+            return np.concatenate((pose.translation(), pose.rotation().toQuaternion().coeffs()))
+        return np.asarray(self._estimate.atPoint2(key))
+
+
+def pose3(value: F64) -> Any:
+    """(x y z qx qy qz qw) as GTSAM's."""
+    x, y, z, w = value[3:].tolist()
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), value[:3])
+
+
+def _insert(values: Any, kind: str, key: int, value: F64) -> None:
+    if kind == "se2":
+        values.insert(key, gtsam.Pose2(*value.tolist()))
+    elif kind == "se3":
+        values.insert(key, pose3(value))
+    else:
+        values.insert(key, np.ascontiguousarray(value))
+
+
+def _prior(kind: str, key: int, values: Any) -> Any:
+    if kind == "se2":
+        return gtsam.PriorFactorPose2(key, values.atPose2(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
+    return gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Isotropic.Sigma(6, _TIGHT))
+
+
+def _between_se2(i: int, j: int, z: F64, information: F64) -> Any:
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    return gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*z.tolist()), noise)
+
+
+def _between_se3(i: int, j: int, z: F64, information: F64) -> Any:
+    order = [3, 4, 5, 0, 1, 2]
+    scale = np.array([0.5, 0.5, 0.5, 1, 1, 1])
+    noise = gtsam.noiseModel.Gaussian.Information(information[np.ix_(order, order)] * np.outer(scale, scale))
+    return gtsam.BetweenFactorPose3(i, j, pose3(z), noise)
+
+
+def _landmark_se2(i: int, j: int, z: F64, information: F64) -> Any:
+    distance, bearing = math.hypot(z[0], z[1]), math.atan2(z[1], z[0])
+    c, s = math.cos(bearing), math.sin(bearing)
+    jacobian = np.array([[-s / distance, c / distance], [c, s]])
+    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
+    noise = gtsam.noiseModel.Gaussian.Covariance((covariance + covariance.T) / 2)
+    return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(bearing), distance, noise)
+
+
+def _bearing_range_se2(i: int, j: int, z: F64, information: F64) -> Any:
+    noise = gtsam.noiseModel.Gaussian.Information(information)
+    return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(float(z[0])), float(z[1]), noise)
+
+
+def _extract_pose3(values: Any) -> F64:
+    from scipy.spatial.transform import Rotation
+
+    rows = gtsam.utilities.extractPose3(values)
+    return np.concatenate((rows[:, 9:], Rotation.from_matrix(rows[:, :9].reshape(-1, 3, 3)).as_quat()), axis=1)
+
+
+_FACTORS = {
+    "between_se2": _between_se2,
+    "between_se3": _between_se3,
+    "landmark_se2": _landmark_se2,
+    "bearing_range_se2": _bearing_range_se2,
+}
+_EXTRACT = {
+    "se2": (lambda values: gtsam.utilities.extractPose2(values), ord("x")),
+    "se3": (_extract_pose3, ord("x")),
+    "point2": (lambda values: gtsam.utilities.extractPoint2(values), ord("l")),
+}
