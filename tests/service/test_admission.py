@@ -215,7 +215,7 @@ def test_whatever_comes_everybody_is_answered_once_and_order_holds(operations: l
             client, sequence, digest, size, epoch = arguments
             asked.append(len(asked))
             event = arrived(client, sequence, asker=None, digest=digest, size=size, epoch=epoch, now=now)
-            effects = admission.admit(Arrived(asked[-1], *[getattr(event, f) for f in event.__slots__[1:]]))
+            effects = admission.admit(event._replace(asker=asked[-1]))
             note(effects)
             for effect in effects:
                 if isinstance(effect, Answer):

@@ -169,9 +169,7 @@ class Folder:
         started = time.perf_counter()
         changed = self._solver.changed()
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
-        delta = codec.encode_delta(
-            Delta(self._epoch, self._revision, self._revision - 1, as_variables(changed), account)
-        )
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, self._revision - 1, tuple(changed), account))
         return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
     def _fault(self) -> str:
