@@ -73,8 +73,8 @@ class DenseGraph:
             eta -= H.T @ W @ r
         return information, eta
 
-    def gauss_newton(self, iterations: int = 12) -> float:
-        """Iterate until nothing moves; gives the length of the last step."""
+    def gauss_newton(self, iterations: int) -> float:
+        """That many steps, or until nothing moves; gives the length of the last one."""
         length = np.inf
         for _ in range(iterations):
             information, eta = self.system()

@@ -99,6 +99,7 @@ def test_a_singular_system_is_reported_not_moved() -> None:
     problem = Curve(lambda x: np.array([x[0] - 1.0]), lambda x: np.array([[1.0, 0.0]]), [5.0, 5.0])
     course = minimise(problem, 16.0, 0.0, SETTLE)
     assert (course.failed, course.iterations, course.converged) == (1, 0, False)
+    assert course.damping == 0.0
     np.testing.assert_array_equal(problem.x, [5.0, 5.0])
 
 

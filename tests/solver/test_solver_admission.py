@@ -136,6 +136,7 @@ def everything(solver: Solver) -> bytes:
     )
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled
 @pytest.mark.parametrize("name", REFUSED)
 def test_bad_batches_are_refused_whole(name: str) -> None:
     code, bad = REFUSED[name]

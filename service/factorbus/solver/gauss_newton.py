@@ -101,9 +101,12 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule) -> Cours
 
 
 def _damp_more(course: Course) -> bool:
-    """Ten times the damping; False: that has no use any more."""
+    """Ten times the damping; False: that has no use any more, and whoever tries again starts without any."""
     course.damping = max(10.0 * course.damping, _FIRST_DAMPING)
-    return course.damping <= _MOST_DAMPING
+    if course.damping > _MOST_DAMPING:
+        course.damping = 0.0
+        return False
+    return True
 
 
 def _damp_less(course: Course, gained: float, expected: float) -> None:
