@@ -17,7 +17,7 @@ EXIT_CODES = {
     FAILED: "failed: the message says at what",
     USAGE: "wrong use: an option, a name or an endpoint that cannot be",
     BAD_FILE: "an input file that cannot be read, or is not what it should be",
-    UNAVAILABLE: "nobody answered on the bus",
+    UNAVAILABLE: "nobody answered: on the bus, or where a data set is fetched from",
     REFUSED: "the service or the solver refused the input",
     INTERRUPTED: "interrupted",
 }

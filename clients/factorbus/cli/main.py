@@ -17,6 +17,7 @@ COMMANDS = {
     "replay": ("replay", "Drive a g2o, TORO or iSAM file through a map, pose by pose."),
     "simulate": ("simulate", "Write a simulated world to a file."),
     "convert": ("convert", "Turn one file format into another."),
+    "datasets": ("datasets", "The public data sets: what there is, where it is, and fetching it."),
     "warm": ("warm", "Compile the kernels ahead."),
     "doctor": ("doctor", "Look for what is wrong on this machine, and say how to mend it."),
     "bench": ("bench", "Measure, beside what it is held against."),

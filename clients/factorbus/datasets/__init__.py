@@ -1,0 +1,28 @@
+"""The public data sets: which there are, where they are found, how they are fetched, converted and checked.
+
+`find("intel")` is what everything that takes a data set by name needs.
+"""
+
+from factorbus.datasets.catalogue import Dataset, Source, named
+from factorbus.datasets.checksum import Verdict, check
+from factorbus.datasets.convert import convert
+from factorbus.datasets.errors import DatasetProblem
+from factorbus.datasets.fetch import fetch
+from factorbus.datasets.known import CATALOGUE
+from factorbus.datasets.places import Place, Places, find, locate
+
+__all__ = [
+    "CATALOGUE",
+    "Dataset",
+    "DatasetProblem",
+    "Place",
+    "Places",
+    "Source",
+    "Verdict",
+    "check",
+    "convert",
+    "fetch",
+    "find",
+    "locate",
+    "named",
+]

@@ -1,0 +1,222 @@
+"""The catalogue: the six data sets of the paper of 2013 (`paper`), and some more.
+
+The conversion is tried to the last bit, from the recorded source checksum to the recorded outcome, for manhattan3500,
+city10000, citytrees10000, killian, victoria_park and w10000_toro.  For w10000, intel, sphere2500 and parking_garage
+the order of the lines in the source is not known here; tried is that any order with the edges of each pose in their
+own order gives the recorded outcome.  Of killian_freiburg no source checksum is recorded.  In every case `fetch` hands
+out nothing but the recorded outcome.
+"""
+
+from factorbus.datasets.catalogue import Dataset, Source
+
+
+def _isam(path: str, sha256: str) -> Source:
+    return Source("isam", (path,), (sha256,), "rickytan/iSAM", "617b3ff154419f92d28e689a0f873d15cd999efe")
+
+
+def _se_sync(path: str, sha256: str) -> Source:
+    return Source("g2o", (path,), (sha256,), "david-m-rosen/SE-Sync", "9b631b6b82d8aa7d32ab846412ae1c070412b7b6")
+
+
+CATALOGUE = (
+    Dataset(
+        name="manhattan3500",
+        what="a simulated drive through a grid of streets",
+        paper="Manhattan",
+        kind="2D",
+        poses=3500,
+        landmarks=0,
+        edges=5598,
+        sightings=0,
+        vertices=0,
+        optimum=6532.7447,
+        sha256="445c12af54fe46643a30fd94bde6d9b848f1fc93378beaaa0874d8fe4b2daf0c",
+        download=_isam(
+            "data/manhattanOlson3500.txt", "cbca9a57a97e43b8a32e3d76d7c78d285e2719aae08fa005d601feb0573c7bbf"
+        ),
+    ),
+    Dataset(
+        name="w10000",
+        what="a simulated walk with 54312 loop closures, noise of HOG-Man",
+        paper="10k",
+        kind="2D",
+        poses=10000,
+        landmarks=0,
+        edges=64311,
+        sightings=0,
+        vertices=10000,
+        optimum=171545.447,
+        sha256="63af9a6ff3a08d235af6138101041f897b51d81de6f5331da79ed822337959f1",
+        download=Source(
+            form="toro",
+            repository="OpenSLAM-org/openslam_hog-man",
+            commit="a5181578033a595ebec8cd7fa47585efb1fa563b",
+            paths=("data/2D/w10000.graph",),
+            sha256=("60e84abfd97ba27fa1698b0ae1bc7e462c489ac518863cc1ee9ac2b149b21589",),
+        ),
+        near="gtsam/Data/w10000.graph: the same graph with other noise; it is w10000_toro here",
+    ),
+    Dataset(
+        name="citytrees10000",
+        what="a simulated drive past 100 trees",
+        paper="CityTrees10k",
+        kind="2D",
+        poses=10000,
+        landmarks=100,
+        edges=9999,
+        sightings=4443,
+        vertices=0,
+        optimum=8668.9281,
+        sha256="993aab788e8931a4ba43486ab71e0241557fdb31d85f075511503e38b0e54c27",
+        download=_isam("data/cityTrees10000.txt", "62760029d3b492f357117a3922b57a68585b137fbcb7a115def597ab7a4f2c24"),
+    ),
+    Dataset(
+        name="intel",
+        what="a corridor loop in an office building, from laser scans",
+        paper="Intel",
+        kind="2D",
+        poses=943,
+        landmarks=0,
+        edges=1837,
+        sightings=0,
+        vertices=943,
+        optimum=546.46111,
+        sha256="42539556bdf850c1ef36343b5ef72ffc5cc6505b9749453084bb71567cc8a870",
+        download=Source(
+            form="g2o",
+            repository="OpenSLAM-org/openslam_g2o",
+            commit="967599368197b96471bb4b96d2d78fc18e58deb0",
+            paths=("data/2d/intel/intel.g2o",),
+            sha256=("4d87aaf96e1e04e47c723c371386b15358c71e98c05dad16b786d585f9fd70ff",),
+        ),
+    ),
+    Dataset(
+        name="killian",
+        what="the long corridors of MIT, measurements of an optimised trajectory: the optimum is all but 0",
+        paper="Killian",
+        kind="2D",
+        poses=1941,
+        landmarks=0,
+        edges=3995,
+        sightings=0,
+        vertices=1941,
+        optimum=5.760417e-8,
+        sha256="0e744273fffa5ffd635754765227271469faccbf7c3da15d04583de581b919db",
+        download=Source(
+            form="toro",
+            repository="bigjun/slam-optim-matlab",
+            commit="e93c6bc1ab2371e9efd51d1dc4223a8909f9530a",
+            paths=("Data/Killian.graph",),
+            sha256=("4eb4389ab79fcf3964059bf60a33fd365ec55b48f1e55661e2e915d7bf34800d",),
+        ),
+    ),
+    Dataset(
+        name="victoria_park",
+        what="a car in a park, trees seen by laser",
+        paper="Victoria Park",
+        kind="2D",
+        poses=6969,
+        landmarks=151,
+        edges=6968,
+        sightings=3640,
+        vertices=0,
+        optimum=6184.1206,
+        sha256="8483a329aab1e040d675b0c24ee477c89f7fe9f6d71fb304de4b88cd1ad130c9",
+        download=_isam("data/victoriaPark.txt", "7bb524560f3050163f8af9c4f07ca5a75f6fd0d0a65112c06bf698b7f0680cee"),
+        wheel=Source(
+            form="isam_covariance",
+            paths=("victoria_park.txt",),
+            sha256=("10596bac625acfe009080748b0ec9993fc9925a93370878c20288a22eeee5253",),
+        ),
+    ),
+    Dataset(
+        name="killian_freiburg",
+        what="the graph of killian with the measurements as measured",
+        paper="",
+        kind="2D",
+        poses=1941,
+        landmarks=0,
+        edges=3995,
+        sightings=0,
+        vertices=1941,
+        optimum=10344.6653,
+        sha256="0d31065c87961bddcf83baa3e769e673324e1b61a9b8745aad71634473190756",
+        download=Source(
+            form="toro",
+            repository="abysmalocean/Graph_SLAM_CPP",
+            commit="ce1c5275fa9c09f2c55266f7fef6968164d03493",
+            paths=("Original/data/killian-v.dat", "Original/data/killian-e.dat"),
+            sha256=(None, None),
+        ),
+    ),
+    Dataset(
+        name="w10000_toro",
+        what="the graph of w10000 with the noise of TORO, unit information",
+        paper="",
+        kind="2D",
+        poses=10000,
+        landmarks=0,
+        edges=64311,
+        sightings=0,
+        vertices=10000,
+        optimum=289.72589,
+        sha256="67c80b5e75fc09816adc41ab0563eb703e62e5bad2c9d593525c61a0825e940e",
+        download=Source(
+            form="toro",
+            repository="borglab/gtsam",
+            commit="0ffe6c930302ebd297484e65e6e8d467c91d26b0",
+            paths=("examples/Data/w10000.graph",),
+            sha256=("1e88f220bd580a4c2b9fc065358608a53b26b1c30033405990b4cdc83236fc89",),
+        ),
+        wheel=Source(
+            form="toro",
+            paths=("w10000.graph",),
+            sha256=("1e88f220bd580a4c2b9fc065358608a53b26b1c30033405990b4cdc83236fc89",),
+        ),
+    ),
+    Dataset(
+        name="city10000",
+        what="a simulated drive through a grid of streets, longer",
+        paper="",
+        kind="2D",
+        poses=10000,
+        landmarks=0,
+        edges=20687,
+        sightings=0,
+        vertices=0,
+        optimum=31931.4120,
+        sha256="6298a2c05b4d7eb268073f8afcac5427fc9a528c8430f79e1f41dadf742755d9",
+        download=_isam("data/city10000.txt", "7b2885aa3f76e0ce513c1a4ea270557d5c884509064f4e1678adf215a2ec105a"),
+    ),
+    Dataset(
+        name="sphere2500",
+        what="a simulated spiral over a sphere",
+        paper="",
+        kind="3D",
+        poses=2500,
+        landmarks=0,
+        edges=4949,
+        sightings=0,
+        vertices=2500,
+        optimum=727.1492,
+        sha256="fccc54249a63184ea2e1dbaf20f1690b06ed644ae92165d0712839f3db1cf46b",
+        download=_se_sync("data/sphere2500.g2o", "104ab57593394f24351d9f692f3b923f8b98fff1eb638c64356cf5049e06cf3c"),
+        near="gtsam/Data/sphere2500.txt: the same measurements with other information, another optimum",
+    ),
+    Dataset(
+        name="parking_garage",
+        what="a car on the ramps of a parking garage, information close to singular",
+        paper="",
+        kind="3D",
+        poses=1661,
+        landmarks=0,
+        edges=6275,
+        sightings=0,
+        vertices=1661,
+        optimum=1.238688,
+        sha256="c67a472c45cf8ee8fa7a2183e189f717a90f279dc281641cecf23cec1f9ff287",
+        download=_se_sync(
+            "data/parking-garage.g2o", "3ac0a31bfb601d7455d451e2546655cb5dececf51a7823f57c8a7e0fe1ca6527"
+        ),
+    ),
+)
