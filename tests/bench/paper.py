@@ -7,7 +7,8 @@ where the first was stopped and measures only what is new or changed.  All of it
 --quick takes two minutes.  Without data sets (FACTORBUS_DATASETS) it replays simulated worlds.
 
 NAME is a data set (intel, w10000, ...) or a solver (inc-l, all-batch, inc-l-b10, inc-l-b100, auto, isam2-0.1,
-isam2-0.01, isam2-0.1-qr, isam2-0.01-qr, g2o-b1, g2o-b10).  The exit code is 1 when a target is missed.
+isam2-0.01, isam2-0.1-qr, isam2-0.01-qr, isam2-0.1-fine, g2o-b1, g2o-b10); auto and isam2-0.1-fine run only when asked
+for.  The exit code is 1 when a target is missed.
 """
 
 import argparse

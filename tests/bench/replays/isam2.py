@@ -1,9 +1,10 @@
-"""GTSAM's iSAM2 as a contestant (relinearizeSkip 1, Gauss-Newton, wildfire threshold as it comes: 1e-3).
+"""GTSAM's iSAM2 as a contestant (relinearizeSkip 1, Gauss-Newton; its own wildfire threshold is 1e-3).
 
 Its wheel has no factor for a landmark seen as (x, y), so a sighting goes in as bearing and range with the covariance
 carried over to first order at the measurement,  Σ_br = J Ω⁻¹ Jᵀ,  J = ∂(bearing, range)/∂(x, y).  Its optimum is thus
-close to ours but not the same.  In space a rotation is judged by its rotation vector φ ≈ 2 · (qx, qy, qz), rotation
-first, so the information of the quaternion's vector part is divided by four.
+close to ours but not the same: judged by our χ² it is 0.5 % above ours on victoria_park, 5e-5 on
+citytrees10000.  In space a rotation is judged by its rotation vector φ ≈ 2 · (qx, qy, qz), rotation first, so the
+information of the quaternion's vector part is divided by four.
 """
 
 import math
@@ -25,9 +26,10 @@ class Isam2:
     """What is on the clock: `update`, with the back-substitution for the newest pose that it may leave undone; then,
     as reading, `calculateEstimate`."""
 
-    def __init__(self, threshold: float, factorization: str) -> None:
-        parameters = gtsam.ISAM2Params()
-        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams())
+    def __init__(self, threshold: float, factorization: str, wildfire: float) -> None:
+        parameters, search = gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
+        search.setWildfireThreshold(wildfire)
+        parameters.setOptimizationParams(search)
         parameters.setRelinearizeThreshold(threshold)
         parameters.relinearizeSkip = 1
         parameters.setFactorization(factorization)
