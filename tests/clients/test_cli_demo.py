@@ -7,7 +7,6 @@ import select
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +78,7 @@ def test_errors_are_distances_of_the_variables_in_both() -> None:
     assert positions(truth, ("se2",))[1].shape == (20, 2)
     assert position_errors(truth, truth, ("se2",)).tolist() == [0.0] * 20
     shorter = merged(_truths(10)).variables
-    moved = [replace(group, values=np.add(group.values, (3.0, 4.0, 0.0))) for group in shorter]
+    moved = [group._replace(values=np.add(group.values, (3.0, 4.0, 0.0))) for group in shorter]
     assert position_errors(moved, truth, ("se2",)).tolist() == pytest.approx([5.0] * 10)
     assert position_errors(moved, truth, ("point2",)).size == 0
 

@@ -1,7 +1,6 @@
 """Bad input over the bus: refused whole with its code, the map unchanged bit for bit, and the service goes on."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -33,7 +32,7 @@ def raw(batch: Batch, change: Callable[[dict[str, Any]], Any]) -> bytes:
 
 
 def factor(**fields: Any) -> bytes:
-    return codec.encode_insert(Insert(1, Batch(factors=(replace(edge("x0", "x1"), **fields),))))
+    return codec.encode_insert(Insert(1, Batch(factors=(edge("x0", "x1")._replace(**fields),))))
 
 
 def variable(*groups: Variables) -> bytes:
