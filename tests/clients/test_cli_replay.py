@@ -56,9 +56,9 @@ def test_in_process(local: dict[str, Any], town: Path) -> None:
     assert local["steps"] == local["inserts"] == POSES
     assert local["revision"] == POSES + 1
     assert local["settled"]
-    assert local["mode"] == "all-batch"
+    assert local["mode"] == "inc-l"
     assert sum(local["strategies"].values()) == POSES
-    assert local["strategies"]["all-batch"] > 10
+    assert local["strategies"]["omega"] > 10
     for name in ("p50", "p95", "p99", "max"):
         assert local["step_ms"][name] > 0
     assert local["step_ms"]["p50"] <= local["step_ms"]["p95"] <= local["step_ms"]["p99"] <= local["step_ms"]["max"]

@@ -28,10 +28,13 @@ class Curve:
         self.factorised.append(damping)
         return -1 if np.linalg.eigvalsh(self.A)[0] > 1e-12 else 1
 
-    def step(self) -> tuple[np.ndarray, float]:
+    def decrease(self) -> float:
         eta = -self.J(self.x).T @ self.r(self.x)
-        delta = np.linalg.solve(self.A, eta)
-        return delta, float(delta @ eta)
+        self.delta = np.linalg.solve(self.A, eta)
+        return float(self.delta @ eta)
+
+    def step(self) -> np.ndarray:
+        return self.delta
 
     def linearise_at(self, step: np.ndarray) -> float:
         self.there = self.x + step

@@ -9,6 +9,8 @@ from naive.random_graphs import random_steps
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 
+BATCH = Options(mode="all-batch")
+
 
 def state(solver: Solver) -> list[bytes]:
     graph, blocks = solver._graph, solver._system.blocks
@@ -38,7 +40,7 @@ def loose_ends(rng: np.random.Generator) -> Batch:
 @given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6), fold=st.integers(1, 3))
 def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) -> None:
     rng = np.random.default_rng(seed)
-    tried, spared = Solver(), Solver()
+    tried, spared = Solver(BATCH), Solver(BATCH)
     for n, batch in enumerate(random_steps(seed, steps=6)):
         tried.stage(batch)
         spared.stage(batch)
@@ -75,7 +77,7 @@ def test_a_failure_anywhere_within_a_step_is_taken_back(seed: int, cut: int) -> 
             raise Interrupted
         return 0.0
 
-    solver = Solver(Options(clock=clock))
+    solver = Solver(Options(mode="all-batch", clock=clock))
     batches = list(random_steps(seed, steps=5, noise=0.2))
     for batch in batches[:3]:
         solver.stage(batch)
@@ -93,7 +95,7 @@ def test_a_failure_anywhere_within_a_step_is_taken_back(seed: int, cut: int) -> 
             solver.stage(batch)
         solver.step(settle=True)
     left[0] = 10**9
-    twin = Solver()
+    twin = Solver(BATCH)
     for n, batch in enumerate(batches):
         twin.stage(batch)
         if n < 3:

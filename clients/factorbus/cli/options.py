@@ -9,8 +9,19 @@ import click
 F = TypeVar("F", bound=Callable[..., Any])
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-MODES = ("auto", "all-batch")
+# The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
+MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch")
 WORLDS = ("manhattan", "city-trees", "sphere")
+
+
+class ModeChoice(click.Choice):
+    """One of MODES; the paper's spelling "inc-l b10" is taken too."""
+
+    def __init__(self) -> None:
+        super().__init__(MODES)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return super().convert(str(value).replace(" ", "-"), param, ctx)
 
 
 def json_option(command: F) -> F:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import MODES, file_argument, json_option, out_option
+from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Request:
     help="For ENDPOINT to answer.",
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
-@click.option("--mode", type=click.Choice(MODES), default="auto", show_default=True, help="How the map is solved.")
+@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
 @click.option(
     "--every",
     type=click.IntRange(0),

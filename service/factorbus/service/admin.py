@@ -4,9 +4,8 @@ from factorbus.proto import codec
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.problems import BadMessage, Problem
-
-# auto is what the service thinks best; so far there is one mode.
-MODES = ("auto", "all-batch")
+from factorbus.solver.errors import UnknownMode
+from factorbus.solver.modes import MODES, mode_named
 
 
 class OtherMode(Problem):
@@ -31,8 +30,10 @@ def read_create(payload: bytes) -> tuple[str, str]:
     """(map, mode) of an admin/create.  Raises BadMessage, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="create")
     mode = content.get("mode", "auto")
-    if mode not in MODES:
-        raise BadMessage("create.mode", f"is {mode!r:.40}", f"one of {', '.join(MODES)}")
+    try:
+        mode_named(mode if isinstance(mode, str) else "")
+    except UnknownMode as unknown:
+        raise BadMessage("create.mode", f"is {mode!r:.40}", f"one of {', '.join(MODES)}") from unknown
     return _map_name(content, "create"), mode
 
 
@@ -43,7 +44,7 @@ def read_drop(payload: bytes) -> str:
 
 def settled_mode(mode: str) -> str:
     """What a map asked for in `mode` runs as."""
-    return "all-batch" if mode == "auto" else mode
+    return mode_named(mode).name
 
 
 def ours(pattern: str, name: str) -> bool:

@@ -29,7 +29,7 @@ def solve_batch(variables: Sequence[VariablesLike], factors: Sequence[FactorsLik
 
     Variables without values are composed from the first factor that reaches them.  Raises SolverError.
     """
-    solver = Solver(Options())
+    solver = Solver(Options(mode="all-batch"))
     solver.stage(_Batch(tuple(variables), tuple(factors)))
     report = solver.step(settle=True)
     return BatchResult(report.chi2, report.iterations, solver.estimate(), report.converged)

@@ -55,7 +55,7 @@ class Blocks:
         return float(linearise(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
 
     def relinearise(self, graph: Graph, values: F64) -> float:
-        """Build all anew at `values` in the spare copy; gives χ² there.  `swap` makes it the present one."""
+        """Build all anew at `values` in the spare copy; gives χ² there."""
         if self._spare_data.size != self.data.size or self._spare_eta.size != self.eta.size:
             self._spare_data, self._spare_eta = np.empty_like(self.data), np.empty_like(self.eta)
         self._spare_data[: self.fill[1]] = 0.0
@@ -65,9 +65,12 @@ class Blocks:
             linearise(0, factors, graph.var, graph.fac, values, graph.payload, self._spare_data, self._spare_eta)
         )
 
-    def swap(self) -> None:
-        """Exchange the present and the spare copy."""
+    def swap_lambda(self) -> None:
+        """Exchange the present and the spare Λ."""
         self.data, self._spare_data = self._spare_data, self.data
+
+    def swap_eta(self) -> None:
+        """Exchange the present and the spare η."""
         self.eta, self._spare_eta = self._spare_eta, self.eta
 
     def forget(self, graph: Graph, fill: tuple[int, int]) -> None:
@@ -78,7 +81,8 @@ class Blocks:
         remove_blocks(fill[0], int(self.fill[0]), self.table, self.pattern)
         self.fill[:] = fill
         self.relinearise(graph, graph.values)
-        self.swap()
+        self.swap_lambda()
+        self.swap_eta()
 
     def _reserve(self, blocks: int, scalars: int) -> None:
         need = int(self.fill[0]) + blocks

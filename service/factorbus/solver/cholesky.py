@@ -21,6 +21,11 @@ class Cholesky:
         self._symbolic: Symbolic | None = None
         self._arena, self._floors, self._x, self._room = (np.empty(0) for _ in range(4))
 
+    @property
+    def arena(self) -> F64:
+        """Where the fronts' numbers are; see `kernels/fronts.py`."""
+        return self._arena
+
     def factorize(self, symbolic: Symbolic, data: F64, offsets: I64, damping: float = 0.0) -> int:
         """Factorise Λ with diagonal Λ·(1 + damping), block b row-major at data[offsets[b]:].
 

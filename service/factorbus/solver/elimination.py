@@ -7,6 +7,7 @@ from factorbus.solver.cholesky import Cholesky
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.options import Options
 from factorbus.solver.ordering import order
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.symbolic import Symbolic, analyze
@@ -18,8 +19,8 @@ _ANYWHERE, _RECENT_LANDMARK, _LAST_POSE = 0, 1, 2
 class Elimination:
     """The factor R of Λ = Rᵀ R, with its arena, order and analysis."""
 
-    def __init__(self, last_pose_last: bool) -> None:
-        self._last_pose_last = last_pose_last
+    def __init__(self, options: Options) -> None:
+        self._options = options
         self._cholesky = Cholesky()
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
@@ -31,17 +32,26 @@ class Elimination:
         watch.lap("numeric")
         return int(failed)
 
-    def solve(self, eta: F64, watch: Stopwatch) -> F64:
-        """δ with Λ δ = η by the factor made last; both in insertion order."""
-        step = self._cholesky.solve(eta)
-        watch.lap("solve")
-        return step
+    def forward(self, eta: F64) -> F64:
+        """d = R⁻ᵀPη by the factor made last, in elimination order."""
+        return self._cholesky.forward(eta)
+
+    def back(self, d: F64) -> F64:
+        """δ = PᵀR⁻¹d, in insertion order."""
+        return self._cholesky.back(d)
+
+    def fronts(self) -> tuple[Symbolic, F64]:
+        """The factor made last: its analysis, and the arena with the numbers."""
+        symbolic = self.symbolic
+        if symbolic is None:
+            raise ValueError("there is no factor: the pattern has changed since")
+        return symbolic, self._cholesky.arena
 
     def _analysis(self, graph: Graph, blocks: Blocks, watch: Stopwatch) -> Symbolic:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]
-            group = constraint(graph) if self._last_pose_last else None
+            group = constraint(graph, self._options.recent_poses) if self._options.last_pose_last else None
             perm = order(dims, blocks.rows, blocks.cols, group)
             watch.lap("order")
             self.symbolic, self._pattern = analyze(dims, blocks.rows, blocks.cols, perm), pattern
@@ -53,8 +63,9 @@ class Elimination:
         self.symbolic = None
 
 
-def constraint(graph: Graph) -> I64:
-    """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it right before it.
+def constraint(graph: Graph, recent_poses: int = 1) -> I64:
+    """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it, or from
+    the `recent_poses` last ones, right before it.
 
     The next factors will most likely touch these, and changes near the end of the order are cheap (2013 paper, §5.2).
     """
@@ -63,7 +74,7 @@ def constraint(graph: Graph) -> I64:
     poses = np.flatnonzero((var[:, at.V_KIND] <= at.SE3) & (var[:, at.V_COLUMN] >= 0))
     if poses.size:
         fac = graph.fac[: graph.counts[at.FACTORS]]
-        seen = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & (fac[:, at.F_I] == poses[-1]), at.F_J]
+        seen = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & np.isin(fac[:, at.F_I], poses[-recent_poses:]), at.F_J]
         columns = var[seen, at.V_COLUMN]
         group[columns[columns >= 0]] = _RECENT_LANDMARK
         group[var[poses[-1], at.V_COLUMN]] = _LAST_POSE

@@ -2,6 +2,8 @@
 
     SolverError
     ├── UnknownMode            unknown_mode            a mode of solving that does not exist
+    ├── BadOption              bad_option              a setting out of its range
+    ├── NoBackend              no_backend              a backend whose package is not installed
     ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
     ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
     ├── DuplicateVariable      duplicate_variable      a key that is taken already
@@ -52,6 +54,24 @@ class UnknownMode(SolverError):
 
     def __init__(self, seen: str, known: Sequence[str]) -> None:
         super().__init__(f"there is no mode {seen!r}; wanted one of {', '.join(known)}", seen=seen)
+
+
+class BadOption(SolverError):
+    code = "bad_option"
+
+    def __init__(self, name: str, seen: str, wanted: str) -> None:
+        super().__init__(f"option {name}: seen {seen}, wanted {wanted}", name=name, seen=seen, wanted=wanted)
+
+
+class NoBackend(SolverError):
+    code = "no_backend"
+
+    def __init__(self, backend: str, package: str, problem: str) -> None:
+        super().__init__(
+            f'backend "{backend}" needs {package}, which cannot be imported ({problem}); install it, or use "blocks"',
+            backend=backend,
+            package=package,
+        )
 
 
 class UnknownKind(SolverError):

@@ -23,8 +23,12 @@ class Problem(Protocol):
         """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed."""
         ...
 
-    def step(self) -> tuple[F64, float]:
-        """(δ, δᵀη) by the factor made last, with the present gradient: the undamped model's decrease of χ² is δᵀη."""
+    def decrease(self) -> float:
+        """dᵀd = δᵀη by the factor made last and the present gradient: what the model says a step takes off χ²."""
+        ...
+
+    def step(self) -> F64:
+        """The δ of the last `decrease`."""
         ...
 
     def linearise_at(self, step: F64) -> float:
@@ -36,13 +40,25 @@ class Problem(Protocol):
         ...
 
 
+class LinearProblem(Problem, Protocol):
+    """A problem that can stay linearised where it was."""
+
+    def accept_linear(self) -> None:
+        """Move to the point linearised last, but keep the linear model: its gradient is zero there."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When to stop: the next step would lower χ² by less than `tolerance` χ² + `floor`; or after `limit` tries."""
+    """When to stop: the next step would lower χ² by less than `tolerance` χ² + `floor`; or after `limit` tries.
+
+    reuse: the old factor makes another step while each is to gain less than this share of the one before.
+    """
 
     tolerance: float
     floor: float
     limit: int
+    reuse: float = 0.0
 
     def is_negligible(self, decrease: float, chi2: float) -> bool:
         """Whether a decrease of χ² is not worth a step.  False for NaN."""
@@ -61,43 +77,73 @@ class Course:
     failed: int = -1
 
 
-def minimise(problem: Problem, chi2: float, damping: float, rule: Rule) -> Course:
+def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
     """Lower χ² from where `problem` stands until `rule` says stop.  χ² never rises.
 
-    Each try: 1. factorise; 2. solve for the step; 3. linearise at its end; 4. accept it if χ² does not rise there,
-    else try a shorter one.  After an accepted undamped step the old factor and the new gradient tell, for the price of
-    one solve, what another step would gain; if that is negligible the loop ends without another factorisation.
+    Each try: 1. factorise and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
+    3. linearise at its end; 4. accept it if χ² does not rise there, else factorise with more damping.  5. After an
+    undamped step the old factor with the new gradient gives, for the price of one solve, what another step would gain:
+    nothing, and the loop ends; little, and that step is tried as it is; else Λ has changed and is factorised anew.
+    With `have_factor` the loop begins with a factor that is there, as after an undamped step.
     """
     course = Course(chi2, damping)
+    decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
-        course.factorisations += 1
-        course.failed = problem.factorize(course.damping)
-        if course.failed >= 0:
-            if not _damp_more(course):
-                return course
-            continue
-        step, decrease = problem.step()
+        if not solved:
+            course.factorisations += 1
+            course.failed = problem.factorize(course.damping)
+            if course.failed >= 0:
+                if _damp_more(course):
+                    continue
+                break
+            decrease, fresh = problem.decrease(), True
         undamped = course.damping == 0.0
         if undamped and rule.is_negligible(decrease, course.chi2):
             course.converged = True
-            return course
-        reached = problem.linearise_at(step)
+            break
+        reached = problem.linearise_at(problem.step())
+        solved = False
         if not reached <= course.chi2:
-            if undamped and decrease <= _ROUNDING * course.chi2 + _ROUNDING_FLOOR:
-                course.converged = True
-                return course
-            if not _damp_more(course):
-                return course
+            if not fresh:
+                continue
+            course.converged = undamped and _is_rounding(decrease, course.chi2)
+            if course.converged or not _damp_more(course):
+                break
             continue
         problem.accept()
         course.iterations += 1
-        gained = course.chi2 - reached
+        gained, course.chi2 = course.chi2 - reached, reached
         _damp_less(course, gained, expected=decrease)
-        course.chi2 = reached
-        if undamped and (gained == 0.0 or rule.is_negligible(problem.step()[1], reached)):
-            course.converged = True
-            return course
+        if undamped:
+            decrease, fresh = problem.decrease(), False
+            if gained == 0.0:
+                course.converged = True
+                break
+            solved = decrease <= rule.reuse * gained or rule.is_negligible(decrease, reached)
+    else:
+        # The last try may have been all that was needed.
+        course.converged = course.damping == 0.0 and solved and rule.is_negligible(decrease, course.chi2)
     return course
+
+
+def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
+    """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
+    course = Course(chi2, 0.0, factorisations=1, converged=True)
+    if problem.factorize(0.0) >= 0:
+        return None
+    if rule.is_negligible(problem.decrease(), chi2):
+        return course
+    reached = problem.linearise_at(problem.step())
+    if not reached <= chi2:
+        return None
+    problem.accept_linear()
+    course.chi2, course.iterations = reached, 1
+    return course
+
+
+def _is_rounding(decrease: float, chi2: float) -> bool:
+    """Whether χ² cannot show a decrease of this size."""
+    return decrease <= _ROUNDING * chi2 + _ROUNDING_FLOOR
 
 
 def _damp_more(course: Course) -> bool:

@@ -2,35 +2,64 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
-from factorbus.solver.errors import UnknownMode
+from factorbus.solver.errors import BadOption
+from factorbus.solver.modes import MODES, mode_named
 
-MODES = ("auto", "all-batch")
+__all__ = ["MODES", "Options"]
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """Settings of a Solver; the defaults are meant for every graph.
 
-    mode            "all-batch": every step solves the whole system anew; "auto" is that at present
+    mode            "inc-l": R is updated, and made anew when that is better (2013 paper, Algorithm 1); "inc-l-b10",
+                    "inc-l-b100": the same with a batch after every 10 or 100 new variables and none in between;
+                    "all-batch": every step that solves factorises anew; "auto" is "inc-l" at present
     clock           seconds, for the phases in the report; without one they are zero
-    tolerance       an ordinary step stops when the next one would lower χ² by less than this share of it
+    tolerance       all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
+    tol             inc-l: the same, and a first step that would is not made.  The paper's tol, with the length of δ
+                    measured in standard deviations: |δ|² = δᵀΛδ = dᵀd ≤ tol χ²  (MATH §8.5)
+    small_loop      smallLoopThresh: Ω-updates reach no more block rows of R than this
+    big_loop        bigLoopThresh: Λ-updates reach no more; above it R is made anew in a new order
+    keep_factor     R stays in use after a step was made with it, as long as it leads there (MATH §8.6); False: it is
+                    made anew at every new linearisation point, as the paper has it
+    place_new       new variables first go where their own factors want them, the rest held
     negligible      a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A step whose new
                     factors add less solves nothing, and no step goes on for less
-    max_iterations  at most this many tries (accepted or not) in an ordinary step; the next step goes on from there
+    max_iterations  maxIT: at most this many tries (accepted or not) in an ordinary step; the next step goes on
     settle_tolerance, settle_iterations   the same for a step that is to converge
-    last_pose_last  constrain the ordering: the last pose last, the landmarks it sees right before it
+    last_pose_last  constrain the ordering: the last pose last, the landmarks seen lately right before it
+    recent_poses    "lately": from the last so many poses
+    backend         "blocks": block multifrontal Cholesky; "cholmod": CHOLMOD on scalars, through scikit-sparse
     """
 
     mode: str = "auto"
     clock: Callable[[], float] | None = None
     tolerance: float = 1e-6
+    tol: float = 5e-5
+    small_loop: int = 400
+    big_loop: int = 500
+    keep_factor: bool = True
+    place_new: bool = True
     negligible: float = 1e-12
     max_iterations: int = 10
     settle_tolerance: float = 1e-14
     settle_iterations: int = 500
     last_pose_last: bool = True
+    recent_poses: int = 1
+    backend: Literal["blocks", "cholmod"] = "blocks"
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise UnknownMode(self.mode, MODES)
+        mode_named(self.mode)
+        if self.backend not in ("blocks", "cholmod"):
+            raise BadOption("backend", repr(self.backend), '"blocks" or "cholmod"')
+        if not 0 <= self.small_loop <= self.big_loop:
+            raise BadOption("small_loop, big_loop", f"{self.small_loop}, {self.big_loop}", "0 ≤ small_loop ≤ big_loop")
+        if self.recent_poses < 1:
+            raise BadOption("recent_poses", str(self.recent_poses), "1 or more")
+        if self.max_iterations < 1 or self.settle_iterations < 1:
+            raise BadOption(
+                "max_iterations, settle_iterations", f"{self.max_iterations}, {self.settle_iterations}", "1 or more"
+            )

@@ -7,14 +7,25 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.admission import admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
-from factorbus.solver.gauss_newton import Course, Rule, minimise
+from factorbus.solver.elimination import Elimination
+from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import BatchLike, FactorGroup, Group
+from factorbus.solver.incremental import Incremental
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels.settle_new import settle_new
+from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
+from factorbus.solver.strategy import Plan
 from factorbus.solver.system import System
+
+# A step of a robot brings no more variables than this, and some factors each.
+_FEW = 8
+# Below this share of steps in which the old R served, it pays more not to try: a try costs a linearisation.
+_LEAST_TRUST, _LEARN, _TRY_AGAIN = 0.4, 0.1, 8
+_REUSE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +33,7 @@ class _Done:
     """Where the last step left things: what a failed step goes back to.
 
     unsolved: χ² of the factors taken in since the system was last solved; infinite if that had not converged.
+    batch: variables when the whole system was last solved anew, which the modes with forced batches count from.
     """
 
     graph: Mark
@@ -29,6 +41,7 @@ class _Done:
     chi2: float = 0.0
     unsolved: float = 0.0
     damping: float = 0.0
+    batch: int = 0
 
 
 class Solver:
@@ -37,8 +50,10 @@ class Solver:
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
         self._graph = Graph()
-        self._system = System(self._graph, self._options.last_pose_last)
+        self._mode = mode_named(self._options.mode)
+        self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
         self._changed: I64 = np.empty(0, np.int64)
+        self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
 
     @property
@@ -72,21 +87,25 @@ class Solver:
         """
         watch = Stopwatch(self._options.clock)
         try:
-            # 1. Linearise what is new and add it to Λ and η.
+            # 1. What is new goes to a good place; linearised there it is added to Λ and η.
+            self._place_new()
             added = self._system.blocks.extend(self._graph, self._done.graph)
             watch.lap("linearise")
             # 2. Is every new variable held by something?
             suspects = self._suspects()
             watch.lap("check")
-            # 3. Solve, if there is anything to solve.
+            # 3. R and d follow.
+            plan = self._follow(suspects, watch)
+            # 4. Solve, if there is anything to solve.
             because = self._reason_to_solve(added, settle, suspects)
-            course = self._solve(added, settle, suspects, watch) if because else self._extend(added)
+            batch = settle or self._is_batch_due()
+            course = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
         except BaseException:
             self._take_back()
             raise
-        # 4. Remember where this leaves things, and account for it.
-        report = self._report(course, added, because, watch)
-        self._commit(course, added, solved=bool(because))
+        # 5. Remember where this leaves things, and account for it.
+        report = self._report(course, added, self._told(plan, because, batch), watch)
+        self._commit(course, added, solved=bool(because), batch=batch)
         return report
 
     def estimate(self) -> list[Group]:
@@ -104,6 +123,16 @@ class Solver:
     def graph(self) -> tuple[list[Group], list[FactorGroup]]:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids."""
         return self._graph.variables(), self._graph.factors()
+
+    def _place_new(self) -> None:
+        """Good first values for the few variables that a step of a robot brings."""
+        mark, counts = self._done.graph, self._graph.counts.tolist()
+        few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
+        if few and self._mode.updates and self._options.place_new:
+            settle_new(
+                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS],
+                self._options.negligible, self._graph.var, self._graph.fac, self._graph.values, self._graph.payload,
+            )  # fmt: skip
 
     def _suspects(self) -> I64:
         """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""
@@ -130,22 +159,64 @@ class Solver:
             return f"{suspects.size} new variables are held only by several factors together"
         if not np.isfinite(self._done.unsolved):
             return "the last step had not converged"
+        if self._system.drifted and self._is_batch_due():
+            return "a batch is due"
         if self._done.unsolved + added > self._options.negligible:
             return f"new factors add {added:.3g} to χ²"
         return ""
 
-    def _solve(self, added: float, settle: bool, suspects: I64, watch: Stopwatch) -> Course:
-        """Gauss-Newton from the present values."""
-        options = self._options
-        rule = Rule(options.tolerance, options.negligible, options.max_iterations)
+    def _is_batch_due(self) -> bool:
+        every = self._mode.batch_every
+        return every > 0 and self.variable_count - self._done.batch >= every
+
+    def _follow(self, suspects: I64, watch: Stopwatch) -> Plan:
+        """R and d follow Λ and η, or are given up."""
+        if not self._mode.updates:
+            self._system.factor.moved()
+            return Plan("all-batch", "the mode is all-batch")
+        if suspects.size:
+            self._system.factor.moved()
+            return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
+        return self._system.factor.fold(self._graph, self._system.blocks, self._done.graph, watch)
+
+    def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> Course:
+        """Gauss-Newton from the present values, or between forced batches one linear step."""
+        system, options, chi2 = self._system, self._options, self._done.chi2 + added
+        rule = Rule(
+            options.tol if self._mode.updates else options.tolerance, options.negligible, options.max_iterations
+        )
         if settle:
             rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
-        self._system.begin(suspects, watch)
-        course = minimise(self._system, self._done.chi2 + added, self._done.damping, rule)
+        system.begin(suspects, watch)
+        course = None
+        if self._mode.batch_every and not batch:
+            course = glide(system, chi2, rule)
+        if course is None:
+            if self._mode.batch_every:
+                system.relinearise()
+            have_factor = self._done.damping == 0.0 and system.factor.serve()
+            course = minimise(system, chi2, self._done.damping, rule, have_factor)
+            if not (self._mode.updates and course.converged and self._keeps(have_factor, course)):
+                system.have_lambda()
         if course.failed >= 0 and course.iterations == 0:
-            raise self._system.underconstrained(self._system.variable_of(course.failed))
-        self._changed = self._system.end(self._done.graph[at.VARIABLES])
+            raise system.underconstrained(system.variable_of(course.failed))
+        self._changed = system.end(self._done.graph[at.VARIABLES])
         return course
+
+    def _keeps(self, had_factor: bool, course: Course) -> bool:
+        """Whether R is to stay in use at the new linearisation point.
+
+        It is where that has led to the new optimum lately, in more than `_LEAST_TRUST` of the steps that tried; else
+        every `_TRY_AGAIN`-th of the steps that move tries, to find out.
+        """
+        if not self._options.keep_factor:
+            return False
+        if course.iterations == 0:
+            return True
+        if had_factor:
+            self._trust += (0.0 if course.factorisations else _LEARN) - _LEARN * self._trust
+        self._moves += 1
+        return self._trust > _LEAST_TRUST or self._moves % _TRY_AGAIN == 0
 
     def _extend(self, added: float) -> Course:
         """Nothing moves: what is new has the values it was given or composed to."""
@@ -156,22 +227,35 @@ class Solver:
         self._graph.forget(self._done.graph)
         self._system.take_back(self._done.fill)
 
-    def _commit(self, course: Course, added: float, solved: bool) -> None:
+    def _commit(self, course: Course, added: float, solved: bool, batch: bool) -> None:
         unsolved = self._done.unsolved + added
         if solved:
             unsolved = 0.0 if course.converged else np.inf
         blocks, numbers = self._system.blocks.fill.tolist()
         self._done = _Done(
-            self._graph.mark(), (blocks, numbers), course.chi2, unsolved, 0.0 if course.converged else course.damping
+            self._graph.mark(),
+            (blocks, numbers),
+            course.chi2,
+            unsolved,
+            0.0 if course.converged else course.damping,
+            self.variable_count if batch else self._done.batch,
         )
 
-    def _report(self, course: Course, added: float, because: str, watch: Stopwatch) -> StepReport:
-        columns = int(self._graph.counts[at.COLUMNS])
-        symbolic = self._system.elimination.symbolic if because else None
+    def _told(self, plan: Plan, because: str, batch: bool) -> Plan:
+        """What the step is called in the report, and why it was done so."""
+        if not because:
+            return Plan("extend", "new factors agree with the estimate: the gradient is zero", plan.rows)
+        if batch and self._mode.batch_every:
+            return Plan("full", f"{because}; a batch is due", plan.rows)
+        return Plan(plan.strategy, f"{because}; {plan.because}", plan.rows)
+
+    def _report(self, course: Course, added: float, plan: Plan, watch: Stopwatch) -> StepReport:
+        columns, factor = int(self._graph.counts[at.COLUMNS]), self._system.factor
+        nonzeros, flops = factor.cost() if plan.strategy != "extend" else (0, 0.0)
         return StepReport(
-            mode="all-batch",
-            strategy="all-batch" if because else "extend",
-            because=because or "new factors agree with the estimate: the gradient is zero",
+            mode=self._mode.name,
+            strategy=plan.strategy,
+            because=plan.because,
             iterations=course.iterations,
             chi2=course.chi2,
             chi2_before=self._done.chi2 + added,
@@ -179,9 +263,9 @@ class Solver:
             new_factors=self.factor_count - self._done.graph[at.FACTORS],
             changed=int(self._changed.size),
             relinearised=course.iterations * columns,
-            eliminated=course.factorisations * columns,
-            nnz_r=symbolic.nnz_r if symbolic else 0,
-            flops=symbolic.flops if symbolic else 0.0,
+            eliminated=plan.rows + course.factorisations * columns,
+            nnz_r=nonzeros,
+            flops=flops,
             damping=course.damping,
             converged=course.converged,
             phases_ms=watch.phases_ms,

@@ -5,11 +5,11 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.anchors import find_loose
 from factorbus.solver.blocks import Blocks
-from factorbus.solver.elimination import Elimination
 from factorbus.solver.graph import Graph
+from factorbus.solver.incremental import Incremental
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.move import differing, inner, move
+from factorbus.solver.kernels.move import differing, move
 from factorbus.solver.report import Stopwatch
 
 _FREE_DIRECTION = (
@@ -20,13 +20,16 @@ _FREE_DIRECTION = (
 class System:
     """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
 
-    def __init__(self, graph: Graph, last_pose_last: bool) -> None:
+    def __init__(self, graph: Graph, factor: Incremental) -> None:
         self.graph = graph
         self.blocks = Blocks()
-        self.elimination = Elimination(last_pose_last)
+        self.factor = factor
         self._before: F64 = np.zeros(0)
         self._trial: F64 = np.zeros(0)
         self._moved = False
+        self._have_lambda, self.drifted = True, False
+        self._spare_is_here = False
+        self.drifted = False  # η is that of the linear model, not of the present point
         self._suspects: I64 = np.zeros(0, np.int64)
         self._watch = Stopwatch(None)
 
@@ -38,10 +41,13 @@ class System:
         used = int(self.graph.counts[at.VALUES])
         self._before[:used] = values[:used]
         self._moved, self._suspects, self._watch = False, suspects, watch
+        self._spare_is_here = False
 
     def factorize(self, damping: float) -> int:
         """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed.  Raises Underconstrained."""
-        failed = self.elimination.factorize(self.graph, self.blocks, damping, self._watch)
+        if not self.drifted:
+            self.have_lambda()
+        failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
         if self._suspects.size and damping == 0.0:
             if failed >= 0:
                 raise self.underconstrained(self.variable_of(failed))
@@ -51,25 +57,54 @@ class System:
             self._suspects = self._suspects[:0]
         return failed
 
-    def step(self) -> tuple[F64, float]:
-        """(δ, δᵀη) by the factor made last and the present gradient."""
-        eta = self.blocks.eta[: self.graph.counts[at.SCALARS]]
-        step = self._solve(eta)
-        return step, float(inner(step, eta))
+    def decrease(self) -> float:
+        """dᵀd = δᵀη by the factor made last and the present gradient."""
+        return self.factor.decrease(self.blocks.eta[: self.graph.counts[at.SCALARS]], self._watch)
+
+    def step(self) -> F64:
+        """The δ of the last `decrease`."""
+        return self.factor.step(self._watch)
 
     def linearise_at(self, step: F64) -> float:
         """χ² at x ⊞ δ, linearised there aside."""
         move(int(self.graph.counts[at.VARIABLES]), self.graph.var, self.graph.values, step, self._trial)
         self._watch.lap("move")
+        self._spare_is_here = False
         chi2 = self.blocks.relinearise(self.graph, self._trial)
         self._watch.lap("linearise")
         return chi2
 
     def accept(self) -> None:
-        """Move to the point linearised last."""
+        """Move to the point linearised last: η is that of the new point, Λ stays until it is asked for."""
         self.graph.values, self._trial = self._trial, self.graph.values
-        self.blocks.swap()
-        self._moved = True
+        self.blocks.swap_eta()
+        self.factor.turned()
+        self._have_lambda, self._spare_is_here, self._moved = False, True, True
+
+    def accept_linear(self) -> None:
+        """Move to the point linearised last; Λ, R and the linear model stay, whose gradient is zero there."""
+        self.graph.values, self._trial = self._trial, self.graph.values
+        self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
+        self.factor.rest()
+        self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
+
+    def relinearise(self) -> None:
+        """Λ and η at the present point, if they are not."""
+        if self.drifted:
+            self.have_lambda()
+            self.blocks.swap_eta()
+            self.drifted = False
+
+    def have_lambda(self) -> None:
+        """Λ at the present point (haveΛ of the 2013 paper)."""
+        if self._have_lambda:
+            return
+        if not self._spare_is_here:
+            self.blocks.relinearise(self.graph, self.graph.values)
+            self._watch.lap("linearise")
+        self.blocks.swap_lambda()
+        self.factor.moved()
+        self._have_lambda, self._spare_is_here = True, False
 
     def end(self, old: int) -> I64:
         """The variables whose values have other bits than at `begin`, and those from index `old` on."""
@@ -88,7 +123,8 @@ class System:
             self.graph.values[:used] = self._before[:used]
             self._moved = False
         self.blocks.forget(self.graph, fill)
-        self.elimination.forget()
+        self._have_lambda, self.drifted = True, False
+        self.factor.forget()
 
     def underconstrained(self, variable: int, missing: str = _FREE_DIRECTION) -> errors.Underconstrained:
         """The error that names `variable`, its factors, and what is missing."""
@@ -99,4 +135,5 @@ class System:
         return int(np.flatnonzero(self.graph.var[: self.graph.counts[at.VARIABLES], at.V_COLUMN] == column)[0])
 
     def _solve(self, eta: F64) -> F64:
-        return self.elimination.solve(eta, self._watch)
+        self.factor.decrease(eta, self._watch)
+        return self.factor.step(self._watch)
