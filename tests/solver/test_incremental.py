@@ -1,5 +1,6 @@
 """R, d and δ after every step against Λ and η themselves, for every way of updating R."""
 
+import sys
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,17 +12,19 @@ from hypothesis import strategies as st
 from naive.block_rows import dense_lambda, dense_r
 from naive.random_graphs import factor, random_steps
 
-from factorbus.cli.options import MODES as cli_modes
+from factorbus.cli.options import MODES as CLI_MODES
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.elimination import constraint
+from factorbus.solver.fill_in import fill_in
 from factorbus.solver.incremental import Where
 from factorbus.solver.modes import MODES
 
 # What makes steps take one way of updating R as long as they can.
 WAYS = {
-    "omega": {"small_loop": 10**6, "big_loop": 10**6},
-    "lambda": {"small_loop": 0, "big_loop": 10**6},
+    "omega": {"small_loop": 10**6, "big_loop": 10**6, "loop_share": 1e6},
+    "lambda": {"small_loop": 0, "big_loop": 10**6, "loop_share": 1e6},
     "all": {"small_loop": 6, "big_loop": 14},
     "full": {"small_loop": 0, "big_loop": 0},
 }
@@ -162,7 +165,7 @@ def test_modes_by_the_papers_names() -> None:
     assert Solver(Options(mode="auto")).step().mode == "inc-l"
     with pytest.raises(errors.UnknownMode, match="inc-l b7"):
         Options(mode="inc-l b7")
-    assert cli_modes == MODES
+    assert CLI_MODES == MODES
 
 
 @pytest.mark.parametrize("wrong", [{"small_loop": 9, "big_loop": 8}, {"recent_poses": 0}, {"backend": "petsc"}])
@@ -189,6 +192,68 @@ def test_a_refused_step_leaves_values_and_graph_and_the_map_goes_on() -> None:
                 [group.values.tobytes() for group in solver.estimate()], solver.chi2(), solver.factor_count,
             )  # fmt: skip
     assert solver.step(settle=True).chi2 == pytest.approx(spared.step(settle=True).chi2, rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cholmod_gives_the_same_r(seed: int) -> None:
+    ours, theirs = Solver(Options(tol=0.0, keep_factor=False)), Solver(
+        Options(tol=0.0, keep_factor=False, backend="cholmod")
+    )  # fmt: skip
+    for batch in random_steps(seed, steps=12):
+        for one in (ours, theirs):
+            one.stage(batch)
+            one.step()
+            assert_is_the_factor(one)
+        assert theirs.chi2() == pytest.approx(ours.chi2(), rel=1e-9)
+    settled = theirs.step(settle=True)
+    assert settled.converged
+    assert settled.chi2 == pytest.approx(ours.step(settle=True).chi2, rel=1e-10)
+
+
+def test_a_backend_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sksparse", None)
+    with pytest.raises(errors.NoBackend, match="scikit-sparse") as caught:
+        Solver(Options(backend="cholmod"))
+    assert caught.value.code == "no_backend"
+
+
+@pytest.mark.parametrize("name", ["intel"])
+def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) -> None:
+    solver = Solver()
+    for batch in read(datasets / f"{name}.g2o").steps():
+        solver.stage(batch)
+    solver.step()
+    graph, blocks = solver._graph, solver._system.blocks
+    dims = graph.dims[: graph.counts[4]]
+    free, bound = (
+        fill_in(dims, blocks.rows, blocks.cols, group)[0] for group in (None, constraint(graph, recent_poses=1))
+    )
+    by_element = fill_in(dims, blocks.rows, blocks.cols, by_element=True)[0]
+    print(f"{name}: nonzeros of R {free}, constrained {bound}, by element {by_element}")
+    assert bound < 1.15 * free
+    assert abs(by_element - free) < 0.15 * free
+
+
+def chi2_along(steps: list[Batch], mode: str) -> np.ndarray:
+    solver, chi2 = Solver(Options(mode=mode)), []
+    for batch in steps:
+        solver.stage(batch)
+        chi2.append(solver.step().chi2)
+    return np.array(chi2)
+
+
+@pytest.mark.parametrize("name", ["intel"])
+def test_chi2_has_spikes_between_forced_batches_and_none_without(datasets: Path, name: str) -> None:
+    steps = list(read(datasets / f"{name}.g2o").steps())[:700]
+    optimum = chi2_along(steps, "all-batch")
+    counted = optimum > 1.0
+    worst = {
+        mode: float((chi2_along(steps, mode)[counted] / optimum[counted]).max())
+        for mode in ("inc-l", "inc-l-b10", "inc-l-b100")
+    }
+    print(worst)
+    assert worst["inc-l"] < 1.001
+    assert worst["inc-l-b100"] > 1.001
 
 
 @pytest.mark.data

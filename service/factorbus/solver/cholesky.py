@@ -1,5 +1,6 @@
 """The numeric factorisation RᵀR = PΛPᵀ and the solves with it, in arenas that are kept between calls."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,14 @@ class Cholesky:
             return symbolic.variable_at(failed)
         self._symbolic = symbolic
         return -1
+
+    def take(self, symbolic: Symbolic, fill: Callable[[F64], int]) -> int:
+        """R from elsewhere: `fill` writes it into the arena it is given, and gives what `factorize` does."""
+        self._symbolic = None
+        self._reserve(symbolic)
+        failed = fill(self._arena)
+        self._symbolic = symbolic if failed < 0 else None
+        return failed
 
     def solve(self, eta: F64) -> F64:
         """δ with Λδ = η, both in insertion order of the scalars."""

@@ -4,6 +4,7 @@ import numpy as np
 
 from factorbus.solver.blocks import Blocks
 from factorbus.solver.cholesky import Cholesky
+from factorbus.solver.cholmod import factorize_by_cholmod, require_cholmod
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
@@ -21,6 +22,8 @@ class Elimination:
 
     def __init__(self, options: Options) -> None:
         self._options = options
+        if options.backend == "cholmod":
+            require_cholmod()
         self._cholesky = Cholesky()
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
@@ -28,7 +31,15 @@ class Elimination:
     def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
         """Factorise Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
         symbolic = self._analysis(graph, blocks, watch)
-        failed = self._cholesky.factorize(symbolic, blocks.data, blocks.offsets, damping)
+        if self._options.backend == "cholmod":
+            failed = self._cholesky.take(
+                symbolic,
+                lambda arena: factorize_by_cholmod(
+                    symbolic, blocks.rows, blocks.cols, blocks.data, blocks.offsets, damping, arena
+                ),
+            )
+        else:
+            failed = self._cholesky.factorize(symbolic, blocks.data, blocks.offsets, damping)
         watch.lap("numeric")
         return int(failed)
 

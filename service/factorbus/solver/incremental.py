@@ -53,7 +53,7 @@ class Incremental:
         watch.lap("extract")
         self.rows.append(graph, since[at.VARIABLES])
         reach = self.rows.reach(graph, since[at.FACTORS])
-        plan = choose(reach, self._options.small_loop, self._options.big_loop)
+        plan = choose(reach, int(graph.counts[at.COLUMNS]), self._options)
         done = True
         if plan.strategy == "omega":
             done = reach.rows.size == 0 or self.rows.omega_update(graph, since[at.FACTORS], reach)

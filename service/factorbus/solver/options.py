@@ -23,6 +23,8 @@ class Options:
                     measured in standard deviations: |δ|² = δᵀΛδ = dᵀd ≤ tol χ²  (MATH §8.5)
     small_loop      smallLoopThresh: Ω-updates reach no more block rows of R than this
     big_loop        bigLoopThresh: Λ-updates reach no more; above it R is made anew in a new order
+    loop_share      in small maps both are smaller: an Ω-update reaches no more than 40 rows and this share of all, a
+                    Λ-update a quarter more, since making R anew costs what the map is large
     keep_factor     R stays in use after a step was made with it, as long as it leads there (MATH §8.6); False: it is
                     made anew at every new linearisation point, as the paper has it
     place_new       new variables first go where their own factors want them, the rest held
@@ -41,6 +43,7 @@ class Options:
     tol: float = 5e-5
     small_loop: int = 400
     big_loop: int = 500
+    loop_share: float = 0.1
     keep_factor: bool = True
     place_new: bool = True
     negligible: float = 1e-12
@@ -59,7 +62,7 @@ class Options:
             raise BadOption("small_loop, big_loop", f"{self.small_loop}, {self.big_loop}", "0 ≤ small_loop ≤ big_loop")
         if self.recent_poses < 1:
             raise BadOption("recent_poses", str(self.recent_poses), "1 or more")
-        if self.max_iterations < 1 or self.settle_iterations < 1:
+        if self.max_iterations < 0 or self.settle_iterations < 0:
             raise BadOption(
-                "max_iterations, settle_iterations", f"{self.max_iterations}, {self.settle_iterations}", "1 or more"
+                "max_iterations, settle_iterations", f"{self.max_iterations}, {self.settle_iterations}", "0 or more"
             )

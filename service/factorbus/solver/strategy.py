@@ -3,6 +3,10 @@
 from dataclasses import dataclass
 
 from factorbus.solver.block_factor import Reach
+from factorbus.solver.options import Options
+
+_FEW_ROWS = 40
+_LAMBDA_REACHES = 1.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,12 +18,13 @@ class Plan:
     rows: int = 0
 
 
-def choose(reach: Reach, small_loop: int, big_loop: int) -> Plan:
-    """The update for what the new factors reach in R: smallLoopThresh and bigLoopThresh are in block rows of R."""
-    size = int(reach.rows.size)
-    loop = f"a loop over {reach.span} block columns that reaches {size}"
-    if size <= small_loop:
-        return Plan("omega", f"{loop}, no more than small_loop = {small_loop}", size)
-    if size <= big_loop:
-        return Plan("lambda", f"{loop}, no more than big_loop = {big_loop}", size)
-    return Plan("full", f"{loop}, more than big_loop = {big_loop}")
+def choose(reach: Reach, columns: int, options: Options) -> Plan:
+    """The update for what the new factors reach in R, which has `columns` block columns."""
+    size, share = int(reach.rows.size), _FEW_ROWS + options.loop_share * columns
+    small, big = min(options.small_loop, share), min(options.big_loop, _LAMBDA_REACHES * share)
+    loop = f"a loop over {reach.span} of {columns} block columns that reaches {size}"
+    if size <= small:
+        return Plan("omega", f"{loop}, no more than smallLoopThresh = {small:.0f}", size)
+    if size <= big:
+        return Plan("lambda", f"{loop}, no more than bigLoopThresh = {big:.0f}", size)
+    return Plan("full", f"{loop}, more than bigLoopThresh = {big:.0f}")
