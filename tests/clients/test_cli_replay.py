@@ -17,6 +17,7 @@ from factorbus.cli.children import service
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.main import main
 from factorbus.client import connect
+from factorbus.datasets import named
 from factorbus.formats import read
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
@@ -41,11 +42,10 @@ def local(town: Path) -> dict[str, Any]:
     return replayed(town, "--in-process", "--every", "100")
 
 
-def replayed(*arguments: "str | Path") -> dict[str, Any]:
+def replayed(*arguments: "str | Path", timeout_s: float = 100) -> dict[str, Any]:
     """The document, which must be all there is on standard output."""
-    ran = subprocess.run(
-        [FACTORBUS, "replay", *map(str, arguments), "--json"], capture_output=True, text=True, timeout=100, check=False
-    )
+    command = [FACTORBUS, "replay", *map(str, arguments), "--json"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     assert ran.returncode == OK, ran.stderr
     return json.loads(ran.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
@@ -128,6 +128,34 @@ def test_intel_ends_at_the_reference_optimum(datasets: Path) -> None:
     assert found["chi2"] == pytest.approx(546.46111, rel=1e-6)
     assert found["chi2_initial"] == pytest.approx(205887.287, rel=1e-6)
     assert (found["poses"], found["factors"]) == (943, 1837)
+
+
+@pytest.mark.data
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "killian",
+        "killian_freiburg",
+        "manhattan3500",
+        "sphere2500",
+        "citytrees10000",
+        "victoria_park",
+        "city10000",
+        "w10000",
+    ],
+)
+def test_a_data_set_over_the_bus_ends_at_the_reference_optimum(datasets: Path, name: str) -> None:
+    known = named(name)
+    found = replayed(datasets / known.file, timeout_s=1800)
+    print(
+        f"{name}: {found['seconds']:.0f} s, solver {found['solver_cpu_s']:.1f} s CPU, step p99 "
+        f"{found['step_ms']['p99']:.1f} ms, χ² {found['chi2']:.12g} ({found['chi2'] / known.optimum - 1:+.1e})"
+    )
+    assert (found["poses"], found["landmarks"]) == (known.poses, known.landmarks)
+    assert found["steps"] == known.poses
+    assert found["settled"]
+    assert found["chi2"] == pytest.approx(known.optimum, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import json
 import runpy
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -371,9 +370,7 @@ def test_no_structure_does_harm(content: Any) -> None:
 
 
 def decodes_or_refuses(decode: Callable[[bytes], Any], data: bytes) -> None:
-    start = time.process_time()
     try:
         decode(data)
     except (BadMessage, TooLarge) as problem:
         codec.decode_problem(codec.encode_problem(problem))  # and it can be told
-    assert time.process_time() - start < 0.1
