@@ -211,7 +211,7 @@ def test_cholmod_gives_the_same_r(seed: int) -> None:
 
 
 def test_a_backend_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sksparse", None)
+    monkeypatch.setitem(sys.modules, "sksparse.cholmod", None)
     with pytest.raises(errors.NoBackend, match="scikit-sparse") as caught:
         Solver(Options(backend="cholmod"))
     assert caught.value.code == "no_backend"

@@ -53,7 +53,8 @@ class Incremental:
         watch.lap("extract")
         self.rows.append(graph, since[at.VARIABLES])
         reach = self.rows.reach(graph, since[at.FACTORS])
-        plan = choose(reach, int(graph.counts[at.COLUMNS]), self._options)
+        new, columns = int(graph.counts[at.FACTORS]) - since[at.FACTORS], int(graph.counts[at.COLUMNS])
+        plan = choose(reach, new, columns, self._options)
         done = True
         if plan.strategy == "omega":
             done = reach.rows.size == 0 or self.rows.omega_update(graph, since[at.FACTORS], reach)

@@ -23,8 +23,8 @@ class Options:
                     measured in standard deviations: |δ|² = δᵀΛδ = dᵀd ≤ tol χ²  (MATH §8.5)
     small_loop      smallLoopThresh: Ω-updates reach no more block rows of R than this
     big_loop        bigLoopThresh: Λ-updates reach no more; above it R is made anew in a new order
-    loop_share      in small maps both are smaller: an Ω-update reaches no more than 40 rows and this share of all, a
-                    Λ-update a quarter more, since making R anew costs what the map is large
+    loop_share      in small maps both are smaller: no more than 40 rows and this share of all, since making R anew
+                    costs what the map is large
     keep_factor     R stays in use after a step was made with it, as long as it leads there (MATH §8.6); False: it is
                     made anew at every new linearisation point, as the paper has it
     place_new       new variables first go where their own factors want them, the rest held

@@ -23,8 +23,9 @@ from factorbus.solver.system import System
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
-# Below this share of steps in which the old R served, it pays more not to try: a try costs a linearisation.
-_LEAST_TRUST, _LEARN, _TRY_AGAIN = 0.4, 0.1, 8
+# The old R is tried while it served in more than _LEAST_TRUST + _DEAR · (factors per variable) of the steps that tried
+# lately: a try that fails costs two linearisations, one that does not saves a factorisation.
+_LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 _REUSE = 0.05
 
 
@@ -206,8 +207,8 @@ class Solver:
     def _keeps(self, had_factor: bool, course: Course) -> bool:
         """Whether R is to stay in use at the new linearisation point.
 
-        It is where that has led to the new optimum lately, in more than `_LEAST_TRUST` of the steps that tried; else
-        every `_TRY_AGAIN`-th of the steps that move tries, to find out.
+        It is where that has led to the new optimum often enough lately; else every `_TRY_AGAIN`-th of the steps that
+        move tries, to find out.
         """
         if not self._options.keep_factor:
             return False
@@ -216,7 +217,8 @@ class Solver:
         if had_factor:
             self._trust += (0.0 if course.factorisations else _LEARN) - _LEARN * self._trust
         self._moves += 1
-        return self._trust > _LEAST_TRUST or self._moves % _TRY_AGAIN == 0
+        dear = _LEAST_TRUST + _DEAR * self.factor_count / self.variable_count
+        return self._trust > dear or self._moves % _TRY_AGAIN == 0
 
     def _extend(self, added: float) -> Course:
         """Nothing moves: what is new has the values it was given or composed to."""

@@ -6,7 +6,8 @@ from factorbus.solver.block_factor import Reach
 from factorbus.solver.options import Options
 
 _FEW_ROWS = 40
-_LAMBDA_REACHES = 1.25
+# An Ω-update costs as much as Ω has rows, a Λ-update does not: with more factors than these the latter is for it.
+_FEW_FACTORS = 24
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,13 +19,14 @@ class Plan:
     rows: int = 0
 
 
-def choose(reach: Reach, columns: int, options: Options) -> Plan:
-    """The update for what the new factors reach in R, which has `columns` block columns."""
+def choose(reach: Reach, factors: int, columns: int, options: Options) -> Plan:
+    """The update for what that many new factors reach in R, which has `columns` block columns."""
     size, share = int(reach.rows.size), _FEW_ROWS + options.loop_share * columns
-    small, big = min(options.small_loop, share), min(options.big_loop, _LAMBDA_REACHES * share)
+    small, big = min(options.small_loop, share), min(options.big_loop, share)
     loop = f"a loop over {reach.span} of {columns} block columns that reaches {size}"
-    if size <= small:
+    if size <= small and factors <= _FEW_FACTORS:
         return Plan("omega", f"{loop}, no more than smallLoopThresh = {small:.0f}", size)
     if size <= big:
-        return Plan("lambda", f"{loop}, no more than bigLoopThresh = {big:.0f}", size)
+        many = f", by {factors} factors at once" if size <= small else ""
+        return Plan("lambda", f"{loop}{many}, no more than bigLoopThresh = {big:.0f}", size)
     return Plan("full", f"{loop}, more than bigLoopThresh = {big:.0f}")
