@@ -17,7 +17,7 @@ from factorbus.cli.children import service
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.main import main
 from factorbus.client import connect
-from factorbus.datasets import named
+from factorbus.datasets import CATALOGUE, named
 from factorbus.formats import read
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
@@ -146,7 +146,7 @@ def test_intel_ends_at_the_reference_optimum(datasets: Path) -> None:
     ],
 )
 def test_a_data_set_over_the_bus_ends_at_the_reference_optimum(datasets: Path, name: str) -> None:
-    known = named(name)
+    known = named(name, CATALOGUE)
     found = replayed(datasets / known.file, timeout_s=1800)
     print(
         f"{name}: {found['seconds']:.0f} s, solver {found['solver_cpu_s']:.1f} s CPU, step p99 "
