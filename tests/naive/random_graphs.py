@@ -38,7 +38,10 @@ def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Gen
         space = CONNECTS[kind][0]
         return boxplus(space, pose_vector(relative), noise * rng.normal(size=TANGENT[space]))
     zero = np.zeros(FACTOR_KINDS[kind].size)
-    return residual(kind, ends, zero) + noise * rng.normal(size=len(zero))
+    z = residual(kind, ends, zero) + noise * rng.normal(size=len(zero))
+    if kind.startswith("bearing_range"):
+        z[1] = abs(z[1])  # a sensor next to the point still measures a distance
+    return z
 
 
 def factor(kind: str, keys: list[int], truth: dict[int, np.ndarray], noise: float, rng: np.random.Generator) -> Factors:
