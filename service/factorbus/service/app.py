@@ -69,13 +69,19 @@ def serve(config: Config, on_ready: Callable[[list[str]], None], stop: threading
 
 def _get_ready_to_compute(config: Config) -> None:
     if config.warm:
-        from factorbus.solver import warm
+        from factorbus.solver import compiled_seconds, warm
 
-        seconds = warm(lambda name: log.info("compiling kernels: %s", name))
+        seconds = warm(lambda name: _announce(name, compiled_seconds()))
         log.info("kernels ready after %.1f s", seconds)
     # The compiler leaves some hundred thousand objects that live on: not walking them again saves pauses of 0.1 s.
     gc.collect()
     gc.freeze()
+
+
+def _announce(kernels: str, compiled_s: float) -> None:
+    """On a cold start, say what is being compiled; loading what was compiled before takes no time worth a line."""
+    if compiled_s:
+        log.info("compiling kernels: %s", kernels)
 
 
 class _Map:

@@ -38,9 +38,9 @@ def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event)
     """
     checked(config)
     if config.warm:
-        from factorbus.solver import warm
+        from factorbus.solver import compiled_seconds, warm
 
-        seconds = warm(lambda name: log.info("compiling kernels: %s", name))
+        seconds = warm(lambda name: _announce(name, compiled_seconds()))
         log.info("kernels ready after %.1f s", seconds)
     sys.setswitchinterval(0.0005)
     session = _open(config, stop)
@@ -50,6 +50,12 @@ def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event)
         _take_jobs(session, config.name or f"w{secrets.token_hex(4)}", config.slots, on_ready, stop)
     finally:
         session.close()
+
+
+def _announce(kernels: str, compiled_s: float) -> None:
+    """On a cold start, say what is being compiled; loading what was compiled before takes no time worth a line."""
+    if compiled_s:
+        log.info("compiling kernels: %s", kernels)
 
 
 def _open(config: Config, stop: threading.Event) -> zenoh.Session | None:
