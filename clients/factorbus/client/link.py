@@ -112,7 +112,7 @@ def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str,
                     timeout_s,
                     "start a service there with `factorbus serve`, or check the address",
                 ) from None
-        time.sleep(pause)
+        time.sleep(pause)  # there is nothing to wait on: nobody is there yet who could say that they are
         pause = min(2 * pause, _LONGEST_PAUSE_S)
 
 

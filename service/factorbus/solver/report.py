@@ -10,7 +10,8 @@ class StepReport:
     """What one step did.
 
     mode         the solver's mode
-    strategy     "all-batch": the system was factorised; "extend": the gradient was zero, there was nothing to solve
+    strategy     "extend": the gradient was zero, there was nothing to solve; "omega", "lambda", "full": how R was
+                 brought up to date in the incremental modes (MATH §8); "all-batch": all was factorised, in that mode
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
     chi2, chi2_before        Σ rᵀ Ω r of all factors after and before solving (the new factors included in both)
