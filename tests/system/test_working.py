@@ -12,6 +12,7 @@ from zenoh.handlers import Callback
 
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Batch, Chi2, Insert
+from factorbus.solver import Options
 
 Spawn = Callable[..., Process]
 QUESTION = codec.encode_map({"batch": True, "timeout_s": 60})
@@ -98,6 +99,14 @@ def test_a_worker_may_come_before_its_service_and_leave_before_it(spawn: Spawn) 
     early = spawn("-m", "factorbus.workers", "--connect", "tcp/127.0.0.1:1", "--no-warm")
     early.signal(signal.SIGINT)
     assert early.wait() in (0, -signal.SIGINT), "stopped while waiting, or before it could listen to signals"
+
+
+def test_stats_name_the_thresholds_in_force(spawn: Spawn) -> None:
+    with service(spawn) as (_, _, client):
+        told = client.stats("m")
+        assert told["options"] == Options(mode=told["mode"]).as_dict()
+        assert told["options"]["small_loop"] > 0
+        assert "clock" not in told["options"]
 
 
 def wait_for(client: Bare, token: str) -> None:

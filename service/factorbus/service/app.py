@@ -85,10 +85,10 @@ def _announce(kernels: str, compiled_s: float) -> None:
 
 
 class _Map:
-    """A map, its place on the bus, and the end of it."""
+    """A map, its place on the bus, the options of its solver, and the end of it."""
 
-    def __init__(self, host: Host, place: Place) -> None:
-        self.host, self.place = host, place
+    def __init__(self, host: Host, place: Place, options: dict[str, Any]) -> None:
+        self.host, self.place, self.options = host, place, options
         self.drained = threading.Event()
         self.on_drained: Callable[[], None] = self.drained.set
 
@@ -212,8 +212,9 @@ class Shell:
     def _make(self, name: str, mode: str) -> _Map:
         from factorbus.solver import Options, Solver
 
+        options = Options(mode=mode, clock=time.perf_counter)
         core = MapCore(name, mode, secrets.randbits(62) | 1, self._config.limits, time.monotonic())
-        folder = Folder(lambda: Solver(Options(mode=mode, clock=time.perf_counter)), core.epoch, self._config.limits)
+        folder = Folder(lambda: Solver(options), core.epoch, self._config.limits)
 
         def perform(effects: list[Effect]) -> None:
             self._perform(made, effects)
@@ -221,7 +222,8 @@ class Shell:
         def answer_reads(reads: Sequence[Read], taken: Snapshot) -> None:
             self._desk.hand(self._answer_reads, made, reads, taken)
 
-        made = _Map(Host(core, folder, perform, answer_reads), self._bus.place(name, self._service))
+        host = Host(core, folder, perform, answer_reads)
+        made = _Map(host, self._bus.place(name, self._service), options.as_dict())
         return made
 
     def _perform(self, found: _Map, effects: list[Effect]) -> None:
@@ -229,7 +231,7 @@ class Shell:
         sending: list[Effect] = []
         for effect in effects:
             if isinstance(effect, Tell):
-                self._desk.hand(self._tell, effect.asker, effect.content)
+                self._desk.hand(self._tell, effect.asker, effect.content | {"options": found.options})
             elif isinstance(effect, Drained):
                 found.on_drained()
             else:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from factorbus.solver.errors import BadOption
 from factorbus.solver.modes import MODES, mode_named
@@ -66,3 +66,7 @@ class Options:
             raise BadOption(
                 "max_iterations, settle_iterations", f"{self.max_iterations}, {self.settle_iterations}", "0 or more"
             )
+
+    def as_dict(self) -> dict[str, Any]:
+        """All settings but the clock, as plain types: what a solver reports of itself."""
+        return {name: getattr(self, name) for name in self.__slots__ if name != "clock"}
