@@ -121,6 +121,45 @@ def test_the_hash_sees_names_and_contents(kernels):
     assert len({first, second, _jit.sources_hash(kernels)}) == 3
 
 
+def test_kernels_of_another_folder_have_a_cache_of_their_own_and_exact_ones_round_as_written(tmp_path):
+    folder = tmp_path / "others"
+    folder.mkdir()
+    script = (
+        "import numpy as np\n"
+        "from pathlib import Path\n"
+        "from factorbus.solver.kernels import _jit\n"
+        "import others.sums\n"
+        "a = np.array([3.0, 1e17, -1e17, 1.0])\n"
+        "print(others.sums.total(a), _jit.compiled_seconds() > 0.0, others.sums.FOLDER.path().name)\n"
+    )
+    text = (
+        "from pathlib import Path\n"
+        "from factorbus.solver.kernels import _jit\n"
+        "FOLDER = _jit.KernelFolder(Path(__file__).parent, 'sums', exact=True)\n"
+        "@FOLDER.kernel('float64(float64[::1])')\n"
+        "def total(a):\n"
+        "    s = 0.0\n"
+        "    for k in range(a.size):\n"
+        "        s += {} * a[k]\n"
+        "    return s\n"
+    )
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    seen = []
+    for factor in (1.0, 1.0, 2.0):
+        (folder / "sums.py").write_text(text.format(factor))
+        environment = {**clean, "PYTHONPATH": str(tmp_path), "FACTORBUS_CACHE": str(tmp_path / "cache")}
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stderr
+        seen.append(done.stdout.split())
+    # In the order written 3 is lost in 1e17 and 1 is not; any other order gives another sum.
+    assert [(value, compiled) for value, compiled, _ in seen] == [("1.0", "True"), ("1.0", "False"), ("2.0", "True")]
+    names = {name for *_, name in seen}
+    assert len(names) == 2
+    assert {path.name for path in (tmp_path / "cache" / "sums").iterdir()} == names
+
+
 @_jit.kernel("float64(float64[::1])")
 def first_of(a):
     return a[0]

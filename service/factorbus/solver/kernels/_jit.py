@@ -8,6 +8,7 @@
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
 numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
 stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder.
+Kernels that live in another folder have a `KernelFolder` of their own, and the same rule for that one.
 
 FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).
 NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
@@ -40,6 +41,7 @@ __all__ = [
     "DISABLED",
     "F64",
     "I64",
+    "KernelFolder",
     "cache_folder",
     "cgutils",
     "compiled_seconds",
@@ -64,29 +66,68 @@ BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
 
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
-_FLAGS: dict[str, Any] = {"nogil": True, "fastmath": _FASTMATH, "error_model": "numpy"}
+_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _KEPT_FOLDERS = 6
 
 
-def kernel(*signatures: Any) -> Any:
-    """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
-    if len(signatures) == 1 and callable(signatures[0]):
-        return _compiled(signatures[0], ())
-    return lambda function: _compiled(function, signatures)
+class KernelFolder:
+    """The decorators for the kernels of one folder of sources, and where they are kept.
 
+    family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
+    is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
+    """
 
-def inline_kernel(function: Callable[..., Any]) -> Any:
-    """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
-    if DISABLED:
-        return function
-    return _ours(numba.njit(forceinline=True, **_FLAGS)(function))
+    def __init__(self, sources: Path, family: str, exact: bool = False) -> None:
+        self._sources, self._family, self._flags = sources, family, _EXACT_FLAGS if exact else _FLAGS
+        self._cache = _cache_in(self)
+        self._path: Path | None = None
 
+    def kernel(self, *signatures: Any) -> Any:
+        """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
+        if len(signatures) == 1 and callable(signatures[0]):
+            return self._compiled(signatures[0], ())
+        return lambda function: self._compiled(function, signatures)
 
-def part(function: Callable[..., Any]) -> Any:
-    """A step of a kernel, kept on disk with the kernel that calls it."""
-    if DISABLED:
-        return function
-    return _ours(numba.njit(**_FLAGS)(function))
+    def inline_kernel(self, function: Callable[..., Any]) -> Any:
+        """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
+        if DISABLED:
+            return function
+        return _ours(numba.njit(forceinline=True, **self._flags)(function))
+
+    def part(self, function: Callable[..., Any]) -> Any:
+        """A step of a kernel, kept on disk with the kernel that calls it."""
+        if DISABLED:
+            return function
+        return _ours(numba.njit(**self._flags)(function))
+
+    def path(self) -> Path:
+        """The cache folder, made when it is first asked for."""
+        if self._path is None:
+            self._path = self._make()
+        return self._path
+
+    def _compiled(self, function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
+        if DISABLED:
+            return function
+        dispatcher = _ours(numba.njit(**self._flags)(function))
+        dispatcher._cache = self._cache(function)
+        dispatcher.factorbus_signatures = signatures
+        if signatures:
+            dispatcher._compile_for_args = _on_first_call(dispatcher)
+        return dispatcher
+
+    def _make(self) -> Path:
+        base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
+        path = base / self._family / sources_hash(self._sources)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=path).close()
+            os.utime(path)
+        except OSError as problem:
+            return _temporary(path.parent, problem)
+        _prune(path.parent, keep=path)
+        return path
 
 
 def compiled_seconds() -> float:
@@ -116,9 +157,9 @@ def cache_folder() -> Path:
 
 
 def sources_hash(folder: Path) -> str:
-    """The name of the cache folder for kernels whose sources are the Python files in `folder`."""
+    """The name of the cache folder for kernels whose sources are the Python files in `folder`, and this one."""
     digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in sorted({*folder.glob("*.py"), Path(__file__)}, key=lambda path: path.name):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
     features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
@@ -135,17 +176,6 @@ def sources_hash(folder: Path) -> str:
         ).encode()
     )
     return digest.hexdigest()[:20]
-
-
-def _compiled(function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
-    if DISABLED:
-        return function
-    dispatcher = _ours(numba.njit(**_FLAGS)(function))
-    dispatcher._cache = _KernelCache(function)
-    dispatcher.factorbus_signatures = signatures
-    if signatures:
-        dispatcher._compile_for_args = _on_first_call(dispatcher)
-    return dispatcher
 
 
 def _compile_declared(dispatcher: Any) -> None:
@@ -181,30 +211,6 @@ class _Compilations(event.TimingListener):
             super().notify(event)
 
 
-class _Folder:
-    """The cache folder, made when the first kernel is declared."""
-
-    def __init__(self) -> None:
-        self._path: Path | None = None
-
-    def path(self) -> Path:
-        if self._path is None:
-            self._path = self._make()
-        return self._path
-
-    def _make(self) -> Path:
-        base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser() / "kernels"
-        path = base / sources_hash(Path(__file__).parent)
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=path).close()
-            os.utime(path)
-        except OSError as problem:
-            return _temporary(base, problem)
-        _prune(base, keep=path)
-        return path
-
-
 def _temporary(base: Path, problem: OSError) -> Path:
     path = Path(tempfile.mkdtemp(prefix="factorbus-kernels-"))
     atexit.register(shutil.rmtree, path, ignore_errors=True)
@@ -225,34 +231,37 @@ def _prune(base: Path, keep: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-class _Locator(caching._CacheLocator):
-    """Places a kernel in the folder above.  The folder's name stands for the sources, so nothing else is stamped."""
+def _cache_in(folder: KernelFolder) -> type[caching.FunctionCache]:
+    """Numba's cache of a function, in `folder`.  The folder's name stands for the sources: nothing else is stamped."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._name = f"{function.__module__}.{function.__qualname__}"
+    class Locator(caching._CacheLocator):
+        def __init__(self, function: Callable[..., Any]) -> None:
+            self._name = f"{function.__module__}.{function.__qualname__}"
 
-    def get_cache_path(self) -> str:
-        return str(cache_folder())
+        def get_cache_path(self) -> str:
+            return str(folder.path())
 
-    def get_source_stamp(self) -> str:
-        return self._name
+        def get_source_stamp(self) -> str:
+            return self._name
 
-    def get_disambiguator(self) -> str:
-        return hashlib.sha256(self._name.encode()).hexdigest()[:8]
+        def get_disambiguator(self) -> str:
+            return hashlib.sha256(self._name.encode()).hexdigest()[:8]
 
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_Locator":
-        return cls(py_func)
+        @classmethod
+        def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "Locator":
+            return cls(py_func)
 
+    class Content(caching.CompileResultCacheImpl):
+        _locator_classes = (Locator,)
 
-class _KernelCacheContent(caching.CompileResultCacheImpl):
-    _locator_classes = (_Locator,)
+    class Cache(caching.FunctionCache):
+        _impl_class = Content
 
-
-class _KernelCache(caching.FunctionCache):
-    _impl_class = _KernelCacheContent
+    return Cache
 
 
 _COMPILATIONS = _Compilations()
-_FOLDER = _Folder()
 event.register("numba:compile", _COMPILATIONS)
+
+_FOLDER = KernelFolder(Path(__file__).parent, "kernels")
+kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part
