@@ -40,7 +40,7 @@ def command(context: click.Context, as_json: bool) -> None:
     \b
     factorbus datasets
     factorbus datasets fetch intel
-    factorbus replay $(factorbus datasets path intel)
+    factorbus replay intel
 
     \b
     In the list:

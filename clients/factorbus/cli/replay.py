@@ -1,8 +1,8 @@
-"""`factorbus replay`: a graph file through a map, pose by pose, as a robot would have sent it."""
+"""`factorbus replay`: a graph file or a data set through a map, pose by pose, as a robot would have sent it."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,13 +68,13 @@ class Request:
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO .graph or iSAM text) through a map, pose by pose.
+    """Drive FILE (g2o, TORO .graph or iSAM text, or the name of a data set) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
 
     \b
-    factorbus replay intel.g2o
+    factorbus replay intel
     factorbus replay intel.g2o --every 100 --plot intel.png
     factorbus replay intel.g2o --connect tcp/127.0.0.1:7447 --map lab --tum lab.tum
     factorbus replay intel.g2o --in-process --json
@@ -102,10 +102,12 @@ def replay(request: Request) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document."""
     from factorbus.cli import screen
     from factorbus.cli.drive import drive
+    from factorbus.cli.replay_source import source_of
     from factorbus.formats import read
 
     if request.plot:
         require("viz", "--plot")
+    request = replace(request, file=source_of(request.file))
     graph = read(request.file)
     for text in graph.notes:
         screen.note(f"{request.file}: {text}")
