@@ -2,8 +2,9 @@
 
     python tests/bench/cholesky.py [--json] [--repetitions N] [NAME ...]
 
-NAME: generated problems (grid2d, grid3d) and data sets of FACTORBUS_DATASETS (city10000, sphere2500, ...); by default
-the two generated ones and, where there are data sets, city10000, sphere2500, manhattan3500 and victoria_park.
+NAME: generated problems (grid2d, grid3d) and data sets (city10000, sphere2500, ...; `factorbus datasets` says which
+are here); by default the two generated ones and, where they are here, city10000, sphere2500, manhattan3500 and
+victoria_park.
 
 Both sides get the matrix in final elimination order, so CHOLMOD has nothing to permute, and only the lower triangle,
 all that it reads.  Thread CPU time, repetitions interleaved, ratios taken within a repetition, medians.  CHOLMOD is as
@@ -27,10 +28,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from bench.replays.problems import file_of
 from naive.block_systems import BlockSystem, grid
 from scipy.sparse import csc_matrix, tril
 from sksparse.cholmod import analyze as cholmod_analyze
 
+from factorbus.datasets import find
 from factorbus.formats import read
 from factorbus.solver import Options, Solver
 from factorbus.solver.cholesky import Cholesky
@@ -52,14 +55,13 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=15)
     options = parser.parse_args()
     core = pin()
-    folder = Path(os.environ.get("FACTORBUS_DATASETS", ""))
-    names = options.names or [*GENERATED, *(name for name in DATASETS if (folder / f"{name}.g2o").is_file())]
+    names = options.names or [*GENERATED, *(name for name in DATASETS if find(name))]
     report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "lanes": LANES, "problems": []}
     if not options.json:
         print(f"CHOLMOD uses {', '.join(report['cholmod_blas'])}; one thread on core {core}; {LANES} lanes")
         print(HEAD)
     for name in names:
-        system = GENERATED[name]() if name in GENERATED else final_system(folder / f"{name}.g2o")
+        system = GENERATED[name]() if name in GENERATED else final_system(file_of(name))
         row = {"name": name, **measure(system, options.repetitions)}
         report["problems"].append(row)
         if not options.json:

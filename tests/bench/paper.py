@@ -161,7 +161,7 @@ def _bars(total: int) -> Any:
         def begin(what: str, problem: Problem) -> None:
             bars.update(jobs, completed=begun[0])
             begun[0] += 1
-            bars.reset(job, description=what, total=_STEPS.get(problem.key, problem.poses) or None, word="")
+            bars.reset(job, description=what, total=problem.steps, word="")
             if not console.is_terminal:
                 console.print(f"[{begun[0]}/{total}] {what}", highlight=False)
 
@@ -170,16 +170,6 @@ def _bars(total: int) -> Any:
 
         yield begin, progress
         bars.update(jobs, completed=total)
-
-
-_STEPS = {
-    "manhattan3500": 3500,
-    "w10000": 10000,
-    "citytrees10000": 10000,
-    "intel": 943,
-    "killian": 1941,
-    "victoria_park": 6969,
-}
 
 
 def _hand_out(document: dict[str, Any], text: str, options: argparse.Namespace) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 from bench.replays import figures, runner
 from bench.replays.contestants import ENTRIES
-from bench.replays.problems import Problem, choose
+from bench.replays.problems import ALL, Problem, choose, load
 from bench.replays.table import table_1
 
 WORLD = Problem("manhattan", "Manhattan", poses=60, seed=2)
+EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
 PAPER = Path(__file__).parent / "paper.py"
 
 
@@ -56,13 +57,32 @@ def test_a_process_that_ends_early_is_a_row_and_is_tried_again(tmp_path: Path, m
 
 def test_problems_are_worlds_where_there_are_no_data_sets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FACTORBUS_DATASETS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     problems, note = choose(quick=True)
     assert all(problem.is_world for problem in problems)
     assert "simulated worlds" in note
+    assert "Not on this machine: manhattan3500, " in note
+
+
+@pytest.mark.parametrize("folder", ["own", "cache/factorbus/datasets"])
+def test_data_sets_are_found_by_name(folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FACTORBUS_DATASETS", str(tmp_path / "own"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / folder / "sphere2500.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n" + EDGE)
+    found, note = choose(quick=False, of=ALL)
+    names = [problem.name for problem in found]
+    assert "sphere2500" in names
+    assert set(names) <= {"sphere2500", "victoria_park", "w10000_toro"}, "the wheel of gtsam may have the last two"
+    assert "intel" in note
+    assert len(load(found[names.index("sphere2500")])) == 2
+    assert load(found[names.index("sphere2500")].shortened(1))[0].variable_count == 1
+    with pytest.raises(FileNotFoundError, match="factorbus datasets fetch intel"):
+        load(Problem("intel", "Intel"))
 
 
 def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
-    environment = {**os.environ, "FACTORBUS_DATASETS": str(tmp_path / "none")}
+    environment = {**os.environ, "FACTORBUS_DATASETS": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, str(PAPER), "--quick", "--only", "city_trees,all-batch", "--samples", "30"]
     command += ["--out", str(tmp_path), "--json"]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110, check=False)

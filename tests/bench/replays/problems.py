@@ -1,12 +1,12 @@
-"""What is replayed: the data sets of the 2013 paper by name, or simulated worlds where there are none."""
+"""What is replayed: public data sets by name, or simulated worlds where there are none."""
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from factorbus.datasets import CATALOGUE, Places, find, locate, named
 from factorbus.formats import read
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS
@@ -46,6 +46,11 @@ class Problem:
         """The name in file names and rows."""
         return f"{self.name}-{self.poses}" if self.poses else self.name
 
+    @property
+    def steps(self) -> int:
+        """How many a replay has: one a pose."""
+        return self.poses or named(self.name, CATALOGUE).poses
+
     def shortened(self, poses: int) -> "Problem":
         """The first `poses` poses of it; their optimum is not a published one."""
         return Problem(self.name, self.title, poses, None, self.seed)
@@ -56,14 +61,8 @@ class Problem:
 
 
 # The optima are the lowest χ² that several solvers from several starts agree on, to nine digits or more.
-PAPER = (
-    Problem("manhattan3500", "Manhattan", optimum=6532.7447),
-    Problem("w10000", "10k", optimum=171545.447),
-    Problem("citytrees10000", "CityTrees10k", optimum=8668.9281),
-    Problem("intel", "Intel", optimum=546.46111),
-    Problem("killian", "Killian", optimum=5.760417e-8),
-    Problem("victoria_park", "Victoria Park", optimum=6184.1206),
-)
+ALL = tuple(Problem(each.name, each.paper or each.name, optimum=each.optimum) for each in CATALOGUE)
+PAPER = tuple(problem for problem, each in zip(ALL, CATALOGUE, strict=True) if each.paper)
 # Stand-ins of a few seconds.
 SIMULATED = (
     Problem("manhattan", "Manhattan", poses=1200, seed=1),
@@ -73,35 +72,29 @@ SIMULATED = (
 QUICK = {"intel": 0, "killian": 0, "manhattan3500": 1000}
 
 
-def dataset_folder() -> Path:
-    """FACTORBUS_DATASETS, or the cache."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    return Path(os.environ.get("FACTORBUS_DATASETS", cache / "factorbus" / "datasets"))
+def choose(quick: bool, of: Sequence[Problem] = PAPER) -> tuple[list[Problem], str]:
+    """The problems to replay, and a note for the reader when they are not all of those data sets.
 
-
-def choose(quick: bool) -> tuple[list[Problem], str]:
-    """The problems to replay, and a note for the reader when they are not the paper's data sets."""
-    folder = dataset_folder()
-    there = [problem for problem in PAPER if (folder / f"{problem.name}.g2o").is_file()]
-    if not there:
-        worlds = [problem.shortened(600) for problem in SIMULATED] if quick else list(SIMULATED)
-        return worlds, (
-            f"There are no data sets in {folder} (FACTORBUS_DATASETS): these are simulated worlds, which say nothing "
-            "about the paper's table."
-        )
-    missing = [problem.name for problem in PAPER if problem not in there]
-    note = f"Missing in {folder}: {', '.join(missing)}." if missing else ""
-    if not quick:
+    A data set is looked for by name: in FACTORBUS_DATASETS, in the cache, in the gtsam wheel.
+    """
+    places = Places.of_this_machine()
+    there = [problem for problem in of if locate(named(problem.name, CATALOGUE), places)]
+    missing = [problem.name for problem in of if problem not in there]
+    note = f"Not on this machine: {', '.join(missing)} (factorbus datasets fetch --all)." if missing else ""
+    if quick:
+        there = [p.shortened(QUICK[p.name]) if QUICK[p.name] else p for p in there if p.name in QUICK]
+        note = f"{note} A quick run: few data sets, some of them shortened.".strip()
+    if there:
         return there, note
-    short = [p.shortened(QUICK[p.name]) if QUICK[p.name] else p for p in there if p.name in QUICK]
-    return short, f"{note} A quick run: few data sets, some of them shortened.".strip()
+    worlds = [problem.shortened(600) for problem in SIMULATED] if quick else list(SIMULATED)
+    return worlds, f"{note} These are simulated worlds, which say nothing about the data sets."
 
 
 def load(problem: Problem) -> Sequence[Batch]:
     """Its replay: one batch a pose, without values but that of the first pose, which is fixed.  Raises FormatError."""
     if problem.is_world:
         return [step.batch for step in WORLDS[problem.name](problem.poses, problem.seed)]
-    steps = read(_file(problem)).steps()
+    steps = read(file_of(problem.name)).steps()
     return steps[: problem.poses] if problem.poses else steps
 
 
@@ -112,9 +105,14 @@ def fingerprint(problem: Problem) -> str:
         for source in sorted(Path(WORLDS[problem.name].__code__.co_filename).parent.glob("*.py")):
             said.update(source.read_bytes())
     else:
-        said.update(_file(problem).read_bytes())
+        said.update(file_of(problem.name).read_bytes())
     return said.hexdigest()
 
 
-def _file(problem: Problem) -> Path:
-    return dataset_folder() / f"{problem.name}.g2o"
+def file_of(name: str) -> Path:
+    """The file of a data set; what only the gtsam wheel has is converted into the cache.  Raises DatasetProblem,
+    FileNotFoundError."""
+    path = find(name)
+    if path is None:
+        raise FileNotFoundError(f"data set {name} is not on this machine: factorbus datasets fetch {name}")
+    return path

@@ -109,7 +109,8 @@ def _remembered(
 def _do(settings: Settings, problem: Problem, job: dict[str, Any], progress: Progress, wall_s: float) -> dict[str, Any]:
     """The result of a job in a child process.  Raises Crashed."""
     job = {**job, "problem": problem.as_json(), "samples": settings.samples, "core": settings.core}
-    environment = {**os.environ, "PYTHONPATH": str(_HERE.parents[1]), "PYTHONUNBUFFERED": "1"}
+    paths = os.pathsep.join(filter(None, (str(_HERE.parents[1]), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
     for library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
         environment[f"{library}_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as folder, open(Path(folder) / "said", "w+") as said:
