@@ -170,12 +170,20 @@ def a_row(dataset: str, name: str, **more: object) -> dict[str, object]:
 
 def verdicts(*rows: dict[str, object], dataset: str = "w10000") -> dict[str, str]:
     judged = targets.judge(rows, {dataset: 100.0}, {})
-    return {name: v.verdict for v in judged for name in ("within", "takes", "less time", "never") if name in v.what}
+    words = ("within", "takes", "less time", "never", "no further", "b10 and b100 rise")
+    return {word: v.verdict for v in judged for word in words if word in v.what}
 
 
 def test_targets_are_met_missed_or_not_measured() -> None:
     ours, slow = a_row("w10000", "inc-l"), a_row("w10000", "all-batch", cpu_s=1.81)
-    assert set(verdicts(ours, slow).values()) == {targets.MET}
+    spikes = {**a_row("w10000", "x")["chi2_ratio"], "spikes": 2, "max": 1.3}  # type: ignore[dict-item]
+    ten, hundred = (a_row("w10000", name, chi2_ratio=spikes) for name in ("inc-l-b10", "inc-l-b100"))
+    assert set(verdicts(ours, slow, ten, hundred).values()) == {targets.MET}
+    assert verdicts(ours, ten)["no further"] == verdicts(ours, ten)["b10 and b100 rise"] == targets.NOT_MEASURED
+    calm = a_row("w10000", "inc-l-b100")
+    assert verdicts(ours, ten, calm)["b10 and b100 rise"] == targets.MISSED
+    further = {**ours["chi2_ratio"], "max": 1.001}  # type: ignore[dict-item]
+    assert verdicts(a_row("w10000", "inc-l", chi2_ratio=further), ten, calm)["no further"] == targets.MISSED
     assert verdicts(ours, a_row("w10000", "all-batch", cpu_s=1.79))["takes"] == targets.MISSED
     assert verdicts(slow)["within"] == verdicts(ours)["takes"] == targets.NOT_MEASURED
     assert verdicts(a_row("w10000", "inc-l", chi2_final=100.02))["within"] == targets.MISSED
