@@ -1,4 +1,7 @@
-"""R, d and δ after every step against Λ and η themselves, for every way of updating R."""
+"""R, d and δ after every step against Λ and η themselves, for every way of updating R.
+
+Small random maps, densely; `test_every_step.py` has larger and real ones.
+"""
 
 import sys
 from collections import Counter
@@ -254,35 +257,3 @@ def test_chi2_has_spikes_between_forced_batches_and_none_without(datasets: Path,
     print(worst)
     assert worst["inc-l"] < 1.001
     assert worst["inc-l-b100"] > 1.001
-
-
-@pytest.mark.data
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize("way", ["omega", "lambda"])
-@pytest.mark.parametrize(
-    ("name", "poses"),
-    [("intel", 943), ("manhattan3500", 1000), ("killian", 1000), ("w10000", 1000), ("citytrees10000", 1000),
-     ("victoria_park", 1000)],
-)  # fmt: skip
-def test_r_follows_through_real_maps(datasets: Path, name: str, poses: int, way: str) -> None:
-    solver, taken, checked = Solver(Options(mode="inc-l", **WAYS[way])), Counter(), 0
-    for n, (batch, _) in enumerate(zip(read(datasets / f"{name}.g2o").steps(), range(poses), strict=False)):
-        solver.stage(batch)
-        report = solver.step()
-        taken[report.strategy] += 1
-        # a dense check costs a second at the end of these; every step early on, then one in 25
-        if n < 150 or n % 25 == 0:
-            checked += assert_sparse(solver)
-    assert taken[way] > 0
-    assert checked > 20
-
-
-def assert_sparse(solver: Solver) -> bool:
-    """RᵀR = PΛPᵀ with sparse matrices."""
-    if solver._system.factor._have is not Where.ROWS:
-        return False
-    information, _ = dense_lambda(solver, sparse=True)
-    R, order, _ = dense_r(solver._system.factor.rows, sparse=True)
-    difference = R.T @ R - information[order][:, order]
-    assert abs(difference).max() <= 1e-9 * abs(information).max()
-    return True
