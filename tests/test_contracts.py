@@ -18,6 +18,7 @@ VIOLATIONS = {
     "The solver is pure": ("service/factorbus/solver", "import time"),
     "The service knows": ("service/factorbus/service", "from factorbus.workers import app"),
     "Workers know": ("workers/factorbus/workers", "from factorbus.service import config"),
+    "The mathematics of inverse depth": ("workers/factorbus/idp", "from factorbus.workers import config"),
     "Client, formats and simulated worlds know": ("clients/factorbus/client", "from factorbus.solver import errors"),
     "Client, formats and simulated worlds do not": ("clients/factorbus/simulate", "from factorbus.client import draft"),
     "Pictures need": ("clients/factorbus/viz", "from factorbus.solver import errors"),

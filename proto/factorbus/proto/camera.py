@@ -1,0 +1,72 @@
+"""A camera as calibration gives it: a lens model's name and its numbers.  The formulas are in `workers/MATH.md` §2."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from factorbus.proto.problems import Problem
+
+# The numbers of each model, in this order; from the first in `_OPTIONAL` on they may be left out and are 0.
+MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "pinhole": ("fx", "fy", "cx", "cy"),
+        "radtan": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+        "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+        "radial": ("f", "dx", "dy", "cx", "cy", "k1", "k2"),
+    }
+)
+_LEAST = MappingProxyType({"pinhole": 4, "radtan": 8, "fisheye": 8, "radial": 7})
+_POSITIVE = frozenset({"fx", "fy", "f", "dx", "dy"})
+_MOST_PIXELS = 1 << 20
+
+
+class BadCamera(Problem):
+    """A camera that cannot be."""
+
+    code = "bad_camera"
+
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"camera: {where} is {seen}; wanted {wanted}", where=where)
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A lens model and its numbers, and the size of the image in pixels (0 × 0: not known, any pixel is taken).
+
+    pinhole   fx fy cx cy                        no distortion, or pixels undistorted before
+    radtan    fx fy cx cy  k1 k2 p1 p2 [k3]      OpenCV's radial–tangential model (plumb bob)
+    fisheye   fx fy cx cy  k1 k2 k3 k4           OpenCV's fisheye model (equidistant)
+    radial    f dx dy  cx cy  k1 k2              Civera's and Davison's: f and the pixel's sizes in mm, k1 in mm⁻²,
+                                                 k2 in mm⁻⁴; it undistorts in closed form
+    Focal lengths fx, fy and the principal point cx, cy are in pixels, the centre of the first pixel is (0, 0).
+    Raises BadCamera.
+    """
+
+    model: str
+    numbers: tuple[float, ...]
+    width: int = 0
+    height: int = 0
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise BadCamera("model", repr(str(self.model)[:64]), f"one of {', '.join(MODELS)}")
+        names = MODELS[self.model]
+        if not _LEAST[self.model] <= len(self.numbers) <= len(names):
+            raise BadCamera(f"numbers of {self.model}", f"{len(self.numbers)} numbers", " ".join(names))
+        for name, number in zip(names, self.numbers, strict=False):
+            if not math.isfinite(number):
+                raise BadCamera(name, number, "a finite number")
+            if name in _POSITIVE and number <= 0.0:
+                raise BadCamera(name, number, "a number above 0")
+        if not (0 <= self.width <= _MOST_PIXELS and 0 <= self.height <= _MOST_PIXELS):
+            raise BadCamera("image size", f"{self.width} × {self.height}", "width × height in pixels, or 0 × 0")
+        if (self.width == 0) != (self.height == 0):
+            raise BadCamera("image size", f"{self.width} × {self.height}", "both, or 0 × 0 where it is not known")
+        # One form for one camera, whatever numbers it was made of.
+        object.__setattr__(self, "numbers", tuple(map(float, self.numbers)))
+
+    def number(self, name: str) -> float:
+        """One of its numbers by name; 0 where an optional one is left out."""
+        names = MODELS[self.model]
+        return (*self.numbers, *[0.0] * (len(names) - len(self.numbers)))[names.index(name)]

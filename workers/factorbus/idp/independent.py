@@ -1,0 +1,31 @@
+"""The covariance by independent rows of blocks: Idris and others, 2011.  MATH §5.2."""
+
+import numpy as np
+
+from factorbus.idp.classical import Counted
+from factorbus.idp.kernels.compile import F64
+from factorbus.idp.kernels.independent import independent
+from factorbus.proto.features import CAMERA_STATE, FEATURE
+
+
+def covariance(P: F64, A: F64, B: F64, padd: F64, out: F64 | None = None) -> Counted:
+    """P after adding n features, from stored products A P.  MATH (5.3)
+
+    in   P (m, m)   A (n, 6, 13)   B (n, 6, 3)   padd (3, 3)
+    out  P (m + 6 n, m + 6 n), in `out` if it is given
+    """
+    m, n = len(P), len(A)
+    after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
+    after[:m, :m] = P
+    count = some_rows(0, n, np.ascontiguousarray(P[:CAMERA_STATE]), A, B, padd, after)
+    return Counted(after, count)
+
+
+def some_rows(first: int, last: int, before: F64, A: F64, B: F64, padd: F64, out: F64) -> int:
+    """The rows and columns of features first .. last−1 in `out`; gives the number of multiplications.
+
+    in   before (13, m): the camera's rows of P
+    """
+    At = np.ascontiguousarray(A.transpose(2, 0, 1).reshape(CAMERA_STATE, -1))
+    left, own = np.empty((FEATURE, before.shape[1])), np.empty((2 * FEATURE, FEATURE))
+    return independent(first, last, before, A, At, B, padd, left, own, out)

@@ -1,0 +1,14 @@
+"""How these kernels are compiled: as the solver's, but exactly (`factorbus.solver.kernels._jit` says how).
+
+The same features may be computed by any worker, whole or in shards, or in place.  With fused or reordered sums the
+last bits would depend on where a loop was cut; without, only on the numbers.
+"""
+
+from pathlib import Path
+
+from factorbus.solver.kernels._jit import DISABLED, F64, I64, KernelFolder
+
+__all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
+
+_FOLDER = KernelFolder(Path(__file__).parent, "kernels-idp", exact=True)
+kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

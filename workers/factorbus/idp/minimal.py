@@ -1,0 +1,106 @@
+"""The covariance by what its structure leaves to multiply: whole, half, or as factors.  MATH §5.3, §5.4."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from factorbus.idp.classical import Counted
+from factorbus.idp.kernels import minimal as kernels
+from factorbus.idp.kernels.compile import F64
+from factorbus.idp.sight import Seen, contiguous
+from factorbus.proto.features import FEATURE, Sighting
+
+
+class Half(NamedTuple):
+    """The upper half of the new rows of features first .. last−1.
+
+    cross (6 k, m): P(new, before).  blocks: for each feature i its P(new i, new i .. n−1), 6 × 6 (n − i), one after
+    the other.
+    """
+
+    cross: F64
+    blocks: F64
+    multiplications: int
+
+
+class Factored(NamedTuple):
+    """Numbers from which any block can be formed: six rows that all features share, and seven numbers a feature.
+
+    U (6, m), S (3, 3) of (5.4).  turn (n, 4).  own (n, 3): σ² M Mᵀ: θθ, θφ, φφ (radians²).
+    """
+
+    U: F64
+    S: F64
+    turn: F64
+    own: F64
+    multiplications: int
+
+
+def covariance(P: F64, sighting: Sighting, seen: Seen, out: F64 | None = None) -> Counted:
+    """P after adding the features of `sighting`.
+
+    in   P (m, m), of which sighting.covariance are the first 13 rows
+    out  P (m + 6 n, m + 6 n), in `out` if it is given
+    """
+    m, n = len(P), len(seen.y)
+    after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
+    after[:m, :m] = P
+    count = rows(sighting, seen, 0, n, after[m:])
+    kernels.mirror(m, after)
+    return Counted(after, count)
+
+
+def rows(sighting: Sighting, seen: Seen, first: int, last: int, out: F64) -> int:
+    """P(new, (before, new)) of features first .. last−1 into `out` (6 (last − first), m + 6 n).  MATH (5.5) to (5.7)
+
+    Gives the number of multiplications.  The bits of a row do not depend on which rows are asked for with it.
+    """
+    parts = _Parts(sighting, seen, 0)
+    count = kernels.rows(
+        first, last, seen.turn, parts.U, parts.V, parts.W, parts.own, sighting.sigma_rho * sighting.sigma_rho, out
+    )
+    return parts.count + count
+
+
+def half(sighting: Sighting, seen: Seen, first: int, last: int) -> Half:
+    """The upper half of the rows of features first .. last−1, with the bits of `rows`."""
+    n = len(seen.y)
+    parts = _Parts(sighting, seen, first)
+    cross = np.empty((FEATURE * (last - first), sighting.width))
+    blocks = np.empty(blocks_in(n, first, last) * FEATURE * FEATURE)
+    variance = sighting.sigma_rho * sighting.sigma_rho
+    count = kernels.half_rows(
+        first, last, seen.turn, parts.U, parts.V, parts.W, parts.own, variance, cross, blocks
+    )  # fmt: skip
+    return Half(cross, blocks, parts.count + count)
+
+
+def factored(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = None) -> Factored:
+    """The factors, of features first .. last−1: O(m + n) numbers and multiplications.  MATH §5.4"""
+    chosen = Seen(*(array[first:last] for array in seen))
+    U, S, count = _shared(sighting)
+    own = np.empty((len(chosen.y), 3))
+    count += kernels.own_variances(chosen.slope, sighting.sigma_pixel, own)
+    return Factored(U, S, chosen.turn, own, count)
+
+
+def blocks_in(n: int, first: int, last: int) -> int:
+    """6 × 6 blocks in the upper half of the rows of features first .. last−1 of n."""
+    return (last - first) * n - (last * (last - 1) - first * (first - 1)) // 2
+
+
+class _Parts:
+    """What the rows of features `first` .. n−1 are made of."""
+
+    def __init__(self, sighting: Sighting, seen: Seen, first: int) -> None:
+        n = len(seen.y)
+        self.U, self.S, self.count = _shared(sighting)
+        self.V, self.W, self.own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
+        self.count += kernels.spread(first, seen.turn, self.U, self.S, self.V, self.W)
+        self.count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, self.own[first:])
+
+
+def _shared(sighting: Sighting) -> tuple[F64, F64, int]:
+    U, S = np.empty((6, sighting.width)), np.empty((3, 3))
+    count = kernels.share(contiguous(sighting.state), contiguous(sighting.covariance), U, S)
+    return U, S, count
