@@ -15,15 +15,16 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.replays import problems, runner, summary, table, targets
+from bench.replays.bars import bars
 from bench.replays.contestants import ENTRIES, QUICK, TABLE_1, Entry
 from bench.replays.problems import Problem
+from bench.replays.samples import Sampling
 
 _PIXELS = 360  # of the pictures of R
 _DRAWN = {"intel", "victoria_park", "city_trees"}  # the systems of Figures 1 and 2: one of poses, one with landmarks
@@ -35,7 +36,8 @@ def main() -> None:
     options = _options()
     chosen, note = problems.choose(options.quick)
     chosen, entries, absent = _selection(chosen, options.only, QUICK if options.quick else TABLE_1)
-    settings = runner.Settings(options.out, runner.pick_core(), options.samples, options.limit_s, options.fresh)
+    sampling = Sampling(options.samples)
+    settings = runner.Settings(options.out, runner.pick_core(), sampling, options.limit_s, options.fresh)
     try:
         measured = measure(settings, chosen, entries, options.repetitions)
     except runner.Crashed as problem:
@@ -62,16 +64,16 @@ def measure(
     """
     found: dict[str, dict[str, Any]] = {p.key: {"runs": {e.name: [] for e in entries}} for p in chosen}
     total = len(chosen) * (repetitions * len(entries) + 2)
-    with _bars(total) as (begin, progress):
+    with bars(total) as (begin, progress):
         for problem in chosen:
-            begin(f"{problem.key}: optima", problem)
+            begin(f"{problem.key}: optima", problem.steps)
             found[problem.key]["reference"] = runner.run_reference(settings, problem, progress)
-            begin(f"{problem.key}: fill-in", problem)
+            begin(f"{problem.key}: fill-in", problem.steps)
             found[problem.key]["fill"] = runner.run_fill(settings, problem, _PIXELS, progress)
         for repetition in range(repetitions):
             for problem in chosen:
                 for entry in entries:
-                    begin(f"{problem.key}: {entry.name}", problem)
+                    begin(f"{problem.key}: {entry.name}", problem.steps)
                     run = runner.run_replay(settings, problem, entry, repetition, progress)
                     found[problem.key]["runs"][entry.name].append(run)
     return found
@@ -138,38 +140,6 @@ def _selection(
     entries = [ENTRIES[name] for name in (names or usual)]
     absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
     return wanted, [entry for entry in entries if not entry.missing()], absent
-
-
-@contextmanager
-def _bars(total: int) -> Any:
-    """Two bars on standard error: all jobs, and the steps of the present one."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description:34}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[word]}"),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console) as bars:
-        jobs, job = bars.add_task("all", total=total, word=""), bars.add_task("", total=None, word="")
-        begun = [0]
-
-        def begin(what: str, problem: Problem) -> None:
-            bars.update(jobs, completed=begun[0])
-            begun[0] += 1
-            bars.reset(job, description=what, total=problem.steps, word="")
-            if not console.is_terminal:
-                console.print(f"[{begun[0]}/{total}] {what}", highlight=False)
-
-        def progress(done: int, word: str) -> None:
-            bars.update(job, completed=done, word=word)
-
-        yield begin, progress
-        bars.update(jobs, completed=total)
 
 
 def _hand_out(document: dict[str, Any], text: str, options: argparse.Namespace) -> None:

@@ -26,6 +26,8 @@ REPLAYS = {
 
 def run(name: str, steps: list[Batch]) -> contestants.Contestant:
     contestant = contestants.make(name)
+    if isinstance(contestant, contestants.Rehearsing):
+        contestant.rehearse(steps, {len(steps) - 1})
     for batch in steps:
         contestant.prepare(batch)
         contestant.step()
@@ -93,6 +95,48 @@ def test_isam2_says_that_a_system_is_indeterminate() -> None:
         contestant.step()
 
 
+def test_update_alone_comes_to_what_was_rehearsed_and_fails_where_that_failed() -> None:
+    pytest.importorskip("gtsam")
+    steps = REPLAYS["landmarks"]
+    with_estimates, alone = run("isam2-0.1", steps).values(), run("isam2-0.1-update", steps)
+    assert alone.facts()["read_s"] > 0
+    for kind, (keys, numbers) in alone.values().items():
+        np.testing.assert_array_equal(keys, with_estimates[kind][0])
+        np.testing.assert_array_equal(numbers, with_estimates[kind][1])
+    lonely = Variables("point2", np.array([7]), np.array([[1.0, 0.0]]))
+    sighting = Factors("bearing_range_se2", np.array([[5, 7]]), np.array([[0.0, 1.0]]), np.array([[1.0, 0.0, 1.0]]))
+    broken = [Batch((Variables("se2", np.array([5]), np.zeros((1, 3))), lonely), (sighting,))]
+    contestant = contestants.make("isam2-0.1-update")
+    assert isinstance(contestant, contestants.Rehearsing)
+    contestant.rehearse(broken, {0})
+    contestant.prepare(broken[0])
+    with pytest.raises(Failed, match="Indeterminate"):
+        contestant.step()
+    with pytest.raises(Failed, match="Indeterminate"):
+        contestant.prepare(broken[0])
+
+
+def test_one_step_at_loops_is_a_gauss_newton_step_of_the_whole_graph() -> None:
+    """Sharp loops that one step does not settle: what is left is what a fresh solver leaves after one step."""
+    steps = REPLAYS["space"]
+    contestant = run("gn-loop", steps[:-1])
+    start = contestant.values()["se3"]
+    once = run("gn-loop", steps)
+    known = {int(k): v for k, v in zip(*start, strict=True)}
+    first = compose.first_values(steps[-1], lambda _, key: known[key])
+    variables, factors = [], []
+    for batch in steps:
+        for group in batch.variables:
+            values = np.array([known.get(int(k), first.get(int(k), (0, 0))[1]) for k in group.keys])
+            variables.append(Variables(group.kind, group.keys, values, group.fixed))
+        factors += batch.factors
+    solver = Solver(Options(mode="all-batch", max_iterations=1))
+    solver.stage(Batch(tuple(variables), tuple(factors)))
+    assert solver.step().iterations == 1
+    np.testing.assert_allclose(once.values()["se3"][1], values_of(solver.estimate())["se3"][1], atol=1e-9)
+    assert once.facts()["strategies"]["batch"] > 10
+
+
 def test_a_value_that_is_missing_is_not_passed_over() -> None:
     steps = REPLAYS["poses"]
     values = run("all-batch", steps).values()
@@ -140,6 +184,13 @@ def test_samples_are_spread_and_end_with_the_last_step(steps: int, most: int) ->
     assert list(picked) == sorted(set(picked))
     assert picked[0] >= 0
     assert max(np.diff(picked), default=0) <= 2 * steps / (most - 1) + 1
+
+
+@given(st.integers(1, 5000), st.integers(1, 300))
+def test_regular_samples_are_each_nth_step_and_the_last(steps: int, every: int) -> None:
+    picked = samples.Sampling(every=every).steps(steps)
+    assert set(picked) == {k for k in range(steps) if (k + 1) % every == 0} | {steps - 1}
+    assert list(picked) == sorted(set(picked))
 
 
 def test_samples_see_a_batch_at_every_hundredth_step_at_all_its_moments() -> None:

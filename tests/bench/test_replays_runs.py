@@ -10,6 +10,7 @@ import pytest
 from bench.replays import figures, runner
 from bench.replays.contestants import ENTRIES
 from bench.replays.problems import ALL, Problem, choose, load
+from bench.replays.samples import Sampling
 from bench.replays.table import table_1
 
 WORLD = Problem("manhattan", "Manhattan", poses=60, seed=2)
@@ -18,7 +19,7 @@ PAPER = Path(__file__).parent / "paper.py"
 
 
 def settings(folder: Path, **more: object) -> runner.Settings:
-    return runner.Settings(folder, runner.pick_core(), samples=20, **more)  # type: ignore[arg-type]
+    return runner.Settings(folder, runner.pick_core(), Sampling(20), **more)  # type: ignore[arg-type]
 
 
 def replay(folder: Path, seen: list[int] | None = None, **more: object) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""One job in a process of its own, on one core: a replay by one contestant, the optima along it, or orderings.
+"""One job in a process of its own, on one core: a replay by one contestant, the optima along it, or another measure.
 
     python -m bench.replays.child JOB.json        (started by `runner`)
 
@@ -21,12 +21,14 @@ from factorbus.proto.messages import Batch
 
 from . import contestants
 from .chi2 import chi2_at
-from .columns import Columns, columns_of
+from .clock import Clock
+from .columns import columns_of
+from .contestants import Contestant, Rehearsing, Settling
+from .memory import peak_mb, reset_peak_mb
 from .problems import Problem, load
-from .samples import sample_steps
+from .samples import Sampling
 
 _WARM = 30  # steps replayed beforehand, so that no library loads anything on the clock
-_POINTS = 400  # of the curve of cumulative time
 Tell = Callable[[dict[str, Any]], None]
 
 
@@ -41,32 +43,33 @@ def main() -> None:
     def tell(message: dict[str, Any]) -> None:
         print(json.dumps(message), file=out, flush=True)
 
-    problem = Problem(**job["problem"])
-    steps = load(problem)
-    columns = columns_of(steps)
-    result = _JOBS[job["kind"]](job, steps, columns, _paced(tell))
+    result = _JOBS[job["kind"]](job, Problem(**job["problem"]), _paced(tell))
     tell({"result": result})
 
 
-def replay(job: dict[str, Any], steps: Sequence[Batch], columns: Columns, tell: Tell) -> dict[str, Any]:
-    """Replay `steps` by job["contestant"]; see `_result` for what comes of it."""
+def replay(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
+    """Replay the problem's steps by job["contestant"]."""
+    steps = load(problem)
+    columns = columns_of(steps)
     name, limit_s = job["contestant"], float(job["limit_s"])
-    samples = set(sample_steps(len(steps), job["samples"]))
+    samples = set(_samples(job, steps))
     _warm_up(name, steps)
     contestant = contestants.make(name)
-    clock = _Clock(len(steps))
+    if isinstance(contestant, Rehearsing):
+        contestant.rehearse(steps, samples, lambda k: tell({"done": k + 1, "cpu_s": 0.0}))
+    clock = Clock(len(steps))
     load_before, compiled = os.getloadavg()[0], _compiled_s(name)
     gc.collect()
     gc.freeze()
     gc.disable()  # a collection would fall on some step by chance
-    base_mb = _reset_peak_mb()
+    base_mb = reset_peak_mb()
     status, reason, chi2 = "done", "", []
     for k, batch in enumerate(steps):
         try:
             contestant.prepare(batch)
             clock.run(k, contestant)
-        except contestants.Failed as problem:
-            status, reason = "failed", f"step {k}: {problem}"
+        except contestants.Failed as failed:
+            status, reason = "failed", f"step {k}: {failed}"
             break
         if k in samples:
             chi2.append((k, chi2_at(columns, contestant.values(), k)))
@@ -74,16 +77,21 @@ def replay(job: dict[str, Any], steps: Sequence[Batch], columns: Columns, tell: 
             status, reason = "limit", f"more than {limit_s:g} s of solver time after step {k}"
             break
         tell({"done": k + 1, "cpu_s": round(clock.cpu_s, 2)})
-    peak_mb = _peak_mb()
+    largest_mb = peak_mb()
     facts = contestant.facts() if status == "done" else {}
+    settled = None
+    if status == "done" and isinstance(contestant, Settling):
+        contestant.settle()
+        settled = chi2_at(columns, contestant.values(), len(steps) - 1)
     return {
         "contestant": name,
         "status": status,
         "reason": reason,
         "steps": len(steps),
         "chi2": chi2,
+        "chi2_settled": settled,
         "facts": facts,
-        "peak_mb": peak_mb,
+        "peak_mb": largest_mb,
         "base_mb": base_mb,
         "compiled_s": _compiled_s(name) - compiled,
         "load_average": load_before,
@@ -93,77 +101,47 @@ def replay(job: dict[str, Any], steps: Sequence[Batch], columns: Columns, tell: 
     }
 
 
-def reference(job: dict[str, Any], steps: Sequence[Batch], columns: Columns, tell: Tell) -> dict[str, Any]:
+def reference(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
     """χ²_batch at the samples; the values at the end go to the file job["values"]."""
     from .reference import optima
 
-    samples = sample_steps(len(steps), job["samples"])
-    chi2, last = optima(steps, columns, samples, lambda k: tell({"done": k + 1}))
+    steps = load(problem)
+    columns = columns_of(steps)
+    chi2, last = optima(steps, columns, _samples(job, steps), lambda k: tell({"done": k + 1}))
     tables = columns.table(last)
     np.savez_compressed(job["values"], **{kind: table[columns.arrival[kind]] for kind, table in tables.items()})
     return {"chi2": chi2, "dof": columns.dof(), "steps": len(steps)}
 
 
-def fill(job: dict[str, Any], steps: Sequence[Batch], columns: Columns, tell: Tell) -> dict[str, Any]:
+def fill(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
     """Nonzeros of R for several orderings; their pictures go to the file job["values"]."""
     from .fill import orderings
 
-    numbers, pictures = orderings(columns, job["pixels"])
+    numbers, pictures = orderings(columns_of(load(problem)), job["pixels"])
     np.savez_compressed(job["values"], **pictures)
     return numbers
 
 
-_JOBS = {"replay": replay, "reference": reference, "fill": fill}
+_JOBS: dict[str, Callable[[dict[str, Any], Problem, Tell], dict[str, Any]]] = {
+    "replay": replay,
+    "reference": reference,
+    "fill": fill,
+}
 
 
-class _Clock:
-    """CPU time of the process (all its threads) and wall time of every step, the solving and the reading apart."""
-
-    def __init__(self, steps: int) -> None:
-        self._solve, self._read, self._wall = np.zeros(steps), np.zeros(steps), np.zeros(steps)
-        self._done, self.cpu_s = 0, 0.0
-
-    def run(self, k: int, contestant: contestants.Contestant) -> None:
-        wall, start = time.perf_counter(), time.process_time()
-        contestant.step()
-        solved = time.process_time()
-        contestant.read()
-        end, wall_end = time.process_time(), time.perf_counter()
-        self._solve[k], self._read[k], self._wall[k] = solved - start, end - solved, wall_end - wall
-        self.cpu_s += end - start
-        self._done = k + 1
-
-    def account(self) -> dict[str, Any]:
-        n = self._done
-        cpu = (self._solve + self._read)[:n]
-        points = np.unique(np.linspace(0, max(n - 1, 0), min(n, _POINTS)).astype(int))
-        return {
-            "done": n,
-            "cpu_s": float(cpu.sum()),
-            "solve_s": float(self._solve.sum()),
-            "read_s": float(self._read.sum()),
-            "wall_s": float(self._wall.sum()),
-            "step_ms": _percentiles(cpu),
-            "solve_ms": _percentiles(self._solve[:n]),
-            "step_wall_ms": _percentiles(self._wall[:n]),
-            "cumulative": [points.tolist(), np.cumsum(cpu)[points].round(6).tolist()] if n else [[], []],
-        }
-
-
-def _percentiles(seconds: np.ndarray) -> dict[str, float]:
-    if not len(seconds):
-        return {}
-    p50, p95, p99 = (float(1e3 * value) for value in np.percentile(seconds, (50, 95, 99)))
-    return {"p50": p50, "p95": p95, "p99": p99, "max": float(1e3 * seconds.max())}
+def _samples(job: dict[str, Any], steps: Sequence[Batch]) -> tuple[int, ...]:
+    return Sampling(**job["sampling"]).steps(len(steps))
 
 
 def _warm_up(name: str, steps: Sequence[Batch]) -> None:
     """Compile or load kernels, and let every library do what it does the first time."""
-    if contestants.ENTRIES[name].solver == contestants.OURS:
+    if contestants.ENTRIES[name].runs_our_kernels:
         from factorbus.solver import warm
 
         warm()
-    scratch = contestants.make(name)
+    scratch: Contestant = contestants.make(name)
+    if isinstance(scratch, Rehearsing):
+        scratch.rehearse(steps[:_WARM], {len(steps[:_WARM]) - 1})
     for batch in steps[:_WARM]:
         scratch.prepare(batch)
         scratch.step()
@@ -172,23 +150,11 @@ def _warm_up(name: str, steps: Sequence[Batch]) -> None:
 
 def _compiled_s(name: str) -> float:
     """Seconds spent in compiling kernels so far; a peer's process has none, and does not load Numba."""
-    if contestants.ENTRIES[name].solver != contestants.OURS:
+    if not contestants.ENTRIES[name].runs_our_kernels:
         return 0.0
     from factorbus.solver import compiled_seconds
 
     return compiled_seconds()
-
-
-def _reset_peak_mb() -> float:
-    """Forget the largest size so far; gives the present one."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return _peak_mb()
-
-
-def _peak_mb() -> float:
-    """The largest resident size since then."""
-    line = next(row for row in Path("/proc/self/status").read_text().splitlines() if row.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
 
 
 def _paced(tell: Tell, every_s: float = 0.25) -> Tell:

@@ -1,10 +1,10 @@
 """Who is measured, by name, and what a run asks of each."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from factorbus.proto.messages import Batch
 
@@ -39,6 +39,24 @@ class Contestant(Protocol):
         ...
 
 
+@runtime_checkable
+class Rehearsing(Protocol):
+    """One that has to go through the replay beforehand, off the clock."""
+
+    def rehearse(self, steps: Sequence[Batch], samples: set[int], progress: Callable[[int], None] = ...) -> None:
+        """`values` is going to be asked for after `samples` only."""
+        ...
+
+
+@runtime_checkable
+class Settling(Protocol):
+    """One that can iterate until it has converged."""
+
+    def settle(self) -> None:
+        """Do; `values` are those of then."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
     """A name of the table.
@@ -57,11 +75,17 @@ class Entry:
 
     def missing(self) -> str:
         """Why it cannot run here; empty when it can."""
-        if self.solver == OURS:
+        if self.runs_our_kernels:
             from factorbus.solver.options import MODES  # here, so that a peer's process does without our solver
 
-            return "" if self.mode in MODES else f"mode {self.mode} is not in this build"
+            known = self.solver == RIVAL or self.mode in MODES
+            return "" if known else f"mode {self.mode} is not in this build"
         return "" if find_spec(self.packages[0]) else f"{self.packages[0]} is not installed (pip install -e '.[bench]')"
+
+    @property
+    def runs_our_kernels(self) -> bool:
+        """Ours, or a rival made of our parts."""
+        return self.solver in (OURS, RIVAL)
 
     def versions(self) -> dict[str, str]:
         """Of its packages."""
@@ -69,6 +93,7 @@ class Entry:
 
 
 OURS, ISAM2, G2O = "factorbus", "gtsam iSAM2", "g2o"
+ISAM2_ALONE, RIVAL = "gtsam iSAM2, update alone", "Gauss-Newton on the kernels of factorbus"
 OUR_PACKAGES = ("factorbus", "numpy", "numba")
 
 
@@ -92,6 +117,30 @@ def _isam2(threshold: float, factorization: str, wildfire: float = 1e-3) -> Entr
     )
 
 
+def _isam2_alone(threshold: float) -> Entry:
+    return Entry(
+        f"isam2-{threshold:g}-update",
+        ISAM2_ALONE,
+        f"{threshold:g} CHOLESKY",
+        f"GTSAM iSAM2, {threshold:g}, update() alone",
+        {"threshold": threshold, "factorization": "CHOLESKY", "wildfire": 1e-3},
+        ("gtsam",),
+        "update and nothing else; graph building and first values are outside the clock",
+    )
+
+
+def _gauss_newton() -> Entry:
+    return Entry(
+        "gn-loop",
+        RIVAL,
+        "one step at loops",
+        "one Gauss-Newton step at loops",
+        {},
+        OUR_PACKAGES,
+        "relinearise, order, analyse, factorise and solve, all of it, once at every step that closes a loop",
+    )
+
+
 def _g2o(every: int) -> Entry:
     remark = "initialize_optimization + Gauss-Newton until the gain is below 1e-6 (10 iterations at most)"
     when = "every step with a loop" if every == 1 else f"every {every} poses, an answer only then"
@@ -109,6 +158,9 @@ ENTRIES = {
         _isam2(0.1, "QR"),
         _isam2(0.01, "QR"),
         _isam2(0.1, "CHOLESKY", wildfire=1e-5),
+        _isam2_alone(0.1),
+        _isam2_alone(0.01),
+        _gauss_newton(),
         _ours("all-batch", "all-batch Λ"),
         _ours("inc-l", "Inc-L"),
         _ours("inc-l-b10", "Inc-L b10"),
@@ -118,8 +170,11 @@ ENTRIES = {
 }
 # On request: "auto" is one of the others under another name; "fine" shows what iSAM2's default wildfire threshold costs
 # in quality where angles weigh much (victoria_park after 2500 poses: 1.47 x the optimum; 1.001 x with 1e-5).
-ON_REQUEST = ("auto", "isam2-0.1-fine")
+# gn-loop and update() alone are for `bench peers`.
+ON_REQUEST = ("auto", "isam2-0.1-fine", "isam2-0.1-update", "isam2-0.01-update", "gn-loop")
 TABLE_1 = tuple(name for name in ENTRIES if name not in ON_REQUEST)
+PEER = "isam2-0.1-update"
+AHEAD = ("auto", PEER)  # of `bench peers`; the others of it when asked for
 QUICK = ("g2o-b10", "isam2-0.1", "all-batch", "inc-l", "inc-l-b10", "inc-l-b100")
 
 
@@ -147,4 +202,14 @@ def _makers() -> dict[str, Callable[..., Contestant]]:
 
         return G2oBatch(every)
 
-    return {OURS: ours, ISAM2: isam2, G2O: g2o}
+    def isam2_alone(threshold: float, factorization: str, wildfire: float) -> Contestant:
+        from .isam2 import Isam2Alone
+
+        return Isam2Alone(threshold, factorization, wildfire)
+
+    def gauss_newton() -> Contestant:
+        from .gn_loop import GaussNewtonAtLoops
+
+        return GaussNewtonAtLoops()
+
+    return {OURS: ours, ISAM2: isam2, ISAM2_ALONE: isam2_alone, G2O: g2o, RIVAL: gauss_newton}

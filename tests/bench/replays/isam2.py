@@ -8,7 +8,9 @@ information of the quaternion's vector part is divided by four.
 """
 
 import math
-from typing import Any
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import gtsam
 import numpy as np
@@ -19,6 +21,7 @@ from .columns import F64, Values, symmetric
 from .compose import first_values
 from .contestants import Failed
 
+Prepared: TypeAlias = tuple[Any, Any]  # GTSAM's graph and values of a step
 _TIGHT = 1e-4  # metres and radians of the prior that holds the first pose; nothing pulls at it
 
 
@@ -27,13 +30,8 @@ class Isam2:
     as reading, `calculateEstimate`."""
 
     def __init__(self, threshold: float, factorization: str, wildfire: float) -> None:
-        parameters, search = gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
-        search.setWildfireThreshold(wildfire)
-        parameters.setOptimizationParams(search)
-        parameters.setRelinearizeThreshold(threshold)
-        parameters.relinearizeSkip = 1
-        parameters.setFactorization(factorization)
-        self._isam = gtsam.ISAM2(parameters)
+        self._isam = _made(threshold, factorization, wildfire)
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._estimate = gtsam.Values()
         self._last_pose = ("se2", -1)
         self._kinds: set[str] = set()
@@ -63,6 +61,10 @@ class Isam2:
                 self._graph.add(make(i, j, z, information))
         self._estimate = gtsam.Values()  # taking the old one down is not on the clock
 
+    def prepared(self) -> "Prepared":
+        """What the next `step` is going to take in."""
+        return self._graph, self._values
+
     def step(self) -> None:
         """Raises Failed: an indeterminate system comes as RuntimeError."""
         kind, key = self._last_pose
@@ -73,7 +75,7 @@ class Isam2:
             else:
                 self._isam.calculateEstimatePose3(key)
         except RuntimeError as problem:
-            raise Failed(" ".join(str(problem).split())[:200] or "RuntimeError without words") from problem
+            raise _failed(problem) from problem
 
     def read(self) -> None:
         """All variables."""
@@ -107,6 +109,93 @@ class Isam2:
             pose = self._estimate.atPose3(key)
             return np.concatenate((pose.translation(), pose.rotation().toQuaternion().coeffs()))
         return np.asarray(self._estimate.atPoint2(key))
+
+
+class Isam2Alone:
+    """What is on the clock: `update`.
+
+    iSAM2 leaves the back-substitution of a step to the next `update`, or to the first who asks for an estimate before
+    that.  First values are composed from the estimate, so whoever composes them during the replay takes that work off
+    the clock.  Hence a rehearsal, with estimates; what it composed is what the replay itself takes in, which asks for
+    nothing.
+    """
+
+    def __init__(self, threshold: float, factorization: str, wildfire: float) -> None:
+        self._settings = threshold, factorization, wildfire
+        self._isam = _made(*self._settings)
+        self._plan: list[Prepared] = []
+        self._sampled: dict[int, Values] = {}
+        self._refused: Failed | None = None
+        self._read_s, self._at = 0.0, -1
+        self._next: Prepared = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    def rehearse(
+        self, steps: Sequence[Batch], samples: set[int], progress: Callable[[int], None] = lambda _: None
+    ) -> None:
+        """Replay with estimates, as far as that goes."""
+        rehearsed = Isam2(*self._settings)
+        for k, batch in enumerate(steps):
+            try:
+                rehearsed.prepare(batch)
+                self._plan.append(rehearsed.prepared())
+                rehearsed.step()
+            except Failed as problem:
+                self._refused = problem
+                return
+            start = time.process_time()
+            rehearsed.read()
+            self._read_s += time.process_time() - start
+            if k in samples:
+                self._sampled[k] = rehearsed.values()
+            progress(k)
+
+    def prepare(self, batch: Batch) -> None:
+        """The step as rehearsed.  Raises Failed."""
+        self._at += 1
+        if self._at >= len(self._plan):
+            raise self._refused or Failed("not rehearsed")
+        self._next, self._plan[self._at] = self._plan[self._at], (None, None)
+
+    def step(self) -> None:
+        """Raises Failed."""
+        try:
+            self._isam.update(*self._next)
+        except RuntimeError as problem:
+            raise _failed(problem) from problem
+
+    def read(self) -> None:
+        """Nothing: that is timed in the rehearsal."""
+
+    def values(self) -> Values:
+        """As in the rehearsal."""
+        return self._sampled[self._at]
+
+    def facts(self) -> dict[str, Any]:
+        """read_s: seconds of calculateEstimate after every step, back-substitution not counted.
+
+        Raises RuntimeError when the replay has not come to what was rehearsed.
+        """
+        estimate = self._isam.calculateEstimate()
+        for kind, (keys, numbers) in self._sampled[self._at].items():
+            extract, letter = _EXTRACT[kind]
+            again = extract(estimate)
+            if len(again) != len(keys) or not np.allclose(again, numbers, rtol=0, atol=1e-9):
+                raise RuntimeError(f"iSAM2's estimate of {chr(letter)} is another one than in the rehearsal")
+        return {"nnz_r": int(self._isam.treeNnz()), "strategies": {"update": self._at + 1}, "read_s": self._read_s}
+
+
+def _made(threshold: float, factorization: str, wildfire: float) -> Any:
+    parameters, search = gtsam.ISAM2Params(), gtsam.ISAM2GaussNewtonParams()
+    search.setWildfireThreshold(wildfire)
+    parameters.setOptimizationParams(search)
+    parameters.setRelinearizeThreshold(threshold)
+    parameters.relinearizeSkip = 1
+    parameters.setFactorization(factorization)
+    return gtsam.ISAM2(parameters)
+
+
+def _failed(problem: RuntimeError) -> Failed:
+    return Failed(" ".join(str(problem).split())[:200] or "RuntimeError without words")
 
 
 def pose3(value: F64) -> Any:

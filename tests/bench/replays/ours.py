@@ -16,7 +16,8 @@ class Ours:
     """`Solver` in one of its modes; what is on the clock is stage, step and estimate."""
 
     def __init__(self, mode: str) -> None:
-        self._solver = Solver(Options(mode=mode))
+        self._options = Options(mode=mode)
+        self._solver = Solver(self._options)
         self._batch = Batch()
         self._report: StepReport | None = None
         self._groups: list[Group] = []
@@ -41,14 +42,20 @@ class Ours:
         """A copy of all values."""
         self._groups = self._solver.estimate()
 
+    def settle(self) -> None:
+        """Iterate until converged."""
+        self._solver.step(settle=True)
+        self._groups = self._solver.estimate()
+
     def values(self) -> Values:
         """The same per kind, fixed and free together."""
         return values_of(self._groups)
 
     def facts(self) -> dict[str, Any]:
-        """nnz_r is of the last factor that was made."""
+        """nnz_r is of the last factor that was made; options: in force."""
         self._count()
-        return {"nnz_r": self._nnz_r or None, "strategies": dict(self._strategies), **self._sums}
+        told = {"nnz_r": self._nnz_r or None, "strategies": dict(self._strategies), **self._sums}
+        return {**told, "options": self._options.as_dict()}
 
     def _count(self) -> None:
         if self._report is not None:

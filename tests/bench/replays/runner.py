@@ -17,14 +17,16 @@ from typing import Any
 
 import factorbus.solver
 
-from .contestants import ISAM2, OURS, Entry
+from .contestants import ISAM2, ISAM2_ALONE, OURS, RIVAL, Entry
 from .problems import Problem, fingerprint
+from .samples import Sampling
 
 _HERE = Path(__file__).parent
 # What a run's numbers depend on in this package.
-_MACHINERY = ("child", "chi2", "columns", "compose", "contestants", "samples")
+_MACHINERY = ("child", "chi2", "clock", "columns", "compose", "contestants", "samples")
 _REFERENCE = ("reference", "chi2", "columns", "samples")
 _FILL = ("fill", "columns")
+_MEASURES = {"growth": ("growth", "memory"), "full_pass": ("full_pass",), "overhead": ("overhead",)}
 _GRACE_S = 600  # wall seconds on top of twice the limit, before a run that does not answer is ended
 Progress = Callable[[int, str], None]
 
@@ -33,14 +35,17 @@ class Crashed(Exception):
     """A job's process ended without a result."""
 
 
+EVERYWHERE = Sampling()
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Of all runs.  folder: where results are kept.  samples: steps at which χ² is looked at.  limit_s: of solver CPU
+    """Of all runs.  folder: where results are kept.  sampling: steps at which χ² is looked at.  limit_s: of solver CPU
     time a run.  fresh: measure again what is there."""
 
     folder: Path
     core: int | None
-    samples: int = 100
+    sampling: Sampling = EVERYWHERE
     limit_s: float = 1800.0
     fresh: bool = False
 
@@ -76,6 +81,20 @@ def run_fill(settings: Settings, problem: Problem, pixels: int, progress: Progre
     return _remembered(settings, problem, "fill", _FILL, {"pixels": pixels}, progress)
 
 
+def run_measure(
+    settings: Settings, problem: Problem, kind: str, more: dict[str, Any], repetition: int, progress: Progress
+) -> dict[str, Any]:
+    """One of the other measures of our solver (`child` has them by `kind`), or what was remembered.  Raises Crashed."""
+    said = [fingerprint(problem), more, _cpu_model(), platform.python_version(), *_solver()]
+    key = _hash([*said, *_sources(("child", *_MEASURES[kind]))])
+    path = settings.folder / kind / f"{problem.key}.{repetition}.{key}.json"
+    kept = _kept(path, settings)
+    if kept is None:
+        kept = _do(settings, problem, {"kind": kind, **more}, progress, wall_s=4 * settings.limit_s + _GRACE_S)
+        _keep(path, kept)
+    return kept
+
+
 def machine() -> dict[str, Any]:
     """What the numbers were measured on."""
     return {
@@ -95,7 +114,9 @@ def pick_core() -> int | None:
 def _remembered(
     settings: Settings, problem: Problem, kind: str, sources: tuple[str, ...], more: dict[str, Any], progress: Progress
 ) -> dict[str, Any]:
-    key = _hash([fingerprint(problem), settings.samples if kind == "reference" else 0, more, *_sources(sources)])
+    key = _hash(
+        [fingerprint(problem), settings.sampling.as_json() if kind == "reference" else 0, more, *_sources(sources)]
+    )
     path = settings.folder / kind / f"{problem.key}.{key}.json"
     values = path.with_suffix(".npz")
     kept = _kept(path, settings) if values.is_file() else None
@@ -108,7 +129,7 @@ def _remembered(
 
 def _do(settings: Settings, problem: Problem, job: dict[str, Any], progress: Progress, wall_s: float) -> dict[str, Any]:
     """The result of a job in a child process.  Raises Crashed."""
-    job = {**job, "problem": problem.as_json(), "samples": settings.samples, "core": settings.core}
+    job = {**job, "problem": problem.as_json(), "sampling": settings.sampling.as_json(), "core": settings.core}
     paths = os.pathsep.join(filter(None, (str(_HERE.parents[1]), os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
     for library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
@@ -148,14 +169,25 @@ def _listen(child: "subprocess.Popen[str]", progress: Progress) -> dict[str, Any
 
 
 def _run_key(settings: Settings, problem: Problem, entry: Entry) -> str:
-    said: list[Any] = [fingerprint(problem), entry.versions(), entry.settings, settings.samples, _cpu_model()]
-    mine = {OURS: "ours", ISAM2: "isam2"}.get(entry.solver, "g2o_batch")
+    said: list[Any] = [
+        fingerprint(problem),
+        entry.versions(),
+        entry.settings,
+        settings.sampling.as_json(),
+        _cpu_model(),
+    ]
+    mine = {OURS: "ours", RIVAL: "gn_loop", ISAM2: "isam2", ISAM2_ALONE: "isam2"}.get(entry.solver, "g2o_batch")
     said += [platform.python_version(), *_sources((*_MACHINERY, mine))]
-    if entry.solver == OURS:
-        folder = Path(factorbus.solver.__file__).parent
-        said += [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.rglob("*.py"))]
-        said.append(metadata.version("scipy"))
+    if entry.runs_our_kernels:
+        said += _solver()
     return _hash(said)
+
+
+def _solver() -> list[str]:
+    """What our solver's numbers depend on."""
+    folder = Path(factorbus.solver.__file__).parent
+    sources = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.rglob("*.py"))]
+    return [*sources, metadata.version("scipy")]
 
 
 def _sources(names: tuple[str, ...]) -> list[str]:

@@ -1,8 +1,25 @@
 """The steps of a replay at which the quality of an estimate is looked at."""
 
 import math
+from dataclasses import asdict, dataclass
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """every: each so many steps; 0: `most` steps, spread.  The last step always."""
+
+    most: int = 100
+    every: int = 0
+
+    def steps(self, count: int) -> tuple[int, ...]:
+        """Those of a replay of `count` steps."""
+        return regular_steps(count, self.every) if self.every else sample_steps(count, self.most)
+
+    def as_json(self) -> dict[str, int]:
+        """For a job's file; `Sampling(**...)` is the way back."""
+        return asdict(self)
 
 
 def sample_steps(steps: int, most: int = 100) -> tuple[int, ...]:
@@ -17,3 +34,8 @@ def sample_steps(steps: int, most: int = 100) -> tuple[int, ...]:
     width = (steps - 1) / (most - 1)
     picked = {int(width * (i + (i * _GOLDEN) % 1.0)) for i in range(most - 1)}
     return (*sorted(step for step in picked if step < steps - 1), steps - 1)
+
+
+def regular_steps(steps: int, every: int) -> tuple[int, ...]:
+    """Each `every`-th step and the last one; fair to solvers that do the same at every step."""
+    return (*range(every - 1, steps - 1, every), steps - 1)
