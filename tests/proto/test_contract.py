@@ -66,6 +66,8 @@ def test_every_field_is_explained(message: Any) -> None:
         (keys.admin_key("maps"), "admin/maps"),
         (keys.job_key("w"), "worker/<id>/job"),
         (keys.worker_token("w", 2), "worker/<id>/live/<slots>"),
+        (keys.features_key("s"), "features/<service>/ask"),
+        (keys.features_token("s"), "features/<service>/live"),
     ],
 )
 def test_every_key_is_where_the_contract_says(key: str, pattern: str) -> None:

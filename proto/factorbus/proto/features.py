@@ -6,7 +6,6 @@ metres), q (4, scalar first, camera to world), v (3), ω (3)), and it stands fir
 `proto/README.md` has the wire, `workers/MATH.md` the equations.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -69,11 +68,15 @@ class Sighting:
 
 
 class Segment(NamedTuple):
-    """Memory that both ends can reach: a file of `size` bytes in /dev/shm, which begins with the 16 bytes `nonce`."""
+    """Shared memory for an answer: the file `name` in /dev/shm, of `size` bytes, that begins with `nonce`.
+
+    The rows of the form `rows` are written from byte `offset` on.
+    """
 
     name: str
-    nonce: bytes
+    nonce: str
     size: int
+    offset: int
 
 
 class Ask(NamedTuple):
@@ -85,38 +88,64 @@ class Ask(NamedTuple):
 
 
 class Shard(NamedTuple):
-    """Work for one worker: features first .. last−1 of the question."""
+    """Work for one worker: features first .. last−1 of a question, which comes as the bytes it had."""
 
-    ask: Ask
+    ask: bytes
     first: int
     last: int
 
 
 class ShardDone(NamedTuple):
-    """Features first .. last−1 of a question, k of them.  Arrays that the form does not have are empty.
+    """Features first .. last−1 of a question, k of them.  Arrays that the form does not have are None.
 
     y (k, 6).
-    rows: P(new, (before, new)) of these features, (6 k, m + 6 n); empty when it was written to the segment (`stored`).
+    rows: P(new, (before, new)) of these features, (6 k, m + 6 n); None, too, where they are in the segment (`stored`).
     half: cross (6 k, m) = P(new, before); blocks: for each feature i its P(new i, new i .. n−1), 6 × 6 (n − i), one
     after the other.
-    factored: turn (k, 4), own (k, 3), shared (6 m + 9,), the same in every shard: U (6, m) and S (3, 3).
+    factored: turn (k, 4), own (k, 3), and the same in every shard U (6, m) and S (3, 3).
     """
 
     first: int
     last: int
     y: F64
-    rows: F64
-    cross: F64
-    blocks: F64
-    turn: F64
-    own: F64
-    shared: F64
+    rows: F64 | None = None
+    cross: F64 | None = None
+    blocks: F64 | None = None
+    turn: F64 | None = None
+    own: F64 | None = None
+    U: F64 | None = None
+    S: F64 | None = None
     stored: bool = False
 
 
-class Answered(NamedTuple):
-    """The answer to an Ask: its shards in the order of their features, who did each, and how long that took there."""
+class Done(NamedTuple):
+    """A shard as it was done: by whom ("in-place": the service), and how long it took there."""
 
-    shards: Sequence[ShardDone]
-    workers: Sequence[str]
+    shard: ShardDone
+    worker: str
     seconds: float
+
+
+class Answer(NamedTuple):
+    """The answer to an Ask: its shards in the order of the features.
+
+    clean: everybody who was given a part has answered for it, so nobody will write to the segment any more.
+    """
+
+    shards: tuple[Done, ...]
+    clean: bool
+
+
+def answer_size(ask: Ask) -> int:
+    """Bytes of the numbers in the answer to `ask`, beyond those that go to its segment."""
+    n, m = ask.sighting.count, ask.sighting.width
+    if ask.form == "factored":
+        return 8 * (13 * n + 6 * m + 9)
+    if ask.form == "half":
+        return 8 * (6 * n + 6 * n * m + 36 * n * (n + 1) // 2)
+    return 8 * 6 * n + (0 if ask.segment else rows_size(n, m))
+
+
+def rows_size(n: int, m: int) -> int:
+    """Bytes of the whole new rows."""
+    return 8 * 6 * n * (m + 6 * n)

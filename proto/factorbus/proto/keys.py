@@ -6,6 +6,8 @@
     factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
     factorbus/v1/worker/<id>/job                        query
     factorbus/v1/worker/<id>/live/<slots>               liveliness token
+    factorbus/v1/features/<service>/ask                 query
+    factorbus/v1/features/<service>/live                liveliness token
     factorbus/v1/admin/{maps,create,drop}               query
 
 Maps sit below `map/`, so that no map name can collide with `worker` or `admin`.
@@ -106,3 +108,23 @@ def worker_of(token: str) -> tuple[str, int]:
 def admin_key(operation: str) -> str:
     """Where `operation` (maps, create, drop) on the set of maps is asked for."""
     return f"{PREFIX}/admin/{operation}"
+
+
+def features_key(service: str) -> str:
+    """Where `service` is asked for features, without a map."""
+    return f"{PREFIX}/features/{checked_name('service', service)}/ask"
+
+
+def features_token(service: str) -> str:
+    """Alive while `service` answers for features."""
+    return f"{PREFIX}/features/{checked_name('service', service)}/live"
+
+
+def any_features_token() -> str:
+    """Matches every service's token for features."""
+    return f"{PREFIX}/features/*/live"
+
+
+def service_of(token: str) -> str:
+    """The service that a token for features names."""
+    return token.split("/")[-2]

@@ -1,0 +1,91 @@
+"""Write the golden messages of inverse-depth features, as `../make.py` does for the others.
+
+    python proto/vectors/features/make.py [FOLDER]        (default: the folder of this file)
+
+The numbers are made up; what stands between them is the form.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from factorbus.proto import codec
+from factorbus.proto import features_codec as features
+from factorbus.proto.camera import Camera
+from factorbus.proto.features import Ask, Segment, Shard, ShardDone, Sighting
+from factorbus.proto.messages import Job, JobDone
+
+_NUMBERS = (
+    "numbers", "state", "covariance", "pixels", "y", "rows", "cross", "blocks", "turn", "own", "U", "S",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Write all vectors."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    for name, data in vectors().items():
+        (folder / f"{name}.msgpack").write_bytes(data)
+        (folder / f"{name}.json").write_text(described(data))
+
+
+def vectors() -> dict[str, bytes]:
+    """The golden messages by name: two pixels, a filter that has nothing but its camera."""
+    ask = features.encode_ask(Ask(_sighting(), "half"))
+    half = ShardDone(0, 2, _ramp(2, 6), cross=_ramp(12, 13), blocks=_ramp(3 * 36))
+    shard = features.encode_shard_done(half)
+    segment = Segment("factorbus-4711-" + "0f" * 16, "1e" * 16, 8192, 4096)
+    return {
+        "ask": features.encode_ask(Ask(_sighting(), "rows")),
+        "ask_half": ask,
+        "ask_into_segment": features.encode_ask(Ask(_sighting(), "rows", segment)),
+        "ask_radtan": features.encode_ask(Ask(_sighting(_RADTAN), "factored")),
+        "shard": features.encode_shard(Shard(ask, 0, 2)),
+        "shard_done_rows": features.encode_shard_done(ShardDone(0, 1, _ramp(1, 6), rows=_ramp(6, 25))),
+        "shard_done_half": shard,
+        "shard_done_factored": features.encode_shard_done(
+            ShardDone(1, 2, _ramp(1, 6), turn=_ramp(1, 4), own=_ramp(1, 3), U=_ramp(6, 13), S=_ramp(3, 3))
+        ),
+        "shard_done_stored": features.encode_shard_done(ShardDone(0, 2, _ramp(2, 6), stored=True)),
+        "job_idp": codec.encode_job(Job("j2", "idp", features.encode_shard(Shard(ask, 0, 2)))),
+        "job_done_idp": codec.encode_job_done(JobDone("j2", "idp", shard, 0.25)),
+        "answer": features.encode_answer([(shard, "w1", 0.25)], clean=True),
+    }
+
+
+def described(data: bytes) -> str:
+    """The .json of a message."""
+    return json.dumps(_plain(msgpack.unpackb(data)), indent=1, ensure_ascii=False) + "\n"
+
+
+_RADIAL = Camera("radial", (2.0, 0.0125, 0.0125, 160.0, 120.0, 0.0625, 0.015625), 320, 240)
+_RADTAN = Camera("radtan", (458.0, 457.0, 367.0, 248.0, -0.25, 0.0625, 0.0, 0.0))
+
+
+def _sighting(camera: Camera = _RADIAL) -> Sighting:
+    state = np.array([0.0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+    pixels = np.array([[100.5, 60.25], [200.0, 150.0]])
+    return Sighting(camera, state, np.eye(13) / 64, pixels, 0.5, 0.25, 1.0)
+
+
+def _ramp(*shape: int) -> np.ndarray:
+    return np.arange(float(np.prod(shape))).reshape(shape) / 8
+
+
+def _plain(content: Any, name: str = "") -> Any:
+    if isinstance(content, dict):
+        return {key: _plain(value, key) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_plain(item) for item in content]
+    if isinstance(content, bytes):
+        if name not in _NUMBERS:
+            return {"msgpack": _plain(msgpack.unpackb(content))}
+        return {"f64": np.frombuffer(content, "<f8").tolist()}
+    return content
+
+
+if __name__ == "__main__":
+    main()
