@@ -144,12 +144,13 @@ def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int,
     seen = idp.see(sighting)
     m = sighting.width
     whole = minimal.covariance(P, sighting, seen).P
+    parts = minimal.Parts(sighting, seen)
     cuts = sorted({0, n, *data.draw(st.lists(st.integers(0, n), max_size=4))})
     for first, last in pairwise(cuts):
         out = np.full((6 * (last - first), m + 6 * n), np.nan)
-        minimal.rows(sighting, seen, first, last, out)
+        parts.rows(first, last, out)
         assert out.tobytes() == whole[m + 6 * first : m + 6 * last].tobytes()
-        half = minimal.half(sighting, seen, first, last)
+        half = minimal.Parts(sighting, seen, first).half(first, last)
         assert half.cross.tobytes() == np.ascontiguousarray(out[:, :m]).tobytes()
         at = 0
         for i in range(first, last):

@@ -1,11 +1,12 @@
-"""Inverse-depth features: from pixels to y and its covariance.  Pure mathematics: no bus, clock, thread or file.
+"""Inverse-depth features: from pixels to y and its covariance.  Mathematics: no bus, clock or thread.
 
 `workers/MATH.md` has the equations.
 
     seen = see(sighting)                      y, and its derivatives by the camera and by the pixel
-    minimal.rows(sighting, seen)              the new rows of P, or `half`, or `factored`
+    minimal.covariance(P, sighting, seen)     P with the new features; or rows of it, its upper half, its factors
     independent.covariance(P, A, B, padd)     the same as the 2011 paper has it, and
     classical.covariance(P, A, B, padd)       as it was before
+    job.do(payload)                           the job of kind `idp`, whoever does it
 
 Every covariance comes with the number of multiplications that made it, counted where they are made.
 """

@@ -45,34 +45,46 @@ def covariance(P: F64, sighting: Sighting, seen: Seen, out: F64 | None = None) -
     m, n = len(P), len(seen.y)
     after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
     after[:m, :m] = P
-    count = rows(sighting, seen, 0, n, after[m:])
+    parts = Parts(sighting, seen)
+    count = parts.multiplications + parts.rows(0, n, after[m:])
     kernels.mirror(m, after)
     return Counted(after, count)
 
 
-def rows(sighting: Sighting, seen: Seen, first: int, last: int, out: F64) -> int:
-    """P(new, (before, new)) of features first .. last−1 into `out` (6 (last − first), m + 6 n).  MATH (5.5) to (5.7)
+class Parts:
+    """What the new rows are made of: O(m + n) numbers, from which any rows can be had.
 
-    Gives the number of multiplications.  The bits of a row do not depend on which rows are asked for with it.
+    first: rows of features before this one are not asked for, nor, by the upper half, blocks with them.
+    multiplications: what making these took.
     """
-    parts = _Parts(sighting, seen, 0)
-    count = kernels.rows(
-        first, last, seen.turn, parts.U, parts.V, parts.W, parts.own, sighting.sigma_rho * sighting.sigma_rho, out
-    )
-    return parts.count + count
 
+    def __init__(self, sighting: Sighting, seen: Seen, first: int = 0) -> None:
+        n = len(seen.y)
+        self._turn, self._variance = seen.turn, sighting.sigma_rho * sighting.sigma_rho
+        self._U, S, count = _shared(sighting)
+        self._V, self._W, self._own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
+        count += kernels.spread(first, seen.turn, self._U, S, self._V, self._W)
+        count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, self._own[first:])
+        self.multiplications = count
 
-def half(sighting: Sighting, seen: Seen, first: int, last: int) -> Half:
-    """The upper half of the rows of features first .. last−1, with the bits of `rows`."""
-    n = len(seen.y)
-    parts = _Parts(sighting, seen, first)
-    cross = np.empty((FEATURE * (last - first), sighting.width))
-    blocks = np.empty(blocks_in(n, first, last) * FEATURE * FEATURE)
-    variance = sighting.sigma_rho * sighting.sigma_rho
-    count = kernels.half_rows(
-        first, last, seen.turn, parts.U, parts.V, parts.W, parts.own, variance, cross, blocks
-    )  # fmt: skip
-    return Half(cross, blocks, parts.count + count)
+    def rows(self, first: int, last: int, out: F64) -> int:
+        """P(new, (before, new)) of features first .. last−1 into `out` (6 (last − first), m + 6 n).  MATH (5.5)–(5.7)
+
+        Gives the number of multiplications.  Needs all parts.  The bits of a row do not depend on which rows are asked
+        for with it.
+        """
+        return kernels.rows(
+            first, last, self._turn, self._U, self._V, self._W, self._own, self._variance, out
+        )  # fmt: skip
+
+    def half(self, first: int, last: int) -> Half:
+        """The upper half of the rows of features first .. last−1, with the bits of `rows`."""
+        cross = np.empty((FEATURE * (last - first), self._U.shape[1]))
+        blocks = np.empty(blocks_in(len(self._turn), first, last) * FEATURE * FEATURE)
+        count = kernels.half_rows(
+            first, last, self._turn, self._U, self._V, self._W, self._own, self._variance, cross, blocks
+        )
+        return Half(cross, blocks, count)
 
 
 def factored(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = None) -> Factored:
@@ -87,17 +99,6 @@ def factored(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = 
 def blocks_in(n: int, first: int, last: int) -> int:
     """6 × 6 blocks in the upper half of the rows of features first .. last−1 of n."""
     return (last - first) * n - (last * (last - 1) - first * (first - 1)) // 2
-
-
-class _Parts:
-    """What the rows of features `first` .. n−1 are made of."""
-
-    def __init__(self, sighting: Sighting, seen: Seen, first: int) -> None:
-        n = len(seen.y)
-        self.U, self.S, self.count = _shared(sighting)
-        self.V, self.W, self.own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
-        self.count += kernels.spread(first, seen.turn, self.U, self.S, self.V, self.W)
-        self.count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, self.own[first:])
 
 
 def _shared(sighting: Sighting) -> tuple[F64, F64, int]:

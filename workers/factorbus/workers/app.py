@@ -38,9 +38,10 @@ def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event)
     """
     checked(config)
     if config.warm:
+        from factorbus.idp import warm as warm_idp
         from factorbus.solver import compiled_seconds, warm
 
-        seconds = warm(lambda name: _announce(name, compiled_seconds()))
+        seconds = sum(make(lambda name: _announce(name, compiled_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
     sys.setswitchinterval(0.0005)
     session = _open(config, stop)

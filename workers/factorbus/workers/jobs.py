@@ -1,6 +1,7 @@
 """What each kind of job does.  A job is a pure function of its payload, so that any worker, or two, may do it.
 
 batch    a Graph            → Optimum: the graph optimised from scratch
+idp      a Shard            → ShardDone: new features of a monocular filter, with their covariance
 """
 
 from collections.abc import Callable, Mapping
@@ -12,7 +13,7 @@ from factorbus.proto.problems import UnknownKind
 
 
 def do(kind: str, payload: bytes) -> bytes:
-    """The result of a job of `kind`.  Raises UnknownKind, BadMessage, TooLarge, SolverError."""
+    """The result of a job of `kind`.  Raises Problem, SolverError."""
     job = JOBS.get(kind)
     if job is None:
         raise UnknownKind("job.kind", kind, tuple(JOBS))
@@ -29,4 +30,11 @@ def batch(payload: bytes) -> bytes:
     return codec.encode_optimum(Optimum(result.chi2, result.iterations, values))
 
 
-JOBS: Mapping[str, Callable[[bytes], bytes]] = MappingProxyType({"batch": batch})
+def idp(payload: bytes) -> bytes:
+    """New features, as an encoded ShardDone.  Raises BadMessage, TooLarge, BadCamera, BadShape, BadState, BadPixel."""
+    from factorbus.idp import job
+
+    return job.do(payload)
+
+
+JOBS: Mapping[str, Callable[[bytes], bytes]] = MappingProxyType({"batch": batch, "idp": idp})

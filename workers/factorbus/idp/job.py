@@ -1,0 +1,74 @@
+"""The job of kind `idp`: a shard of a question's features, the same bits whoever does it.
+
+What goes to shared memory is written there in pieces that fit the second-level cache.
+"""
+
+import numpy as np
+
+from factorbus.idp.minimal import Parts, factored
+from factorbus.idp.sight import Seen, see
+from factorbus.proto import segments
+from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, rows_size
+from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done
+from factorbus.proto.limits import ANSWER_LIMITS
+from factorbus.proto.problems import BadMessage, TooLarge
+
+_PIECE = 64 << 10  # doubles
+
+
+def do(payload: bytes) -> bytes:
+    """The encoded ShardDone of an encoded Shard.
+
+    Raises BadMessage, TooLarge, BadCamera, BadShape, BadState, BadPixel.
+    """
+    shard = decode_shard(payload)
+    return encode_shard_done(done(shard, decode_ask(shard.ask, ANSWER_LIMITS)))
+
+
+def done(shard: Shard, ask: Ask) -> ShardDone:
+    """`shard` of the question `ask`.  Raises BadMessage, TooLarge, BadShape, BadState, BadPixel."""
+    first, last, n = shard.first, shard.last, ask.sighting.count
+    if last > n:
+        raise BadMessage("last", f"is {last}", f"at most {n}, the number of pixels")
+    if answer_size(ask) > ANSWER_LIMITS.max_bytes:
+        raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
+    seen = see(ask.sighting)
+    y = seen.y[first:last]
+    if ask.form == "factored":
+        found = factored(ask.sighting, seen, first, last)
+        return ShardDone(first, last, y, turn=found.turn, own=found.own, U=found.U, S=found.S)
+    if ask.form == "half":
+        half = Parts(ask.sighting, seen, first).half(first, last)
+        return ShardDone(first, last, y, cross=half.cross, blocks=half.blocks)
+    if ask.segment is not None and _stored(shard, ask, ask.segment, seen):
+        return ShardDone(first, last, y, stored=True)
+    return ShardDone(first, last, y, rows=_rows(shard, ask, seen))
+
+
+def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
+    """Whether the rows could be written to shared memory."""
+    n, m = ask.sighting.count, ask.sighting.width
+    width = m + FEATURE * n
+    parts, step = Parts(ask.sighting, seen), max(1, _PIECE // (FEATURE * width))
+    piece = np.empty((FEATURE * min(step, n), width))
+    with segments.try_opened(segment, rows_size(n, m)) as descriptor:
+        if descriptor is None:
+            return False
+        try:
+            for first in range(shard.first, shard.last, step):
+                last = min(first + step, shard.last)
+                rows = piece[: FEATURE * (last - first)]
+                parts.rows(first, last, rows)
+                segments.write(descriptor, rows, segment.offset + 8 * FEATURE * first * width)
+        except OSError:  # no room: /dev/shm is full
+            return False
+    return True
+
+
+def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
+    n, m = ask.sighting.count, ask.sighting.width
+    if (size := rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
+        raise TooLarge("the answer, which cannot go to shared memory,", size, ANSWER_LIMITS.max_bytes, "bytes")
+    rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
+    Parts(ask.sighting, seen).rows(shard.first, shard.last, rows)
+    return rows
