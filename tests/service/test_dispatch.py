@@ -88,6 +88,30 @@ def test_a_problem_with_the_job_itself_is_not_tried_again() -> None:
     assert dispatch.failed(tag_of(dispatch.submit(job("j"))), problem) == [Ended("j", "a", problem)]
 
 
+def test_a_worker_that_did_not_answer_in_time_gets_nothing_until_it_is_heard_of() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    dispatch.joined("b", 2)
+    effects = dispatch.failed(tag_of(dispatch.submit(job("j"))), TIMEOUT)
+    assert places(effects) == ["b"]
+    assert (dispatch.suspects, dispatch.slots) == (["a"], 2)
+    assert [places(dispatch.submit(job(name))) for name in "klm"] == [["b"], [], []]
+    assert places(dispatch.heard("a")) == ["a"]
+    assert (dispatch.suspects, dispatch.slots) == ([], 3)
+    ended, *following = dispatch.done(tag_of(effects), done("j"))
+    assert ended == Ended("j", "b", done("j"))
+    assert isinstance(ended, Ended)
+    assert ended.tries == 2
+    assert places(following) == ["b"]
+
+
+def test_when_all_are_suspects_it_is_done_in_place() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    assert places(dispatch.failed(tag_of(dispatch.submit(job("j"))), TIMEOUT)) == [IN_PLACE]
+    assert places(dispatch.submit(job("k"))) == [IN_PLACE]
+
+
 def test_a_late_answer_is_dropped_by_its_tag() -> None:
     dispatch = Dispatch()
     dispatch.joined("a", 1)

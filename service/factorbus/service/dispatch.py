@@ -4,6 +4,9 @@ The worker with the fewest jobs in flight goes first; nobody gets more than it h
 leaves, times out, answers nothing or fails goes to another one, and after `TRIES` of them, or when there is no
 worker at all, it is done in place.  Jobs are pure functions of their payload, so two workers on one job do no harm;
 every sending has a tag of its own, and an answer to any but the latest is dropped.
+
+A worker that did not answer in time is a suspect: it may be frozen, and would cost every job that it is given another
+deadline.  It gets nothing more until it is heard of again, in whatever way the shell finds out.
 """
 
 from collections import deque
@@ -38,11 +41,15 @@ class InPlace:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """`job` is done by `worker`, or cannot be done: result is a JobDone or a problem."""
+    """`job` is done by `worker`, or cannot be done: result is a JobDone or a problem.
+
+    tries: how often it was given to somebody; above 1, one who was given up may still be at it.
+    """
 
     job: str
     worker: str
     result: JobDone | Any
+    tries: int = field(default=1, compare=False)
 
 
 Effect: TypeAlias = Send | InPlace | Ended
@@ -53,6 +60,7 @@ IN_PLACE = "in-place"
 class _Worker:
     slots: int
     tags: set[int] = field(default_factory=set)
+    suspect: bool = False
 
 
 @dataclass(slots=True)
@@ -80,6 +88,16 @@ class Dispatch:
         """Jobs that are not done."""
         return len(self._jobs)
 
+    @property
+    def slots(self) -> int:
+        """Jobs that the workers which are not suspect take at a time."""
+        return sum(worker.slots for worker in self._workers.values() if not worker.suspect)
+
+    @property
+    def suspects(self) -> list[str]:
+        """Workers that did not answer in time and have not been heard of since."""
+        return [name for name, worker in self._workers.items() if worker.suspect]
+
     def table(self) -> list[dict[str, Any]]:
         """Who works here: rows of name, slots and jobs in flight."""
         return [{"name": n, "slots": w.slots, "in_flight": len(w.tags)} for n, w in sorted(self._workers.items())]
@@ -95,6 +113,12 @@ class Dispatch:
         gone = self._workers.pop(worker, None)
         for tag in sorted(gone.tags, reverse=True) if gone else ():
             self._again(tag)
+        return self._place_waiting()
+
+    def heard(self, worker: str) -> list[Effect]:
+        """`worker` answers: it is no suspect (any more)."""
+        if worker in self._workers:
+            self._workers[worker].suspect = False
         return self._place_waiting()
 
     def submit(self, job: Job) -> list[Effect]:
@@ -114,19 +138,21 @@ class Dispatch:
         job, worker = self._release(tag)
         if not self._is_latest(job, tag):
             return self._place_waiting()
-        del self._jobs[job]
-        return [Ended(job, worker, done), *self._place_waiting()]
+        tries = self._jobs.pop(job).tries
+        return [Ended(job, worker, done, tries), *self._place_waiting()]
 
     def failed(self, tag: int, problem: Any) -> list[Effect]:
         """The sending `tag` was refused, timed out or came to nothing."""
         job, worker = self._by_tag.get(tag, ("", ""))
+        if problem.code == "unavailable" and worker in self._workers:
+            self._workers[worker].suspect = True
         retry = worker != IN_PLACE and problem.code in _TRY_ANOTHER | {"unavailable"}
         if retry or not self._is_latest(job, tag):
             self._again(tag)
             return self._place_waiting()
         self._release(tag)
-        del self._jobs[job]
-        return [Ended(job, worker, problem), *self._place_waiting()]
+        tries = self._jobs.pop(job).tries
+        return [Ended(job, worker, problem, tries), *self._place_waiting()]
 
     def _is_latest(self, job: str, tag: int) -> bool:
         return job in self._jobs and self._jobs[job].tag == tag
@@ -158,14 +184,17 @@ class Dispatch:
 
     def _place(self, found: _Open) -> Effect | None:
         """Where it goes now; None: it waits for a slot."""
-        untried: Mapping[str, _Worker] = {n: w for n, w in self._workers.items() if n not in found.tried}
+        untried: Mapping[str, _Worker] = {
+            name: worker for name, worker in self._workers.items() if name not in found.tried and not worker.suspect
+        }
         tag = next(self._tags)
         if found.tries >= TRIES or not untried:
             worker, effect = IN_PLACE, InPlace(tag, found.job)
         else:
-            worker = min(untried, key=lambda name: (len(untried[name].tags), name))
-            if len(untried[worker].tags) >= untried[worker].slots:
+            free = [name for name, worker in untried.items() if len(worker.tags) < worker.slots]
+            if not free:
                 return None
+            worker = min(free, key=lambda name: (len(untried[name].tags), name))
             self._workers[worker].tags.add(tag)
             effect = Send(tag, worker, found.job)
         found.tried.add(worker)
