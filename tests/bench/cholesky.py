@@ -28,6 +28,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from bench.replays.full_pass import cholmod_blas, system_of
 from bench.replays.problems import file_of
 from naive.block_systems import BlockSystem, grid
 from scipy.sparse import csc_matrix, tril
@@ -37,7 +38,6 @@ from factorbus.datasets import find
 from factorbus.formats import read
 from factorbus.solver import Options, Solver
 from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels.simd import LANES
 from factorbus.solver.ordering import order
 from factorbus.solver.symbolic import Symbolic, analyze
@@ -80,9 +80,7 @@ def final_system(path: Path) -> BlockSystem:
     solver = Solver(Options(mode="all-batch"))
     solver.stage(read(path).whole())
     solver.step(settle=True)
-    graph, blocks = solver._graph, solver._system.blocks
-    dims = graph.dims[: graph.counts[at.COLUMNS]].copy()
-    return BlockSystem(dims, blocks.rows.copy(), blocks.cols.copy(), blocks.data.copy(), blocks.offsets.copy())
+    return system_of(solver)
 
 
 def measure(system: BlockSystem, repetitions: int) -> dict[str, Any]:
@@ -151,12 +149,6 @@ def pin() -> int:
     core = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     return core
-
-
-def cholmod_blas() -> list[str]:
-    """The BLAS libraries in this process that are not numpy's or scipy's own."""
-    paths = {row.split()[-1] for row in Path("/proc/self/maps").read_text().splitlines() if "blas" in row.lower()}
-    return sorted(path for path in paths if ".libs/" not in path)
 
 
 HEAD = (

@@ -12,7 +12,6 @@ for.  The exit code is 1 when a target is missed.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.replays import problems, runner, summary, table, targets
 from bench.replays.bars import bars
+from bench.replays.command import add_options, hand_out, positive
 from bench.replays.contestants import ENTRIES, QUICK, TABLE_1, Entry
 from bench.replays.problems import Problem
 from bench.replays.samples import Sampling
@@ -50,7 +50,7 @@ def main() -> None:
     document.pop("optima", None)
     verdicts = document.pop("verdicts")
     text = table.report(document["rows"], document["fill"], verdicts, document["notes"], document["machine"])
-    _hand_out(document, text, options)
+    hand_out("paper", document, text, options)
     if any(target["verdict"] == targets.MISSED for target in document["targets"]):
         sys.exit(1)
 
@@ -118,7 +118,7 @@ def draw(
     fill_figures.elements_figure(paths[1], systems)
     figures.maps_figure(paths[2], [(p, Path(measured[p.key]["reference"]["values"])) for p in chosen])
     runs = {p.key: [each[0] for each in measured[p.key]["runs"].values() if each] for p in chosen}
-    figures.time_figure(paths[3], runs, {p.key: p.label for p in chosen})
+    figures.time_figure(paths[3], runs, {p.key: p.label for p in chosen}, "Fig. 4   ")
     along = min(chosen, key=lambda p: _FIGURE_5.index(p.name) if p.name in _FIGURE_5 else len(_FIGURE_5))
     figures.chi2_figure(paths[4], along.label, runs[along.key], optima[along.key])
     return paths
@@ -142,40 +142,11 @@ def _selection(
     return wanted, [entry for entry in entries if not entry.missing()], absent
 
 
-def _hand_out(document: dict[str, Any], text: str, options: argparse.Namespace) -> None:
-    """Markdown and JSON into the output folder, and to where they were asked for."""
-    options.out.mkdir(parents=True, exist_ok=True)
-    content = json.dumps(document, indent=2)
-    (options.out / "paper.md").write_text(text)
-    (options.out / "paper.json").write_text(content)
-    if options.json == "-":
-        print(content)
-        return
-    if options.json:
-        Path(options.json).write_text(content)
-    print(text)
-    print(f"In {options.out}: paper.md, paper.json{'' if options.no_figures else ', figure_1.png to figure_5.png'}")
-
-
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small or shortened data sets and fewer solvers")
-    parser.add_argument("--only", default="", metavar="NAME,...", help="these data sets and solvers only")
-    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="the JSON document to FILE, or to -")
-    parser.add_argument("--repetitions", type=_positive, default=1, help="of every run; times are medians")
-    parser.add_argument("--samples", type=_positive, default=100, help="steps at which χ² is held against the optimum")
-    parser.add_argument("--limit-s", type=float, default=1800.0, help="solver CPU seconds after which a run is ended")
-    parser.add_argument("--fresh", action="store_true", help="measure again what the output folder has")
-    parser.add_argument("--out", type=Path, default=Path("out/bench/paper"), help="where results are kept")
-    parser.add_argument("--no-figures", action="store_true", help="tables only")
+    add_options(parser, "paper", repetitions=1)
+    parser.add_argument("--samples", type=positive, default=100, help="steps at which χ² is held against the optimum")
     return parser.parse_args()
-
-
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number}; wanted 1 or more")
-    return number
 
 
 if __name__ == "__main__":

@@ -115,6 +115,6 @@ def test_the_table_has_data_sets_as_columns_and_marks_the_best() -> None:
 
 
 def test_every_contestant_has_a_look_of_its_own() -> None:
-    looks = [(look["color"], str(look.get("linestyle"))) for look in figures._LOOKS.values()]
-    assert set(figures._LOOKS) == set(ENTRIES)
+    looks = [(look["color"], str(look.get("linestyle"))) for look in figures.LOOKS.values()]
+    assert set(figures.LOOKS) == set(ENTRIES)
     assert len(set(looks)) == len(looks)

@@ -12,7 +12,7 @@ from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
 BENCHES = ("cholesky", "bus")  # what `all` runs, a minute or two
-LONG = ("paper",)  # hours; on request
+LONG = ("paper", "peers")  # hours; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -27,6 +27,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
+    peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
+               growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
     all        cholesky and bus
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
@@ -35,6 +37,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     \b
     factorbus bench cholesky
     factorbus bench paper --quick
+    factorbus bench peers --only intel,manhattan3500
     factorbus bench all --json > bench.json
     """
     folder = _folder()

@@ -12,8 +12,9 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -122,10 +123,17 @@ def fill(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
     return numbers
 
 
-_JOBS: dict[str, Callable[[dict[str, Any], Problem, Tell], dict[str, Any]]] = {
+def _measure(kind: str) -> "Job":
+    """The function `kind` of the file `kind`."""
+    return lambda job, problem, tell: getattr(import_module(f"bench.replays.{kind}"), kind)(job, problem, tell)
+
+
+Job: TypeAlias = Callable[[dict[str, Any], Problem, Tell], dict[str, Any]]
+_JOBS: dict[str, Job] = {
     "replay": replay,
     "reference": reference,
     "fill": fill,
+    **{kind: _measure(kind) for kind in ("growth", "full_pass", "overhead")},
 }
 
 

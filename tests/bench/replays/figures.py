@@ -15,12 +15,12 @@ from .problems import Problem
 from .summary import FLOOR
 
 # Okabe and Ito's colours, which differ for colour-blind readers as well; dashes tell them apart in grey.
-_LOOKS: dict[str, dict[str, Any]] = {
+LOOKS: dict[str, dict[str, Any]] = {
     "inc-l": {"color": "#D55E00", "linewidth": 1.8, "zorder": 6},
     "all-batch": {"color": "#009E73", "linewidth": 1.6, "zorder": 5},
     "inc-l-b10": {"color": "#E69F00", "linewidth": 1.1, "zorder": 4},
     "inc-l-b100": {"color": "#CC79A7", "linewidth": 1.1, "zorder": 3},
-    "auto": {"color": "#000000", "linewidth": 1.0, "linestyle": (0, (1, 1)), "zorder": 7},
+    "auto": {"color": "#000000", "linewidth": 1.6, "zorder": 7},
     "isam2-0.1": {"color": "#0072B2", "linewidth": 1.3, "linestyle": (0, (5, 2)), "zorder": 4},
     "isam2-0.01": {"color": "#56B4E9", "linewidth": 1.3, "linestyle": (0, (5, 2)), "zorder": 3},
     "isam2-0.1-qr": {"color": "#0072B2", "linewidth": 1.0, "linestyle": (0, (1, 1.5)), "zorder": 2},
@@ -38,7 +38,7 @@ _COMPARED = ("all-batch", "inc-l", "inc-l-b10", "inc-l-b100", "isam2-0.1", "isam
 
 def maps_figure(path: Path, maps: Sequence[tuple[Problem, Path]]) -> None:
     """Fig. 3: the optimal map of each problem; poses as a line, landmarks as marks."""
-    axes_of, finish = _sheet(len(maps), 3.4, "Fig. 3   The maps at the optimum (metres)")
+    axes_of, finish = sheet(len(maps), 3.4, "Fig. 3   The maps at the optimum (metres)")
     for axes, (problem, file) in zip(axes_of, maps, strict=True):
         with np.load(file) as values:
             poses = values["se2"] if "se2" in values else values["se3"]
@@ -51,27 +51,28 @@ def maps_figure(path: Path, maps: Sequence[tuple[Problem, Path]]) -> None:
     finish(path)
 
 
-def time_figure(path: Path, curves: dict[str, list[dict[str, Any]]], titles: dict[str, str]) -> None:
+def time_figure(path: Path, curves: dict[str, list[dict[str, Any]]], titles: dict[str, str], name: str) -> None:
     """Fig. 4: solver time used up to each pose, one panel a data set.
 
     curves: data set -> runs; a logarithmic axis, because the slowest takes hundreds of times as long as the fastest.
+    name: what the figure is called.
     """
-    axes_of, finish = _sheet(len(curves), 3.0, "Fig. 4   Cumulative time (CPU seconds) along the replay (poses)")
+    axes_of, finish = sheet(len(curves), 3.0, f"{name}Cumulative time (CPU seconds) along the replay (poses)")
     for axes, (dataset, runs) in zip(axes_of, curves.items(), strict=True):
-        for run in _in_order(runs):
+        for run in in_order(runs):
             steps, seconds = (np.array(part, float) for part in run["cumulative"])
             keep = seconds > 0
-            axes.plot(steps[keep], seconds[keep], **_LOOKS[run["contestant"]])
+            axes.plot(steps[keep], seconds[keep], **LOOKS[run["contestant"]])
         axes.set_yscale("log")
         axes.set_ylim(bottom=1e-3)
         axes.locator_params(axis="x", nbins=5)
         axes.set_title(titles[dataset], loc="left")
-    finish(path, _handles({run["contestant"] for runs in curves.values() for run in runs}))
+    finish(path, handles_of({run["contestant"] for runs in curves.values() for run in runs}))
 
 
 def chi2_figure(path: Path, title: str, runs: Sequence[dict[str, Any]], batch: dict[int, float]) -> None:
     """Fig. 5: χ² along one replay; below, how far it is above the optimum of the same step."""
-    compared = [run for run in _in_order(runs) if run["contestant"] in _COMPARED and run["chi2"]]
+    compared = [run for run in in_order(runs) if run["contestant"] in _COMPARED and run["chi2"]]
     with mpl.rc_context(style.SETTINGS):
         figure = Figure(figsize=(9.5, 7.0), layout="constrained")
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1, 1.15))
@@ -82,8 +83,8 @@ def chi2_figure(path: Path, title: str, runs: Sequence[dict[str, Any]], batch: d
             at, chi2 = (np.array(part) for part in zip(*run["chi2"], strict=True))
             best = np.array([batch[int(step)] for step in at])
             excess = np.maximum(chi2, FLOOR) / np.maximum(best, FLOOR) - 1
-            upper.plot(at, chi2, label=ENTRIES[run["contestant"]].label, **_LOOKS[run["contestant"]])
-            lower.plot(at, np.maximum(excess, 1e-10), marker=".", markersize=3, **_LOOKS[run["contestant"]])
+            upper.plot(at, chi2, label=ENTRIES[run["contestant"]].label, **LOOKS[run["contestant"]])
+            lower.plot(at, np.maximum(excess, 1e-10), marker=".", markersize=3, **LOOKS[run["contestant"]])
         upper.set_ylabel("χ²")
         upper.ticklabel_format(axis="y", style="sci", scilimits=(-3, 4))
         upper.legend(loc="upper left", ncols=2)
@@ -94,7 +95,7 @@ def chi2_figure(path: Path, title: str, runs: Sequence[dict[str, Any]], batch: d
         figure.savefig(path, dpi=150)
 
 
-def _sheet(count: int, height: float, title: str) -> tuple[list[Any], Callable[..., None]]:
+def sheet(count: int, height: float, title: str) -> tuple[list[Any], Callable[..., None]]:
     """Panels on one page, three in a row, and what saves them, with a legend if there are handles."""
     columns = min(3, count)
     rows = -(-count // columns)
@@ -115,13 +116,14 @@ def _sheet(count: int, height: float, title: str) -> tuple[list[Any], Callable[.
     return panels[:count], finish
 
 
-def _handles(names: set[str]) -> list[Any]:
+def handles_of(names: set[str]) -> list[Any]:
+    """Entries of a legend."""
     from matplotlib.lines import Line2D
 
-    return [Line2D([], [], label=ENTRIES[name].label, **_LOOKS[name]) for name in ENTRIES if name in names]
+    return [Line2D([], [], label=ENTRIES[name].label, **LOOKS[name]) for name in ENTRIES if name in names]
 
 
-def _in_order(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def in_order(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """As the table has them; runs that got nowhere are left out."""
     there = {run["contestant"]: run for run in runs if run.get("done")}
     return [there[name] for name in ENTRIES if name in there]

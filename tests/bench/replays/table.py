@@ -19,7 +19,7 @@ def report(
     """The whole text."""
     parts = [
         "# Replays",
-        f"{machine['cpu']}, one core; Python {machine['python']}; CPU seconds of the solver alone. {_when(rows)}",
+        f"{machine['cpu']}, one core; Python {machine['python']}; CPU seconds of the solver alone. {when(rows)}",
         *(f"> {note}" for note in notes),
         "## Table 1: seconds for a whole replay",
         table_1(rows),
@@ -45,13 +45,13 @@ def table_1(rows: Sequence[dict[str, Any]]) -> str:
         dataset: min((row["cpu_s"] for row in rows if row["dataset"] == dataset and row["status"] == "done"), default=0)
         for dataset in titles
     }
-    lines = [_line(["", *titles.values()]), _line(["---", *["---:"] * len(titles)])]
+    lines = [line(["", *titles.values()]), line(["---", *["---:"] * len(titles)])]
     for ours in (False, True):
         if ours:
-            lines.append(_line(["*ours*", *[""] * len(titles)]))
+            lines.append(line(["*ours*", *[""] * len(titles)]))
         for name, entry in ENTRIES.items():
             if (entry.solver == OURS) == ours and any(row["name"] == name for row in rows):
-                lines.append(_line([entry.label, *(_cell(cells.get((name, d)), best[d]) for d in titles)]))
+                lines.append(line([entry.label, *(_cell(cells.get((name, d)), best[d]) for d in titles)]))
     return "\n".join(lines)
 
 
@@ -59,18 +59,18 @@ def details(rows: Sequence[dict[str, Any]]) -> str:
     """All that was measured on one data set."""
     head = ["", "cpu s", "solve s", "read s", "wall s", "p50 ms", "p95", "p99", "max", "χ² end"]
     head += ["χ²/batch median", "p95", "max", "mean", "spikes", "nnz R", "MB", "steps by strategy"]
-    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 2), "---"])]
+    lines = [line(head), line(["---", *["---:"] * (len(head) - 2), "---"])]
     for row in rows:
         step, quality = row["step_ms"], row["chi2_ratio"]
         size = "" if row["peak_mb"] is None else f"{row['peak_mb']:.0f} ({row['base_mb']:.0f})"
         cells = [ENTRIES[row["name"]].label]
-        cells += [_number(row[name], "{:.3f}") for name in ("cpu_s", "solve_s", "read_s", "wall_s")]
-        cells += [_number(step.get(name), "{:.3f}") for name in ("p50", "p95", "p99", "max")]
-        cells.append(_number(row["chi2_final"], "{:.8g}"))
-        cells += [_number(quality.get(name), "{:.5f}") for name in ("median", "p95", "max", "mean")]
-        cells += [_number(quality.get("spikes"), "{}"), _number(row["nnz_r"], "{}"), size]
+        cells += [number(row[name], "{:.3f}") for name in ("cpu_s", "solve_s", "read_s", "wall_s")]
+        cells += [number(step.get(name), "{:.3f}") for name in ("p50", "p95", "p99", "max")]
+        cells.append(number(row["chi2_final"], "{:.8g}"))
+        cells += [number(quality.get(name), "{:.5f}") for name in ("median", "p95", "max", "mean")]
+        cells += [number(quality.get("spikes"), "{}"), number(row["nnz_r"], "{}"), size]
         cells.append(", ".join(f"{name} {count}" for name, count in row["strategies"].items()))
-        lines.append(_line(cells))
+        lines.append(line(cells))
     return "\n".join(lines)
 
 
@@ -78,7 +78,7 @@ def fill_table(fills: dict[str, dict[str, Any]]) -> str:
     """Nonzeros of R by ordering."""
     head = ["", "scalars", "blocks", "blocks, constrained", "elements", "elements, constrained", "CHOLMOD AMD"]
     head += ["blocks / CHOLMOD", "price of the constraint", "with landmarks of 10 poses", "stored by full blocks"]
-    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 1)])]
+    lines = [line(head), line(["---", *["---:"] * (len(head) - 1)])]
     for dataset, fill in fills.items():
         nnz = fill["nnz"]
         names = ("blocks", "blocks_constrained", "elements", "elements_constrained", "cholmod_amd")
@@ -86,7 +86,7 @@ def fill_table(fills: dict[str, dict[str, Any]]) -> str:
         cells += [f"{fill['against_cholmod']:.4f}", f"{100 * fill['price_of_constraint']:+.2f} %"]
         cells.append(f"{100 * fill['price_of_recent']:+.2f} %")
         cells.append(str(fill["stored_by_blocks"]))
-        lines.append(_line(cells))
+        lines.append(line(cells))
     return "\n".join(lines)
 
 
@@ -106,15 +106,15 @@ def _cell(row: dict[str, Any] | None, best: float) -> str:
     return f"**{text}**" if row["cpu_s"] == best else text
 
 
-def _number(value: Any, form: str) -> str:
+def number(value: Any, form: str) -> str:
     return "" if value is None else form.format(value)
 
 
-def _line(cells: Sequence[str]) -> str:
+def line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _when(rows: Sequence[dict[str, Any]]) -> str:
+def when(rows: Sequence[dict[str, Any]]) -> str:
     times = sorted(row["measured_at"] for row in rows if row["measured_at"])
     loads = [row["load_average"] for row in rows if row["load_average"] is not None]
     if not times:

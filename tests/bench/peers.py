@@ -1,0 +1,231 @@
+"""Our default mode against GTSAM's iSAM2 on all public data sets, with an estimate of everything after every step.
+
+    python tests/bench/peers.py [--quick] [--only NAME,...] [--json [FILE]] [--repetitions N] [--fresh] [...]
+
+    replays    pose by pose, all eleven data sets: CPU time of `auto`, all variables read after every step, against that
+               of iSAM2's `update()` alone; long steps; χ²/χ²_batch at every hundredth step and the last
+    growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
+    full-pass  relinearise, order, analyse, factorise and solve each final system, against CHOLMOD with OpenBLAS
+    overhead   what Python adds to the compiled calls of a step; the start of a process; compiling from nothing
+
+Every run is a process of its own on one core, three repetitions, medians, and is kept in the output folder
+(out/bench/peers): a second call goes on where the first was stopped and measures only what is new or changed.
+--quick takes two minutes, and does not judge what it shortens.  Without data sets it replays simulated worlds.
+
+NAME is a part (replays, growth, full-pass, overhead), a data set (intel, w10000, ...) or a solver: auto, isam2-0.1, and
+when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop), all-batch, inc-l.
+The exit code is 1 when a target is missed.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets
+from bench.replays.bars import Begin, Tell, bars
+from bench.replays.command import add_options, hand_out
+from bench.replays.contestants import AHEAD, ENTRIES, Entry
+from bench.replays.problems import ALL, Problem
+from bench.replays.samples import Sampling
+
+PARTS = ("replays", "growth", "full-pass", "overhead")
+SOLVERS = {
+    **{name: name for name in ("auto", "gn-loop", "all-batch", "inc-l")},
+    **{f"isam2-{threshold}": f"isam2-{threshold}-update" for threshold in ("0.1", "0.01")},
+}
+GROWTH = Problem("manhattan", "Manhattan", poses=100_000, seed=1)
+_QUICK_GROWTH = 2_000
+_OVERHEAD_POSES = 1_000
+_PASSES, _QUICK_PASSES = 15, 5
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is measured."""
+
+    parts: tuple[str, ...]
+    chosen: list[Problem]
+    entries: list[Entry]
+    repetitions: int
+    quick: bool
+
+    def jobs(self) -> int:
+        """How many."""
+        references = len(self.chosen) if {"replays", "full-pass"} & set(self.parts) else 0
+        replays = len(self.chosen) * len(self.entries) * self.repetitions if "replays" in self.parts else 0
+        growth = self.repetitions if "growth" in self.parts else 0
+        passes = len(self.chosen) if "full-pass" in self.parts else 0
+        return references + replays + growth + passes + ("overhead" in self.parts)
+
+
+def main() -> None:
+    """Measure what is missing, print, draw; exit 1 when a target is missed."""
+    options = _options()
+    chosen, note = problems.choose(options.quick, ALL)
+    plan, absent = _plan(options, chosen)
+    sampling = Sampling(every=100)
+    settings = runner.Settings(options.out, runner.pick_core(), sampling, options.limit_s, options.fresh)
+    try:
+        with bars(plan.jobs()) as (begin, progress):
+            found = measure(settings, plan, begin, progress)
+    except runner.Crashed as problem:
+        sys.exit(f"bench peers: optima could not be computed: {problem}")
+    except KeyboardInterrupt:
+        sys.exit(f"bench peers: stopped; what is finished is in {options.out}, and the same call goes on from there")
+    document, verdicts = conclude(found, plan, [note, *absent])
+    if not options.no_figures:
+        document["figures"] = [str(path) for path in draw(options.out, found, document, plan)]
+    hand_out("peers", document, peer_table.report(document, verdicts), options)
+    if targets.missed(verdicts):
+        sys.exit(1)
+
+
+def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, Any]:
+    """references and runs by data set; growth, full_pass and overhead where they are in the plan."""
+    found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}, "overhead": None}
+    if {"replays", "full-pass"} & set(plan.parts):
+        for problem in plan.chosen:
+            begin(f"{problem.key}: optima", problem.steps)
+            found["references"][problem.key] = runner.run_reference(settings, problem, progress)
+    if "replays" in plan.parts:
+        found["runs"] = _replays(settings, plan, begin, progress)
+    if "growth" in plan.parts:
+        world = GROWTH.shortened(_QUICK_GROWTH) if plan.quick else GROWTH
+        for repetition in range(plan.repetitions):
+            begin(f"growth to {world.poses}", world.poses)
+            more = {"limit_s": settings.limit_s}
+            found["growth"].append(_measured(settings, world, "growth", more, progress, repetition))
+    if "full-pass" in plan.parts:
+        count = _QUICK_PASSES if plan.quick else _PASSES
+        for problem in plan.chosen:
+            begin(f"{problem.key}: full pass", count)
+            more = {"values": found["references"][problem.key]["values"], "repetitions": count}
+            found["full_pass"][problem.key] = _measured(settings, problem, "full_pass", more, progress)
+    if "overhead" in plan.parts:
+        world = GROWTH.shortened(_OVERHEAD_POSES)
+        begin("overhead", world.poses)
+        found["overhead"] = _measured(settings, world, "overhead", {"cold": not plan.quick}, progress)
+    return found
+
+
+def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, dict[str, list[Any]]]:
+    """Runs by data set and contestant.  The solvers take turns: all of them once before any of them a second time."""
+    runs: dict[str, dict[str, list[Any]]] = {p.key: {e.name: [] for e in plan.entries} for p in plan.chosen}
+    for repetition in range(plan.repetitions):
+        for problem in plan.chosen:
+            for entry in plan.entries:
+                begin(f"{problem.key}: {entry.name}", problem.steps)
+                run = runner.run_replay(settings, problem, entry, repetition, progress)
+                runs[problem.key][entry.name].append(run)
+    return runs
+
+
+def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[dict[str, Any], list[targets.Verdict]]:
+    """The document, and the verdicts."""
+    rows, said, ends = [], [note for note in notes if note], {}
+    if "replays" in plan.parts:
+        for problem in plan.chosen:
+            mine = found["runs"][problem.key]
+            firsts = [each[0] for each in mine.values() if each]
+            batch, remarks = summary.best_known(problem, found["references"][problem.key], firsts)
+            said += remarks
+            ends[problem.key] = batch[max(batch)]
+            rows += peer_summary.rows_of(problem, plan.entries, mine, batch)
+    growth, overhead = _together(found["growth"]), found["overhead"]
+    crashed = overhead["reason"] if overhead and "step" not in overhead else ""
+    if crashed:
+        said.append(f"overhead was not measured: {crashed}")
+        overhead = None
+    verdicts = [
+        *peer_targets.judge(rows, ends),
+        *peer_targets.judge_growth(growth),
+        *peer_targets.judge_passes(found["full_pass"]),
+        *peer_targets.judge_overhead(overhead),
+    ]
+    return {
+        "machine": runner.machine(),
+        "notes": said,
+        "rows": rows,
+        "growth": growth,
+        "full_pass": found["full_pass"],
+        "overhead": overhead,
+        "targets": [{"what": v.what, "seen": v.seen, "verdict": v.verdict} for v in verdicts],
+    }, verdicts
+
+
+def draw(folder: Path, found: dict[str, Any], document: dict[str, Any], plan: Plan) -> list[Path]:
+    """The figures, in `folder`."""
+    from bench.replays import figures, peer_figures
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths, titles = [], {p.key: p.label for p in plan.chosen}
+    if document["rows"]:
+        runs = {key: [each[0] for each in by_name.values() if each] for key, by_name in found["runs"].items()}
+        paths = [folder / f"peers_{name}.png" for name in ("steps", "time", "ratios")]
+        peer_figures.steps_figure(paths[0], runs, titles)
+        figures.time_figure(paths[1], runs, titles, "")
+        peer_figures.ratios_figure(paths[2], document["rows"])
+    if document["growth"] and document["growth"]["windows"]:
+        paths.append(folder / "peers_growth.png")
+        peer_figures.growth_figure(paths[-1], document["growth"])
+    return paths
+
+
+def _measured(
+    settings: runner.Settings, problem: Problem, kind: str, more: dict[str, Any], progress: Tell, repetition: int = 0
+) -> dict[str, Any]:
+    """A measure; one that crashed is a result too, and the others go on."""
+    try:
+        return runner.run_measure(settings, problem, kind, more, repetition, progress)
+    except runner.Crashed as crashed:
+        return {"status": "failed", "reason": str(crashed)}
+
+
+def _together(runs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Several drives as one: the first that went worst, its windows the medians of all that went as far."""
+    if not runs:
+        return None
+    worst = min(runs, key=lambda run: run.get("poses", 0))
+    if "windows" not in worst:
+        return {**worst, "poses": 0, "windows": [], "memory": [], "factors": 0, "cpu_s": 0.0}
+    windows = [
+        {name: median(run["windows"][w][name] for run in runs) for name in window}
+        for w, window in enumerate(worst["windows"])
+    ]
+    return {**worst, "windows": windows, "cpu_s": median(run["cpu_s"] for run in runs)}
+
+
+def _plan(options: argparse.Namespace, chosen: list[Problem]) -> tuple[Plan, list[str]]:
+    """What was asked for, and a line for each solver that cannot run here."""
+    words = [word for word in options.only.split(",") if word]
+    parts = tuple(word for word in PARTS if word in words)
+    names = [SOLVERS[word] for word in words if word in SOLVERS]
+    wanted = [p for p in chosen if {p.name, p.key} & set(words)]
+    if unknown := [w for w in words if w not in (*PARTS, *SOLVERS) and not any(w in (p.name, p.key) for p in chosen)]:
+        sys.exit(
+            f"--only {','.join(unknown)}: none of the parts ({', '.join(PARTS)}), of the data sets that are here "
+            f"({', '.join(p.name for p in chosen)}) or of the solvers ({', '.join(SOLVERS)})"
+        )
+    if not parts:
+        parts = ("replays",) if wanted or names else PARTS
+    entries = [ENTRIES[name] for name in names or AHEAD]
+    absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
+    entries = [entry for entry in entries if not entry.missing()]
+    repetitions = options.repetitions or (1 if options.quick else 3)
+    return Plan(parts, wanted or chosen, entries, repetitions, options.quick), absent
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_options(parser, "peers", repetitions=None)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

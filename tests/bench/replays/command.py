@@ -1,0 +1,42 @@
+"""What the commands `bench paper` and `bench peers` have in common: their options, and where results go."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add_options(parser: argparse.ArgumentParser, name: str, repetitions: int | None) -> None:
+    """Options of both; results are kept in out/bench/`name`."""
+    parser.add_argument("--quick", action="store_true", help="small or shortened data sets, below two minutes")
+    parser.add_argument("--only", default="", metavar="NAME,...", help="these only")
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="the JSON document to FILE, or to -")
+    parser.add_argument("--repetitions", type=positive, default=repetitions, help="of every run; times are medians")
+    parser.add_argument("--limit-s", type=float, default=1800.0, help="solver CPU seconds after which a run is ended")
+    parser.add_argument("--fresh", action="store_true", help="measure again what the output folder has")
+    parser.add_argument("--out", type=Path, default=Path(f"out/bench/{name}"), help="where results are kept")
+    parser.add_argument("--no-figures", action="store_true", help="tables only")
+
+
+def positive(text: str) -> int:
+    """A number of things."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number}; wanted 1 or more")
+    return number
+
+
+def hand_out(name: str, document: dict[str, Any], text: str, options: argparse.Namespace) -> None:
+    """Markdown and JSON into the output folder, and to where they were asked for."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    content = json.dumps(document, indent=2)
+    (options.out / f"{name}.md").write_text(text)
+    (options.out / f"{name}.json").write_text(content)
+    if options.json == "-":
+        print(content)
+        return
+    if options.json:
+        Path(options.json).write_text(content)
+    figures = [Path(path).name for path in document.get("figures", ())]
+    print(text)
+    print(f"In {options.out}: {', '.join([f'{name}.md', f'{name}.json', *figures])}")

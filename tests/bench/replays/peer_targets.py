@@ -1,0 +1,212 @@
+"""What `bench peers` must show: time, long steps and quality on every data set, and what holds for all of them."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .contestants import PEER
+from .summary import ratio
+from .targets import MET, MISSED, NOT_MEASURED, Rows, Verdict
+
+OURS = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """times: iSAM2's time over ours at least; p99_ms: of our steps, an estimate of all variables included, at most."""
+
+    times: float
+    p99_ms: float
+
+
+BARS = {
+    "intel": Bar(5, 1.0),
+    "killian": Bar(5, 1.0),
+    "killian_freiburg": Bar(5, 1.0),
+    "manhattan3500": Bar(6, 1.5),
+    "citytrees10000": Bar(10, 2.0),
+    "victoria_park": Bar(8, 3.0),
+    "city10000": Bar(12, 4.0),
+    "w10000": Bar(10, 8.0),
+    "w10000_toro": Bar(10, 8.0),
+    "sphere2500": Bar(5, 9.0),
+    "parking_garage": Bar(5, 5.0),
+}
+QUALITY = {"median": 1.0005, "p95": 1.002, "max": 1.01}
+MEAN_TIMES = 8.0
+SETTLED = 1e-6
+SAME = 1e-6  # two ratios that differ by less are the same
+GROWN_P50, GROWN_P99, GROWN_MEMORY = 1.5, 4.0, 1.2
+GROWN_FROM, GROWN_TO = 1_000, 100_000
+OVERHEAD_US, ODOMETRY_US, START_S, COLD_S = 15.0, 10.0, 1.5, 60.0
+
+
+def judge(rows: Sequence[dict[str, Any]], ends: dict[str, float]) -> list[Verdict]:
+    """The data sets in `ends`, which maps them to the reference optimum; what is not a whole data set has no bars."""
+    table: Rows = {(row["dataset"], row["name"]): row for row in rows}
+    found: list[Verdict] = []
+    for dataset, optimum in ends.items():
+        ours = table.get((dataset, OURS))
+        if dataset not in BARS or ours is None:
+            continue
+        if ours["status"] != "done":
+            found.append(Verdict(f"{dataset}: auto goes through without an exception", ours["note"], MISSED))
+            continue
+        found += [
+            _time(dataset, ours, table.get((dataset, PEER))),
+            _p99(dataset, ours),
+            _quality(dataset, ours),
+            _no_worse(dataset, ours, table.get((dataset, PEER))),
+            _settled(dataset, ours, optimum),
+        ]
+    return [*found, _mean(table, ends)] if found else []
+
+
+def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
+    """The drive of 100,000 poses."""
+    words = (
+        f"{GROWN_FROM} to {GROWN_TO} poses: median step time grows by less than {GROWN_P50} x",
+        f"{GROWN_FROM} to {GROWN_TO} poses: p99 step time grows by less than {GROWN_P99} x",
+        f"memory per pose is constant within {GROWN_MEMORY - 1:.0%}",
+    )
+    if found is None:
+        return []
+    if found["status"] == "failed":
+        return [Verdict(what, found["reason"], MISSED) for what in words]
+    starts = {window["from"]: window for window in found["windows"]}
+    if GROWN_FROM not in starts or found["poses"] < GROWN_TO:
+        return [Verdict(what, f"{found['poses']} poses", NOT_MEASURED) for what in words]
+    first, last = starts[GROWN_FROM], found["windows"][-1]
+    verdicts = []
+    for what, name, limit in zip(words, ("p50", "p99"), (GROWN_P50, GROWN_P99), strict=False):
+        grown = last[name] / first[name]
+        verdicts.append(_verdict(what, f"{grown:.2f} x ({first[name]:.3f} to {last[name]:.3f} ms)", grown < limit))
+    each = bytes_per_pose(found["memory"])
+    kilobytes = ", ".join(f"{poses}: {size / 1024:.2f} KiB" for poses, size in each)
+    spread = max(size for _, size in each) / min(size for _, size in each)
+    return [*verdicts, _verdict(words[2], f"{spread:.2f} x ({kilobytes})", spread <= GROWN_MEMORY)]
+
+
+def judge_passes(found: dict[str, dict[str, Any]]) -> list[Verdict]:
+    """Full passes by data set."""
+    verdicts = []
+    for dataset, passed in found.items():
+        what = f"{dataset}: a full batch pass is no slower than CHOLMOD's analyse + factor + solve"
+        if "ms" not in passed:
+            verdicts.append(Verdict(what, passed["reason"], MISSED))
+            continue
+        ours, theirs = passed["ms"]["ours"]["total"], passed["ms"][passed["best"]]["total"]
+        seen = f"{ours:.2f} ms against {theirs:.2f} ms ({passed['best']}), {passed['ratio']:.2f} x"
+        if not any("openblas" in path for path in passed["blas"]):
+            verdicts.append(Verdict(what, f"{seen}, but with {', '.join(passed['blas'])}", NOT_MEASURED))
+        elif passed["difference"] > 1e-8:
+            verdicts.append(Verdict(what, f"the solutions differ by {passed['difference']:.1e}", MISSED))
+        else:
+            verdicts.append(_verdict(what, seen, passed["ratio"] >= 1.0))
+    return verdicts
+
+
+def judge_overhead(found: dict[str, Any] | None) -> list[Verdict]:
+    """Python around the compiled calls, and starting."""
+    if found is None:
+        return []
+    step, start, cold = found["step"], found["start"], found["cold"]
+    by = f"by {step['by']}"
+    verdicts = [
+        _verdict(
+            f"Python adds less than {OVERHEAD_US:g} µs to a step",
+            f"{step['all']['outside_us']:.1f} µs, median of {step['all']['steps']} steps, {by}",
+            step["all"]["outside_us"] < OVERHEAD_US,
+        ),
+        _verdict(
+            f"a step of odometry alone takes less than {ODOMETRY_US:g} µs inside the compiled call",
+            f"{step['odometry']['inside_us']:.1f} µs, median of {step['odometry']['steps']} steps, {by}",
+            step["odometry"]["inside_us"] < ODOMETRY_US,
+        ),
+        _verdict(
+            f"a new process has made its first step after less than {START_S:g} s, kernels on disk",
+            f"{start['cpu_s']:.2f} s of CPU, {start['wall_s']:.2f} s by the clock",
+            start["cpu_s"] < START_S and start["compiled_s"] == 0.0,
+        ),
+    ]
+    what = f"compiling everything takes less than {COLD_S:g} s and is announced"
+    if cold is None:
+        return [*verdicts, Verdict(what, "", NOT_MEASURED)]
+    seen = f"{cold['cpu_s']:.1f} s of CPU, {len(cold['announced'])} lines said so"
+    return [*verdicts, _verdict(what, seen, cold["cpu_s"] < COLD_S and len(cold["announced"]) > 3)]
+
+
+def bytes_per_pose(memory: Iterable[dict[str, int]]) -> list[tuple[int, float]]:
+    """(poses, bytes a pose): what the solver says it uses, from 1,000 poses on; where it says nothing, resident
+    memory, whose pages are too coarse to judge before 10,000."""
+    sizes = [(each["poses"], each["used"] / each["poses"]) for each in memory if "used" in each]
+    if sizes:
+        return [each for each in sizes if each[0] >= GROWN_FROM]
+    return [(each["poses"], each["resident"] / each["poses"]) for each in memory if each["poses"] >= 10 * GROWN_FROM]
+
+
+def times_faster(row: dict[str, Any]) -> float | None:
+    """iSAM2's time over the row's."""
+    return 1 / row["ratio_to_isam2"] if row["ratio_to_isam2"] else None
+
+
+def _time(dataset: str, ours: dict[str, Any], peer: dict[str, Any] | None) -> Verdict:
+    bar = BARS[dataset]
+    what = f"{dataset}: at most 1/{bar.times:g} of the time of iSAM2's update() (0.1, skip 1), our estimates included"
+    times = times_faster(ours)
+    if peer is None or times is None:
+        return Verdict(what, "" if peer is None else peer["note"], NOT_MEASURED)
+    seen = f"1/{times:.2f} ({ours['cpu_s']:.3f} s; iSAM2 {peer['cpu_s']:.3f} s, reading estimates {_s(peer['read_s'])})"
+    if peer["status"] != "done":
+        seen += f"; up to step {ours['ratio_steps']}, where iSAM2 stopped: {peer['note']}"
+    return _verdict(what, seen, times >= bar.times)
+
+
+def _p99(dataset: str, ours: dict[str, Any]) -> Verdict:
+    seen, bar = ours["step_ms"]["p99"], BARS[dataset].p99_ms
+    return _verdict(f"{dataset}: p99 of the steps at most {bar:g} ms", f"{seen:.3f} ms", seen <= bar)
+
+
+def _quality(dataset: str, ours: dict[str, Any]) -> Verdict:
+    bars = ", ".join(f"{name} {bar:g}" for name, bar in QUALITY.items())
+    found = ours["chi2_ratio"]
+    seen = ", ".join(f"{name} {found[name]:.6f}" for name in QUALITY)
+    is_met = all(found[name] <= bar for name, bar in QUALITY.items())
+    return _verdict(f"{dataset}: χ²/χ²_batch at most {bars}", seen, is_met)
+
+
+def _no_worse(dataset: str, ours: dict[str, Any], peer: dict[str, Any] | None) -> Verdict:
+    what = f"{dataset}: χ²/χ²_batch no worse than iSAM2's, median and worst"
+    if peer is None or not peer["chi2_ratio"] or not ours["chi2_ratio_common"]:
+        return Verdict(what, "" if peer is None else peer["note"], NOT_MEASURED)
+    mine, theirs = ours["chi2_ratio_common"], peer["chi2_ratio"]
+    seen = ", ".join(f"{name} {mine[name]:.6f} against {theirs[name]:.6f}" for name in ("median", "max"))
+    return _verdict(what, seen, all(mine[name] <= theirs[name] + SAME for name in ("median", "max")))
+
+
+def _settled(dataset: str, ours: dict[str, Any], optimum: float) -> Verdict:
+    what = f"{dataset}: settled at the end, χ² is within {SETTLED:g} of the reference optimum"
+    if ours["chi2_settled"] is None:
+        return Verdict(what, "", NOT_MEASURED)
+    off = ratio(ours["chi2_settled"], optimum) - 1
+    return _verdict(what, f"{ours['chi2_settled']:.10g} against {optimum:.10g} ({off:+.1e})", abs(off) <= SETTLED)
+
+
+def _mean(table: Rows, ends: Iterable[str]) -> Verdict:
+    what = f"geometric mean of iSAM2's time over ours on all {len(BARS)} data sets at least {MEAN_TIMES:g}"
+    times = [times_faster(table[dataset, OURS]) for dataset in ends if dataset in BARS and (dataset, OURS) in table]
+    known = [each for each in times if each]
+    if not known:
+        return Verdict(what, "", NOT_MEASURED)
+    mean = math.exp(sum(math.log(each) for each in known) / len(known))
+    seen = f"{mean:.2f} over {len(known)} of {len(BARS)}"
+    return _verdict(what, seen, mean >= MEAN_TIMES) if len(known) == len(BARS) else Verdict(what, seen, NOT_MEASURED)
+
+
+def _s(seconds: float | None) -> str:
+    return "not measured" if seconds is None else f"{seconds:.3f} s"
+
+
+def _verdict(what: str, seen: str, is_met: bool) -> Verdict:
+    return Verdict(what, seen, MET if is_met else MISSED)

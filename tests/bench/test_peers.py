@@ -1,0 +1,276 @@
+"""`bench peers`: its ratios, its bars, its other measures, and the whole command on a simulated world."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bench.replays import full_pass, growth, overhead, peer_summary, peer_table, peer_targets
+from bench.replays.columns import columns_of
+from bench.replays.contestants import ENTRIES, PEER
+from bench.replays.peer_targets import BARS
+from bench.replays.problems import ALL, Problem, load
+from bench.replays.reference import optima
+from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
+
+from factorbus.solver import Options, Solver
+
+PEERS = Path(__file__).parent / "peers.py"
+SILENT = lambda *_: None  # noqa: E731
+
+
+def a_run(name: str, cpu_s: float = 1.0, done: int = 300, **more: Any) -> dict[str, Any]:
+    """Of 300 steps, of which the second half takes three quarters of the time."""
+    parts = {"p50": 0.1, "p95": 0.2, "p99": 0.3, "max": 0.4}
+    run: dict[str, Any] = dict.fromkeys(("solve_s", "read_s", "wall_s", "peak_mb", "base_mb", "load_average"), 1.0)
+    run |= {"contestant": name, "cpu_s": cpu_s, "done": done, "steps": 300, "status": "done", "reason": ""}
+    run |= {"step_ms": parts, "solve_ms": parts, "step_wall_ms": parts, "facts": {"nnz_r": 7}}
+    run |= {"cumulative": [[0, 149, 299], [0.0, 0.25 * cpu_s, cpu_s]], "chi2_settled": None}
+    return {**run, "chi2": [[99, 10.0], [199, 10.0], [299, 10.0]], **more}
+
+
+BATCH = {99: 10.0, 199: 10.0, 299: 10.0}
+
+
+def rows(ours: list[dict[str, Any]], peer: list[dict[str, Any]], name: str = "intel") -> list[dict[str, Any]]:
+    entries = [ENTRIES["auto"], ENTRIES[PEER]]
+    return peer_summary.rows_of(Problem(name, name), entries, {"auto": ours, PEER: peer}, BATCH)
+
+
+def test_the_ratio_is_that_of_the_medians() -> None:
+    ours = [a_run("auto", seconds, chi2_settled=10.0) for seconds in (1.0, 9.0, 2.0)]
+    peer = [a_run(PEER, seconds, facts={"nnz_r": 3, "read_s": 0.5}) for seconds in (10.0, 20.0, 30.0)]
+    mine, theirs = rows(ours, peer)
+    assert mine["ratio_to_isam2"] == pytest.approx(0.1)
+    assert mine["ratio_spread"] == pytest.approx([2 / 30, 9 / 20])
+    assert (mine["ratio_steps"], mine["chi2_settled"]) == (300, 10.0)
+    assert (theirs["ratio_to_isam2"], theirs["read_s"]) == (1.0, 0.5)
+    assert {"dataset", "solver", "mode", "cpu_s", "wall_s", "step_ms", "chi2_ratio", "versions", "peak_mb"} <= set(mine)
+
+
+def test_a_peer_that_gave_up_is_compared_as_far_as_it_came() -> None:
+    curve = {"cumulative": [[0, 149], [0.0, 5.0]], "chi2": [[99, 10.5]]}
+    failed = [a_run(PEER, 5.0, 150, status="failed", reason="step 150: Indeterminate", facts={}, **curve)]
+    chi2 = [[99, 10.0], [199, 30.0], [299, 10.0]]
+    mine, theirs = rows([a_run("auto", 1.0, chi2=chi2, chi2_settled=10.0)], failed)
+    assert mine["ratio_to_isam2"] == pytest.approx(0.25 / 5.0)
+    assert mine["ratio_steps"] == 150
+    assert (mine["chi2_ratio"]["max"], mine["chi2_ratio_common"]["max"]) == (3.0, 1.0)
+    assert theirs["note"].startswith("FAILED: step 150: Indeterminate")
+    said = {v.what: v for v in peer_targets.judge([mine, theirs], {"intel": 10.0})}
+    (time,) = [v for what, v in said.items() if "of the time of iSAM2" in what]
+    assert time.verdict == MET
+    assert "up to step 150, where iSAM2 stopped: FAILED" in time.seen
+    (worse,) = [v for what, v in said.items() if "no worse than iSAM2" in what]
+    assert worse.verdict == MET
+
+
+def test_a_peer_that_never_began_leaves_nothing_to_compare() -> None:
+    crashed = [{"contestant": PEER, "status": "crashed", "reason": "exit code -11", "chi2": [], "facts": {}}]
+    mine, theirs = rows([a_run("auto", chi2_settled=10.0)], crashed)
+    assert mine["ratio_to_isam2"] is None
+    verdicts = peer_targets.judge([mine, theirs], {"intel": 10.0})
+    assert [v.verdict for v in verdicts] == [NOT_MEASURED, MET, MET, NOT_MEASURED, MET, NOT_MEASURED]
+
+
+def judged(**more: Any) -> dict[str, str]:
+    """Verdicts on intel by a word of what was wanted; all are met unless `more` spoils our run."""
+    ours = a_run("auto", **{"cpu_s": 1.0, "chi2_settled": 10.0, **more})
+    verdicts = peer_targets.judge(rows([ours], [a_run(PEER, 5.0)]), {"intel": 10.0})
+    words = ("time of iSAM2", "p99", "at most median", "no worse", "settled", "exception")
+    return {word: v.verdict for v in verdicts for word in words if word in v.what}
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "missed"),
+    [
+        ({}, set()),
+        ({"cpu_s": 1.01}, {"time of iSAM2"}),
+        ({"step_ms": {"p50": 0.1, "p95": 0.5, "p99": 1.01, "max": 2.0}}, {"p99"}),
+        ({"chi2": [[99, 10.006], [199, 10.006], [299, 10.006]]}, {"at most median", "no worse"}),
+        ({"chi2": [[99, 10.0], [199, 10.0], [299, 10.101]]}, {"at most median", "no worse"}),
+        ({"chi2": [[99, 10.0], [199, 10.0], [299, 10.00002]]}, {"no worse"}),
+        ({"chi2": [[99, 10.0], [199, 10.0], [299, 10.000005]]}, set()),
+        ({"chi2_settled": 10.0002}, {"settled"}),
+        ({"status": "failed", "reason": "step 7: not_finite"}, {"exception"}),
+    ],
+)
+def test_bars_of_a_data_set(spoiled: dict[str, Any], missed: set[str]) -> None:
+    verdicts = judged(**spoiled)
+    assert {word for word, verdict in verdicts.items() if verdict == MISSED} == missed
+    assert set(verdicts.values()) <= {MET, MISSED}
+
+
+def test_every_data_set_has_bars_and_the_mean_wants_them_all() -> None:
+    assert set(BARS) == {problem.name for problem in ALL}
+    all_rows, ends = [], {}
+    for name, bar in BARS.items():
+        all_rows += rows([a_run("auto", 1.0, chi2_settled=10.0)], [a_run(PEER, bar.times)], name)
+        ends[name] = 10.0
+    verdicts = peer_targets.judge(all_rows, ends)
+    assert {v.verdict for v in verdicts[:-1]} == {MET}
+    assert (verdicts[-1].verdict, verdicts[-1].seen) == (MISSED, "6.94 over 11 of 11")
+    assert peer_targets.judge(all_rows[:2], {"intel": 10.0, **dict(list(ends.items())[:1])})[-1].verdict == NOT_MEASURED
+    assert peer_targets.judge(rows([a_run("auto")], [a_run(PEER)], "intel-200"), {"intel-200": 10.0}) == []
+
+
+def drive(last: dict[str, float], **more: Any) -> list[Verdict]:
+    windows = [{"from": 1_000, "to": 2_000, "p50": 1.0, "p99": 2.0}, {"from": 90_000, "to": 100_000, **last}]
+    memory = [
+        {"poses": n, "resident": 7, "used": int(1_000 * n * f)} for n, f in ((500, 9), (1_000, 1), (100_000, 1.19))
+    ]
+    found = {"status": "done", "reason": "", "poses": 100_000, "windows": windows, "memory": memory, **more}
+    return peer_targets.judge_growth(found)
+
+
+def test_growth_is_held_between_the_first_and_the_last_window() -> None:
+    assert [v.verdict for v in drive({"p50": 1.49, "p99": 7.9})] == [MET] * 3
+    assert [v.verdict for v in drive({"p50": 1.51, "p99": 8.1})] == [MISSED, MISSED, MET]
+    coarse = [{"poses": n, "resident": int(1_000 * n * f)} for n, f in ((1_000, 9), (10_000, 1), (100_000, 1.21))]
+    assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=coarse)] == [MET, MET, MISSED]
+    assert {v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, poses=50_000)} == {NOT_MEASURED}
+    assert {v.verdict for v in drive({}, status="failed", reason="step 3: x")} == {MISSED}
+    assert peer_targets.judge_growth(None) == []
+
+
+def test_growth_of_a_short_drive() -> None:
+    seen: list[int] = []
+    world = Problem("manhattan", "Manhattan", poses=1200, seed=3)
+    found = growth.growth({"limit_s": 100}, world, lambda message: seen.append(message["done"]))
+    assert (found["status"], found["poses"], found["factors"]) == ("done", 1200, factors_of(world))
+    assert [(w["from"], w["to"]) for w in found["windows"]] == [(500, 1000), (1000, 1200)]
+    assert all(0 < w["p50"] <= w["p99"] <= w["max"] for w in found["windows"])
+    assert [each["poses"] for each in found["memory"]] == [500, 1000, 1200]
+    assert found["memory"][-1]["resident"] > 0
+    assert seen == list(range(1, 1201))
+    ended = growth.growth({"limit_s": 1e-9}, world, SILENT)
+    assert (ended["status"], ended["poses"]) == ("limit", 1)
+    text = peer_table.growth_table(found)
+    assert "| 1000 to 1200 |" in text
+
+
+def factors_of(problem: Problem) -> int:
+    return sum(batch.factor_count for batch in load(problem))
+
+
+def test_a_full_pass_solves_the_whole_graph_at_the_optimum(tmp_path: Path) -> None:
+    world = Problem("city_trees", "CityTrees", poses=150, seed=2)
+    steps = load(world)
+    columns = columns_of(steps)
+    found, last = optima(steps, columns, [len(steps) - 1])
+    tables = columns.table(last)
+    values = {kind: table[columns.arrival[kind]] for kind, table in tables.items()}
+    solver = Solver(Options(mode="all-batch", max_iterations=0))
+    solver.stage(full_pass.whole(steps, columns, values))
+    assert solver.step().chi2 == pytest.approx(found[-1][1], rel=1e-12)
+    ours = full_pass.OurPass(solver)
+    laps, delta = ours.run()
+    dense = full_pass.system_of(solver).dense()
+    np.testing.assert_allclose(delta, np.linalg.solve(dense, ours.eta), atol=1e-9 * np.abs(delta).max())
+    assert laps["total"] == pytest.approx(sum(seconds for name, seconds in laps.items() if name != "total"))
+    np.savez(tmp_path / "values.npz", **values)
+    passed = full_pass.full_pass({"values": str(tmp_path / "values.npz"), "repetitions": 2}, world, SILENT)
+    assert passed["difference"] < 1e-9
+    assert passed["ratio"] > 0
+    assert len(passed["ms"]) == 4
+    assert "city_trees" in peer_table.pass_table({"city_trees": passed})
+
+
+def a_pass(**more: Any) -> str:
+    passed = {"ms": {"ours": {"total": 1.0}, "cholmod x": {"total": 1.1}}, "best": "cholmod x", "difference": 1e-13}
+    passed |= {"ratio": 1.1, "blas": ["/usr/lib/openblas-pthread/libblas.so.3"], **more}
+    (verdict,) = peer_targets.judge_passes({"intel": passed})
+    return verdict.verdict
+
+
+def test_a_pass_counts_only_against_openblas_and_with_the_same_solution() -> None:
+    assert a_pass() == MET
+    assert a_pass(ratio=0.99) == MISSED
+    assert a_pass(difference=1e-6) == MISSED
+    assert a_pass(blas=["/usr/lib/blas/libblas.so.3"]) == NOT_MEASURED
+    (crashed,) = peer_targets.judge_passes({"intel": {"status": "failed", "reason": "exit code 1"}})
+    assert (crashed.verdict, crashed.seen) == (MISSED, "exit code 1")
+
+
+def test_time_inside_compiled_calls_is_part_of_the_step() -> None:
+    steps = load(Problem("manhattan", "Manhattan", poses=150, seed=1))
+    with overhead.timed_calls() as inside:
+        found = overhead._drive(steps, inside)
+    for part in ("all", "odometry"):
+        row = found[part]
+        assert 0 < row["inside_us"] < row["total_us"]
+        assert 0 < row["outside_us"] < row["total_us"]
+    assert found["odometry"]["steps"] < found["all"]["steps"] == 150
+    assert not any(getattr(f, "__name__", "") == "call" for m in overhead._python_modules() for f in vars(m).values())
+
+
+def test_the_solvers_own_account_of_compiled_time_is_preferred() -> None:
+    class Report:
+        compiled_ms = 0.25
+
+    with overhead.timed_calls() as inside:
+        assert inside(Report()) == 0.25e-3
+
+
+def test_a_start_compiles_nothing() -> None:
+    started = overhead.starts()
+    assert started["compiled_s"] == 0.0
+    assert 0 < started["cpu_s"] < 60
+
+
+def an_overhead(**more: Any) -> list[str]:
+    step = {"by": "x", "all": {"steps": 9, "total_us": 30.0, "inside_us": 20.0, "outside_us": 14.0}}
+    step["odometry"] = {"steps": 4, "total_us": 20.0, "inside_us": 9.0, "outside_us": 10.0}
+    cold = {"cpu_s": 50.0, "wall_s": 51.0, "announced": ["a", "b", "c", "d"], "said": ""}
+    found = {"step": step, "start": {"cpu_s": 1.4, "wall_s": 3.0, "compiled_s": 0.0}, "cold": cold, **more}
+    assert "Python" in peer_table.overhead_list(found)
+    return [verdict.verdict for verdict in peer_targets.judge_overhead(found)]
+
+
+def test_bars_of_python_and_starting() -> None:
+    assert an_overhead() == [MET] * 4
+    assert an_overhead(cold=None) == [MET, MET, MET, NOT_MEASURED]
+    assert an_overhead(start={"cpu_s": 1.4, "wall_s": 1.4, "compiled_s": 0.2})[2] == MISSED
+    assert an_overhead(cold={"cpu_s": 50.0, "wall_s": 51.0, "announced": [], "said": ""})[3] == MISSED
+    slow = {"steps": 9, "total_us": 40.0, "inside_us": 11.0, "outside_us": 16.0}
+    assert an_overhead(step={"by": "x", "all": slow, "odometry": slow})[:2] == [MISSED, MISSED]
+
+
+def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
+    pytest.importorskip("gtsam")
+    environment = {**os.environ, "FACTORBUS_DATASETS": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    command = [sys.executable, str(PEERS), "--quick", "--only", "city_trees,replays,full-pass,auto,isam2-0.1,gn-loop"]
+    command += ["--out", str(tmp_path), "--json"]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110, check=False)
+    assert ran.returncode in (0, 1), ran.stderr[-2000:]
+    document = json.loads(ran.stdout)
+    by_name = {row["name"]: row for row in document["rows"]}
+    assert set(by_name) == {"auto", PEER, "gn-loop"}
+    assert {row["status"] for row in by_name.values()} == {"done"}
+    assert by_name[PEER]["ratio_to_isam2"] == 1.0
+    assert by_name["auto"]["ratio_to_isam2"] == pytest.approx(by_name["auto"]["cpu_s"] / by_name[PEER]["cpu_s"])
+    assert by_name["auto"]["chi2_ratio"]["samples"] == 6
+    assert by_name["auto"]["chi2_settled"] == pytest.approx(by_name["gn-loop"]["chi2_final"], rel=1e-2)
+    assert by_name[PEER]["chi2_settled"] is None
+    assert by_name["auto"]["work"]["options"]["mode"] == "auto"
+    assert document["full_pass"]["city_trees-600"]["difference"] < 1e-8
+    assert document["growth"] is None
+    assert document["overhead"] is None
+    assert [Path(path).name for path in document["figures"]] == [f"peers_{n}.png" for n in ("steps", "time", "ratios")]
+    assert all(Path(path).stat().st_size > 10_000 for path in document["figures"])
+    assert "one Gauss-Newton step at loops" in (tmp_path / "peers.md").read_text()
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    repeated = json.loads(again.stdout)
+    assert [row["measured_at"] for row in repeated["rows"]] == [row["measured_at"] for row in document["rows"]]
+
+
+def test_an_unknown_name_is_refused_with_those_there_are() -> None:
+    ran = subprocess.run(
+        [sys.executable, str(PEERS), "--only", "intle"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert ran.returncode == 1
+    assert "--only intle: none of the parts (replays, growth, full-pass, overhead)" in ran.stderr
