@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets
 from bench.replays.bars import Begin, Tell, bars
 from bench.replays.command import add_options, hand_out
-from bench.replays.contestants import AHEAD, ENTRIES, Entry
+from bench.replays.contestants import AHEAD, ENTRIES, PEER, STAND_IN, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
 
@@ -116,13 +116,17 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
 
 def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, dict[str, list[Any]]]:
     """Runs by data set and contestant.  The solvers take turns: all of them once before any of them a second time."""
-    runs: dict[str, dict[str, list[Any]]] = {p.key: {e.name: [] for e in plan.entries} for p in plan.chosen}
+    runs: dict[str, dict[str, list[Any]]] = {p.key: {} for p in plan.chosen}
     for repetition in range(plan.repetitions):
         for problem in plan.chosen:
             for entry in plan.entries:
                 begin(f"{problem.key}: {entry.name}", problem.steps)
                 run = runner.run_replay(settings, problem, entry, repetition, progress)
-                runs[problem.key][entry.name].append(run)
+                runs[problem.key].setdefault(entry.name, []).append(run)
+                if entry.name == PEER and run["status"] == "failed":
+                    begin(f"{problem.key}: {STAND_IN}", problem.steps)
+                    run = runner.run_replay(settings, problem, ENTRIES[STAND_IN], repetition, progress)
+                    runs[problem.key].setdefault(STAND_IN, []).append(run)
     return runs
 
 
@@ -132,11 +136,11 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
     if "replays" in plan.parts:
         for problem in plan.chosen:
             mine = found["runs"][problem.key]
-            firsts = [each[0] for each in mine.values() if each]
+            firsts = [each[0] for name, each in mine.items() if name != STAND_IN]
             batch, remarks = summary.best_known(problem, found["references"][problem.key], firsts)
             said += remarks
             ends[problem.key] = batch[max(batch)]
-            rows += peer_summary.rows_of(problem, plan.entries, mine, batch)
+            rows += peer_summary.rows_of(problem, [ENTRIES[name] for name in mine], mine, batch)
     growth, overhead = _together(found["growth"]), found["overhead"]
     crashed = overhead["reason"] if overhead and "step" not in overhead else ""
     if crashed:
@@ -166,7 +170,7 @@ def draw(folder: Path, found: dict[str, Any], document: dict[str, Any], plan: Pl
     folder.mkdir(parents=True, exist_ok=True)
     paths, titles = [], {p.key: p.label for p in plan.chosen}
     if document["rows"]:
-        runs = {key: [each[0] for each in by_name.values() if each] for key, by_name in found["runs"].items()}
+        runs = {key: [each[0] for each in by_name.values()] for key, by_name in found["runs"].items()}
         paths = [folder / f"peers_{name}.png" for name in ("steps", "time", "ratios")]
         peer_figures.steps_figure(paths[0], runs, titles)
         figures.time_figure(paths[1], runs, titles, "")

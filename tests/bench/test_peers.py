@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bench.replays import full_pass, growth, overhead, peer_summary, peer_table, peer_targets
 from bench.replays.columns import columns_of
-from bench.replays.contestants import ENTRIES, PEER
+from bench.replays.contestants import ENTRIES, PEER, STAND_IN
 from bench.replays.peer_targets import BARS
 from bench.replays.problems import ALL, Problem, load
 from bench.replays.reference import optima
@@ -67,6 +67,18 @@ def test_a_peer_that_gave_up_is_compared_as_far_as_it_came() -> None:
     assert "up to step 150, where iSAM2 stopped: FAILED" in time.seen
     (worse,) = [v for what, v in said.items() if "no worse than iSAM2" in what]
     assert worse.verdict == MET
+
+
+def test_a_stand_in_that_goes_through_takes_the_place_of_a_peer_that_gave_up() -> None:
+    failed = [a_run(PEER, 5.0, 150, status="failed", reason="step 150: Indeterminate", chi2=[[99, 10.5]])]
+    runs = {"auto": [a_run("auto", 1.0, chi2_settled=10.0)], PEER: failed, STAND_IN: [a_run(STAND_IN, 6.0)]}
+    found = peer_summary.rows_of(Problem("intel", "Intel"), [ENTRIES[name] for name in runs], runs, BATCH)
+    assert {row["ratio_against"] for row in found} == {STAND_IN}
+    assert found[0]["ratio_to_isam2"] == pytest.approx(1 / 6)
+    assert found[0]["ratio_steps"] == 300
+    time, _, _, worse, _, _ = peer_targets.judge(found, {"intel": 10.0})
+    assert "because without that it gave up" in time.seen
+    assert "max 1.000000 against 1.050000" in worse.seen
 
 
 def test_a_peer_that_never_began_leaves_nothing_to_compare() -> None:

@@ -27,6 +27,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "isam2-0.01-qr": {"color": "#56B4E9", "linewidth": 1.0, "linestyle": (0, (1, 1.5)), "zorder": 2},
     "isam2-0.1-fine": {"color": "#0072B2", "linewidth": 1.0, "linestyle": (0, (6, 1, 1, 1, 1, 1)), "zorder": 2},
     "isam2-0.1-update": {"color": "#0072B2", "linewidth": 1.3, "linestyle": (0, (3, 1))},
+    "isam2-0.1-update-as-read": {"color": "#0072B2", "linewidth": 1.3, "linestyle": (0, (1, 1))},
     "isam2-0.01-update": {"color": "#56B4E9", "linewidth": 1.3, "linestyle": (0, (3, 1))},
     "gn-loop": {"color": "#666666", "linewidth": 1.1, "linestyle": (0, (2, 2)), "zorder": 2},
     "g2o-b1": {"color": "#555555", "linewidth": 1.1, "linestyle": (0, (4, 1, 1, 1)), "zorder": 2},

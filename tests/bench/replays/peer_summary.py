@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from . import summary
-from .contestants import ISAM2_ALONE, PEER, Entry
+from .contestants import ISAM2_ALONE, PEER, STAND_IN, Entry
 from .problems import Problem
 
 Run = dict[str, Any]
@@ -19,23 +19,30 @@ def rows_of(
     """One for each contestant.
 
     ratio_to_isam2: its time over that of iSAM2's `update()`, medians over the repetitions, both up to the last step
-    that both made (ratio_steps), None where one of them made none; ratio_spread: least and largest of a repetition.
+    that both made (ratio_steps), None where one of them made none; ratio_spread: least and largest of a repetition;
+    ratio_against: the name of that iSAM2, which is the stand-in where only that went through.
     chi2_ratio_common: chi2_ratio at the samples that iSAM2 has too.  chi2_settled: at the end, iterated until it had
     converged; ours only.
     """
-    peers = [run for run in runs.get(PEER, ()) if run.get("done")]
-    rows = []
+    against = _peer_of(runs)
+    peers, rows = [run for run in runs.get(PEER, ()) if run.get("done")], []
     for entry in entries:
         row, mine = summary.row_of(problem, entry, runs[entry.name], batch), runs[entry.name]
         row["chi2_settled"] = mine[0].get("chi2_settled")
         if entry.solver == ISAM2_ALONE:
             row["read_s"] = _median_of([run["facts"].get("read_s") for run in mine])
             row["work"].pop("read_s", None)
-        row |= _against(mine, peers)
+        row |= {"ratio_against": against, **_against(mine, runs.get(against, ()))}
         last = max((step for step, _ in peers[0]["chi2"]), default=-1) if peers else -1
         row["chi2_ratio_common"] = summary.ratio_statistics([s for s in mine[0]["chi2"] if s[0] <= last], batch)
         rows.append(row)
     return rows
+
+
+def _peer_of(runs: dict[str, list[Run]]) -> str:
+    """Whose time counts: the stand-in's, if it came further."""
+    reached = {name: max((run.get("done", 0) for run in runs.get(name, ())), default=0) for name in (PEER, STAND_IN)}
+    return STAND_IN if reached[STAND_IN] > reached[PEER] else PEER
 
 
 def time_until(run: Run, steps: int) -> float:
@@ -46,7 +53,7 @@ def time_until(run: Run, steps: int) -> float:
 
 
 def _against(mine: Sequence[Run], peers: Sequence[Run]) -> dict[str, Any]:
-    mine = [run for run in mine if run.get("done")]
+    mine, peers = ([run for run in runs if run.get("done")] for runs in (mine, peers))
     if not mine or not peers:
         return {"ratio_to_isam2": None, "ratio_steps": 0, "ratio_spread": None}
     steps = min(run["done"] for run in (*mine, *peers))

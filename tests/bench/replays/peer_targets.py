@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .contestants import PEER
+from .contestants import ENTRIES, PEER
 from .summary import ratio
 from .targets import MET, MISSED, NOT_MEASURED, Rows, Verdict
 
@@ -54,7 +54,7 @@ def judge(rows: Sequence[dict[str, Any]], ends: dict[str, float]) -> list[Verdic
             found.append(Verdict(f"{dataset}: auto goes through without an exception", ours["note"], MISSED))
             continue
         found += [
-            _time(dataset, ours, table.get((dataset, PEER))),
+            _time(dataset, ours, table.get((dataset, ours["ratio_against"]))),
             _p99(dataset, ours),
             _quality(dataset, ours),
             _no_worse(dataset, ours, table.get((dataset, PEER))),
@@ -158,6 +158,8 @@ def _time(dataset: str, ours: dict[str, Any], peer: dict[str, Any] | None) -> Ve
     if peer is None or times is None:
         return Verdict(what, "" if peer is None else peer["note"], NOT_MEASURED)
     seen = f"1/{times:.2f} ({ours['cpu_s']:.3f} s; iSAM2 {peer['cpu_s']:.3f} s, reading estimates {_s(peer['read_s'])})"
+    if peer["name"] != PEER:
+        seen += f"; {ENTRIES[peer['name']].label}, because without that it gave up"
     if peer["status"] != "done":
         seen += f"; up to step {ours['ratio_steps']}, where iSAM2 stopped: {peer['note']}"
     return _verdict(what, seen, times >= bar.times)
