@@ -60,6 +60,49 @@ def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: Ma
     assert core.revision == 1
 
 
+def brought(core: MapCore, sequence: int, at: float, size: int = 10, settle: bool = False) -> Run:
+    """The Run for one more insert, which arrives `at`."""
+    message = Insert(sequence, Batch(), settle)
+    return run_of(core.insert(Arrived(f"a{sequence}", "a", sequence, 0, size, sequence, message, at)))
+
+
+def finish(core: MapCore, run: Run, at: float) -> list[Effect]:
+    core.judged(Judged(tuple(Outcome(i, b"ok") for i in run.inserts)))
+    return core.folded(Folded(3, 4, 0.5, at))
+
+
+def ran(core: MapCore, sequence: int, begin: float, end: float) -> bool:
+    """Was the Run from `begin` to `end` called short?"""
+    run = brought(core, sequence, begin)
+    finish(core, run, end)
+    return run.short
+
+
+def test_a_run_is_short_when_those_of_late_were(core: MapCore) -> None:
+    short = [ran(core, n, n, n + (0.5 if n == 3 else 0.001)) for n in range(1, 60)]
+    assert short[:3] == [False, True, True], "nothing is known of the first"
+    assert not any(short[3:55]), "one slow Run is remembered: 0.9^52 of half a second is just above 2 ms"
+    assert all(short[56:])
+
+
+def test_a_run_is_not_short_for_an_insert_that_was_on_its_way_already(core: MapCore) -> None:
+    assert [ran(core, 1, 1.0, 1.001), ran(core, 2, 1.0011, 1.002), ran(core, 3, 1.0025, 1.003)] == [False, False, True]
+
+
+def test_a_run_is_not_short_when_it_is_large_settles_reads_or_follows_another(core: MapCore) -> None:
+    assert not ran(core, 1, 1.0, 1.001)
+    run = brought(core, 2, 2.0, size=1 << 20)
+    assert not run.short
+    finish(core, run, 2.001)
+    run = brought(core, 3, 3.0, settle=True)
+    assert not run.short
+    finish(core, run, 3.001)
+    asked = run_of(core.ask(Asked("q", "estimate", b""), 4.0))
+    assert not asked.short
+    core.insert(insert("a", 4))
+    assert not run_of(finish(core, asked, 4.001)).short, "that one came in meanwhile, and so may others"
+
+
 def test_a_refusal_is_answered_and_counted(core: MapCore) -> None:
     problem = UnknownMap("x")
     run = run_of(core.insert(insert("a", 1)))

@@ -2,11 +2,12 @@
 
 Every callback is direct: it runs on Zenoh's receiving thread, in order of arrival over all keys of one peer, and
 costs no Python thread that could keep the interpreter from exiting.  So what is passed in here may only hand over
-and return; above all it must not call back into this file.
+and return, or at most reply and publish: while it runs, nothing more is heard of that peer.
 """
 
 import json
 import logging
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,7 @@ from factorbus.proto.messages import Job
 from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.events import Asker
-from factorbus.service.settings import zenoh_settings
+from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE, zenoh_settings
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ _PRIORITY = {
 
 def open_bus(config: Config) -> "Bus":
     """The bus as `config` describes it.  Raises BadConfig."""
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
         for path, value in zenoh_settings(config).items():

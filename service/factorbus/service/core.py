@@ -7,10 +7,12 @@
 At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
 """
 
+import math
 from collections import Counter, deque
 from typing import Any
 
 from factorbus.proto import codec
+from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
@@ -27,10 +29,16 @@ from factorbus.service.events import (
     Run,
     Stepped,
     Tell,
+    Waiting,
 )
 from factorbus.service.questions import Question, parse
 
 _KEYFRAME = Read(Question("keyframe"))
+# A Run is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
+# insert was already on its way when the last Run ended: then there are likely more behind it, to be folded together.
+_SHORT_BYTES = 16 << 10
+_SHORT_S = 0.002
+_ROUND_TRIP_S = 0.0002
 
 
 class MapCore:
@@ -43,7 +51,8 @@ class MapCore:
         self._admission = Admission(epoch, limits)
         self._reads: deque[Read] = deque()
         self._running: Run | None = None
-        self._started = 0.0
+        self._started = self._ended = 0.0
+        self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
         self._closing: Problem | None = None
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
@@ -116,7 +125,10 @@ class MapCore:
         """The solver is free again."""
         taken = self._running.inserts if self._running else ()
         self._running = None
-        self._admission.took(len(taken), folded.now - self._started)
+        self._ended = folded.now
+        seconds = self._ended - self._started
+        self._admission.took(len(taken), seconds)
+        self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
         return self._go_on([], folded.now)
 
@@ -166,7 +178,8 @@ class MapCore:
         if self._running is not None:
             return effects
         if self._reads or self._admission.ready:
-            self._running = Run(tuple(self._reads), self._admission.take(self._limits.fold))
+            reads, inserts = tuple(self._reads), self._admission.take(self._limits.fold)
+            self._running = Run(reads, inserts, self._is_short(reads, inserts, now))
             self._reads.clear()
             self._started = now
             effects.append(self._running)
@@ -174,6 +187,12 @@ class MapCore:
             self._drained = True
             effects.append(Drained())
         return effects
+
+    def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Waiting, ...], now: float) -> bool:
+        if reads or len(inserts) != 1 or self._slowest_s > _SHORT_S or now - self._ended < _ROUND_TRIP_S:
+            return False
+        content = inserts[0].content
+        return inserts[0].size <= _SHORT_BYTES and not (isinstance(content, Insert) and content.settle)
 
     def _event(self, what: str) -> Publish:
         return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

@@ -135,10 +135,14 @@ class Publish(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Work for the solver: first answer `reads` from the present revision, then fold `inserts`."""
+    """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
+
+    short: most likely done sooner than another thread would have taken it over.
+    """
 
     reads: tuple[Read, ...]
     inserts: tuple[Waiting, ...]
+    short: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Waiting inserts into the solver, one step, the delta.  All of it runs on the one thread that owns the map's solver.
+"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's Run.
 
     1  stage every insert; the solver refuses a bad one whole, the others go on
     2  one step for all of them
@@ -57,12 +57,13 @@ class _TakenBack(Exception):
 
 
 class Folder:
-    """The solver of one map, and what it is known to hold.  For one thread."""
+    """The solver of one map, and what it is known to hold.  For one thread at a time."""
 
     def __init__(self, make_solver: Callable[[], Any], epoch: int, limits: Limits) -> None:
         self._make, self._epoch, self._limits = make_solver, epoch, limits
         self._solver = make_solver()
         self._revision = 0
+        self._cpu_s = 0.0  # of every thread that folded
         self._held: dict[Column, int] = {}  # accepted rows
         self._broken = ""
 
@@ -78,13 +79,15 @@ class Folder:
         Yields, for every step, Judged (the answers, which stand whatever becomes of the delta) and Stepped; Folded at
         the end.
         """
+        cpu_s = time.thread_time()
         try:
             yield from self._together(inserts)
         except _TakenBack:
             for insert in inserts:
                 yield from self._together([insert])
         solver = self._solver
-        yield Folded(solver.variable_count, solver.factor_count, time.thread_time(), time.monotonic())
+        self._cpu_s += time.thread_time() - cpu_s
+        yield Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
 
     def _together(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""

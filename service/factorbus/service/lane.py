@@ -3,6 +3,7 @@
 import logging
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -14,12 +15,21 @@ class Lane:
 
     def __init__(self, name: str) -> None:
         self._calls: queue.SimpleQueue[tuple[Callable[..., None], tuple[Any, ...]] | None] = queue.SimpleQueue()
+        self._open: deque[None] = deque()  # one for each call that is not done
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def hand(self, call: Callable[..., None], *arguments: Any) -> None:
         """Have `call(*arguments)` run after all that was handed in before.  Never blocks."""
+        self._open.append(None)
         self._calls.put((call, arguments))
+
+    def hand_or_do(self, call: Callable[..., None], *arguments: Any) -> None:
+        """The same, but on this thread, before returning, if all that was handed in before is done."""
+        if self._open:
+            self.hand(call, *arguments)
+        else:
+            self._do(call, arguments)
 
     def close(self) -> None:
         """Return when all that was handed in is done and the thread has ended."""
@@ -28,11 +38,13 @@ class Lane:
 
     def _run(self) -> None:
         while (item := self._calls.get()) is not None:
-            call, arguments = item
-            try:
-                call(*arguments)
-            except Exception:
-                # One answer that cannot be given must not silence the lane for all others.
-                log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
-            finally:
-                item = call = arguments = None  # a query kept alive keeps its asker waiting
+            self._do(*item)
+            item = None  # a query kept alive keeps its asker waiting
+            self._open.pop()
+
+    def _do(self, call: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        try:
+            call(*arguments)
+        except Exception:
+            # One answer that cannot be given must not silence the lane for all others.
+            log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
