@@ -5,7 +5,8 @@
               solver <map>     folds and steps, and encodes what comes of it
               outbox           answers to inserts, and publications, in order
               desk             large answers, maps that come and go, jobs for workers
-              in-place jobs    batch optima when there is no worker
+              in-place <kind>  jobs when there is no worker
+              features         questions of filters: small ones done, large ones cut up and put together
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs the desk a second,
@@ -30,11 +31,14 @@ from factorbus.service.bus import Bus, Place, ignore, key_of, open_bus, payload_
 from factorbus.service.config import BadConfig, Config, checked
 from factorbus.service.core import MapCore
 from factorbus.service.events import Answer, Asked, Asker, Drained, Effect, Publish, Read, Refuse, Tell
+from factorbus.service.features import Features
 from factorbus.service.fold import Folder
 from factorbus.service.host import Host
 from factorbus.service.jobs import Jobs
 from factorbus.service.lane import Lane
+from factorbus.service.optima import Optima
 from factorbus.service.questions import Snapshot, answer
+from factorbus.service.trips import Trips
 
 log = logging.getLogger(__name__)
 
@@ -71,9 +75,10 @@ def serve(config: Config, on_ready: Callable[[list[str]], None], stop: threading
 
 def _get_ready_to_compute(config: Config) -> None:
     if config.warm:
+        from factorbus.idp import warm as warm_idp
         from factorbus.solver import compiled_seconds, warm
 
-        seconds = warm(lambda name: _announce(name, compiled_seconds()))
+        seconds = sum(make(lambda name: _announce(name, compiled_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
     # The compiler leaves some hundred thousand objects that live on: not walking them again saves pauses of 0.1 s.
     gc.collect()
@@ -110,14 +115,25 @@ class Shell:
         self._stopping = False
         self._outbox, self._desk = Lane("outbox"), Lane("desk")
         self._seat = threading.Lock()  # of the one callback that may solve
-        self._jobs = Jobs(self._desk, bus.send_job, reply, refuse, config.job_deadline_s, config.limits.jobs)
+        self._jobs = Jobs(self._desk, bus.send_job)
+        self._trips = Trips(self._desk, bus.send_job, self._jobs.heard)
+        limits, deadline_s = config.limits, config.job_deadline_s
+        self._optima = Optima(self._jobs, reply, refuse, deadline_s, limits.jobs)
+        self._features = Features(
+            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s
+        )
+        if config.warm:
+            log.info("features: %s", self._features.measure())
         chunk = config.maps.replace("*", "$*") if config.maps != "*" else "*"
         root = f"{keys.PREFIX}/map/{chunk}"
         self._refuse_if_kept_elsewhere(f"{root}/live/service/*")
         bus.answer_on(f"{root}/in/*", self._on_insert)
         bus.answer_on(f"{root}/ask/*", self._on_question)
         bus.answer_on(keys.admin_key("*"), self._on_admin)
+        bus.answer_on(keys.features_key(self._service), self._on_features)
         bus.watch(keys.any_worker_token(), self._on_worker)
+        # Last of all: alive means askable.
+        self._withdraw_features = bus.announce(keys.features_token(self._service))
 
     def create(self, name: str, mode: str) -> dict[str, Any]:
         """The row of map `name`, made if it is not there.  On the desk, or before it has work.  Raises Problem."""
@@ -144,9 +160,11 @@ class Shell:
         for found in list(self._maps.values()):
             found.host.tick()
         self._desk.hand(self._jobs.tick)
+        self._desk.hand(self._look_for_suspects)
 
     def close(self) -> None:
         """Withdraw, finish everything accepted, answer it, and undeclare."""
+        self._withdraw_features()
         self._desk.hand(self._stop_creating)
         for found in self._wait_for_desk():
             found.place.withdraw()
@@ -154,8 +172,10 @@ class Shell:
         for found in [*self._leaving, *self._maps.values()]:
             found.drained.wait()
             found.host.end()
+        self._features.stop()
         self._desk.hand(self._jobs.close)
         self._desk.close()
+        self._features.close()
         self._outbox.close()
         self._bus.withdraw()
         for found in self._maps.values():
@@ -201,6 +221,9 @@ class Shell:
     def _on_admin(self, query: Asker) -> None:
         self._desk.hand(self._administer, query)
 
+    def _on_features(self, query: Asker) -> None:
+        self._features.ask(query, payload_of(query))
+
     def _on_worker(self, token: str, alive: bool) -> None:
         try:
             worker, slots = keys.worker_of(token)
@@ -209,8 +232,10 @@ class Shell:
             return
         if alive:
             self._desk.hand(self._jobs.joined, worker, slots)
+            self._desk.hand(self._trips.joined, worker)
         else:
             self._desk.hand(self._jobs.left, worker)
+            self._desk.hand(self._trips.left, worker)
 
     # ---- effects of the maps ----------------------------------------------------------------------------------------
 
@@ -281,7 +306,7 @@ class Shell:
                     # Behind the delta of the same revision: a mirror that had the keyframe first would skip the delta.
                     self._outbox.hand(found.place.publish, "keyframe", answer(read.question, taken))
                 elif read.question.batch:
-                    self._jobs.batch(read.asker, read.question, taken)
+                    self._optima.batch(read.asker, read.question, taken)
                 else:
                     reply(read.asker, answer(read.question, taken))
             except Problem as problem:
@@ -299,7 +324,7 @@ class Shell:
             "service": self._service,
             "version": __version__,
             "kernels_compiled_s": compiled_seconds(),
-            "workers": self._jobs.workers(),
+            "workers": [row | self._trips.row(row["name"]) for row in self._jobs.workers()],
         }
         reply(asker, codec.encode_map({**content, **own}))
 
@@ -348,6 +373,9 @@ class Shell:
         self._outbox.hand(found.place.close)  # behind the map's last publications
         reply(query, codec.encode_map({}))
         log.info("map %s dropped", found.host.core.name)
+
+    def _look_for_suspects(self) -> None:
+        self._trips.look_for(self._jobs.suspects)
 
     def _stop_creating(self) -> None:
         self._stopping = True

@@ -66,6 +66,10 @@ class Bus:
         """Every query on `key` goes to `take`."""
         self._declared.append(self._session.declare_queryable(key, Callback(take, indirect=False)))
 
+    def announce(self, token: str) -> Callable[[], None]:
+        """Declare a liveliness token; call what comes back to withdraw it."""
+        return self._session.liveliness().declare_token(token).undeclare
+
     def watch(self, tokens: str, see: Callable[[str, bool], None]) -> None:
         """`see` gets (key, alive) for every liveliness token on `tokens`, those present first."""
 

@@ -1,21 +1,33 @@
-"""Jobs done by the service itself when there is no worker."""
+"""Jobs done by the service itself when there is no worker, or when the way to one would take longer."""
 
 import time
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Job, JobDone, Optimum
-from factorbus.proto.problems import BadMessage
+from factorbus.proto.problems import UnknownKind
 from factorbus.service.questions import as_variables
 
 
 def do(job: Job) -> JobDone:
-    """What a worker would answer to `job`.  Raises BadMessage, SolverError."""
-    if job.kind != "batch":
-        raise BadMessage("job.kind", f"is {job.kind!r}", "batch")
+    """What a worker would answer to `job`, bit for bit.  Raises Problem, SolverError."""
+    if job.kind not in _DO:
+        raise UnknownKind("job.kind", job.kind, tuple(_DO))
+    started = time.perf_counter()
+    return JobDone(job.job, job.kind, _DO[job.kind](job.payload), time.perf_counter() - started)
+
+
+def _batch(payload: bytes) -> bytes:
     from factorbus.solver import solve_batch
 
-    started = time.perf_counter()
-    graph = codec.decode_graph(job.payload)
+    graph = codec.decode_graph(payload)
     result = solve_batch(graph.batch.variables, graph.batch.factors)
-    optimum = Optimum(result.chi2, result.iterations, as_variables(result.values))
-    return JobDone(job.job, job.kind, codec.encode_optimum(optimum), time.perf_counter() - started)
+    return codec.encode_optimum(Optimum(result.chi2, result.iterations, as_variables(result.values)))
+
+
+def _idp(payload: bytes) -> bytes:
+    from factorbus.idp import job
+
+    return job.do(payload)
+
+
+_DO = {"batch": _batch, "idp": _idp}

@@ -1,6 +1,6 @@
-"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.
+"""Jobs on their way: to a worker, to the next one when that fails, in place when there is none, and back.
 
-Everything here runs on one lane (the desk); workers and the in-place thread only hand their results to it.
+Everything here runs on one lane (the desk); workers and the in-place threads only hand their results to it.
 """
 
 import logging
@@ -10,14 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from factorbus.proto import codec
-from factorbus.proto.messages import Chi2, Job, JobDone
-from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown, Unavailable
+from factorbus.proto.messages import Job, JobDone
+from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable
 from factorbus.service import inplace
 from factorbus.service.dispatch import Dispatch, Effect, Ended, InPlace, Send
-from factorbus.service.events import Asker
 from factorbus.service.lane import Lane
-from factorbus.service.questions import Question, Snapshot
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -27,32 +24,31 @@ SendJob: TypeAlias = Callable[[str, Job, float, Callable[[Any], None]], None]
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    asker: Asker
-    question: Question
-    epoch: int
-    revision: int
-    chi2: float
+class _Open:
+    ended: Callable[[Ended], None]
+    deadline_s: float
     until: float
+    timeout_s: float
 
 
 class Jobs:
     """The jobs of one service.  For the desk lane, which `desk` must be."""
 
-    def __init__(
-        self,
-        desk: Lane,
-        send: SendJob,
-        reply: Callable[[Asker, bytes], None],
-        refuse: Callable[[Asker, Any], None],
-        deadline_s: float,
-        most: int,
-    ) -> None:
-        self._desk, self._send, self._reply, self._refuse = desk, send, reply, refuse
-        self._deadline_s, self._most = deadline_s, most
+    def __init__(self, desk: Lane, send: SendJob) -> None:
+        self._desk, self._send = desk, send
         self._dispatch = Dispatch()
-        self._asked: dict[str, _Asked] = {}
-        self._in_place: Lane | None = None  # started when first needed
+        self._open: dict[str, _Open] = {}
+        self._in_place: dict[str, Lane] = {}  # by kind, started when first needed
+
+    @property
+    def slots(self) -> int:
+        """Jobs that workers take at a time now."""
+        return self._dispatch.slots
+
+    @property
+    def suspects(self) -> list[str]:
+        """Workers that did not answer in time and have not been heard of since."""
+        return self._dispatch.suspects
 
     def workers(self) -> list[dict[str, Any]]:
         """Who works here: rows of name, slots and jobs in flight."""
@@ -68,44 +64,50 @@ class Jobs:
         log.info("worker %s left", worker)
         self._perform(self._dispatch.left(worker))
 
-    def batch(self, asker: Asker, question: Question, taken: Snapshot) -> None:
-        """Answer `question` with χ² and the batch optimum of the snapshot's graph."""
-        if self._dispatch.open_jobs >= self._most:
-            self._refuse(asker, Busy(self._dispatch.open_jobs, 1.0))
-            return
-        job = Job(secrets.token_hex(8), "batch", codec.encode_graph(taken.graph))
-        until = time.monotonic() + question.timeout_s
-        self._asked[job.job] = _Asked(asker, question, taken.epoch, taken.revision, taken.chi2, until)
+    def heard(self, worker: str) -> None:
+        """A worker that was silent answers again."""
+        self._perform(self._dispatch.heard(worker))
+
+    def submit(
+        self, kind: str, payload: bytes, ended: Callable[[Ended], None], deadline_s: float, timeout_s: float
+    ) -> None:
+        """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the desk.
+
+        deadline_s: for one worker.  timeout_s: until it is given up, with Unavailable.
+        """
+        job = Job(secrets.token_hex(8), kind, payload)
+        self._open[job.job] = _Open(ended, deadline_s, time.monotonic() + timeout_s, timeout_s)
         self._perform(self._dispatch.submit(job))
 
     def tick(self) -> None:
         """Give up what has taken too long."""
         now = time.monotonic()
-        for job in [job for job, asked in self._asked.items() if asked.until < now]:
-            asked = self._asked.pop(job)
-            self._dispatch.cancel(job)
-            self._refuse(
-                asked.asker,
-                Unavailable("the batch optimum", asked.question.timeout_s, "allow more with timeout_s or add workers"),
-            )
+        for job in [job for job, found in self._open.items() if found.until < now]:
+            late = self._open[job].timeout_s
+            self._give_up(job, Unavailable("the job", late, "allow more with timeout_s or add workers"))
 
     def close(self) -> None:
         """Refuse what is not done."""
-        for job, asked in self._asked.items():
-            self._dispatch.cancel(job)
-            self._refuse(asked.asker, ShuttingDown())
-        self._asked.clear()
+        for job in list(self._open):
+            self._give_up(job, ShuttingDown())
+
+    def _give_up(self, job: str, problem: Problem) -> None:
+        found = self._open.pop(job)
+        self._dispatch.cancel(job)
+        found.ended(Ended(job, "", problem))
 
     def _perform(self, effects: list[Effect]) -> None:
         for effect in effects:
             match effect:
                 case Send(tag, worker, job):
-                    self._send(worker, job, self._deadline_s, lambda r, t=tag: self._desk.hand(self._came, t, r))
+                    deadline_s = self._open[job.job].deadline_s
+                    self._send(worker, job, deadline_s, lambda r, t=tag: self._desk.hand(self._came, t, r))
                 case InPlace(tag, job):
-                    self._in_place = self._in_place or Lane("in-place jobs")
-                    self._in_place.hand(self._do_in_place, tag, job)
-                case Ended(job, worker, result):
-                    self._end(job, worker, result)
+                    lane = self._in_place.get(job.kind) or Lane(f"in-place {job.kind}")
+                    self._in_place[job.kind] = lane
+                    lane.hand(self._do_in_place, tag, job)
+                case Ended():
+                    self._open.pop(effect.job).ended(effect)
 
     def _came(self, tag: int, result: JobDone | Any) -> None:
         if isinstance(result, JobDone):
@@ -114,28 +116,17 @@ class Jobs:
             self._perform(self._dispatch.failed(tag, result))
 
     def _do_in_place(self, tag: int, job: Job) -> None:
-        """On the in-place lane."""
-        try:
-            result: Any = inplace.do(job)
-        except (Problem, SolverError) as problem:
-            result = problem
-        except Exception:
-            reference = secrets.token_hex(4)
-            log.exception("fault %s: job %s (%s) in place", reference, job.job, job.kind)
-            result = Internal(reference)
-        self._desk.hand(self._came, tag, result)
+        """On an in-place lane."""
+        self._desk.hand(self._came, tag, do_here(job))
 
-    def _end(self, job: str, worker: str, result: JobDone | Any) -> None:
-        asked = self._asked.pop(job)
-        if not isinstance(result, JobDone):
-            self._refuse(asked.asker, result)
-            return
-        try:
-            optimum = codec.decode_optimum(result.payload)
-        except Problem as problem:
-            self._refuse(asked.asker, problem)
-            return
-        self._reply(
-            asked.asker,
-            codec.encode_chi2(Chi2(asked.epoch, asked.revision, asked.chi2, optimum.chi2, worker, result.seconds)),
-        )
+
+def do_here(job: Job) -> JobDone | Any:
+    """What comes of `job` when the service does it itself: a JobDone or a problem."""
+    try:
+        return inplace.do(job)
+    except (Problem, SolverError) as problem:
+        return problem
+    except Exception:
+        reference = secrets.token_hex(4)
+        log.exception("fault %s: job %s (%s) in place", reference, job.job, job.kind)
+        return Internal(reference)

@@ -1,6 +1,7 @@
 """A camera's numbers as the kernels want them, with the radius up to which its lens is one to one."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +39,9 @@ def pixels(camera: Camera, rays: F64) -> Mapped:
     return mapped
 
 
+@lru_cache(maxsize=64)
 def lens_of(camera: Camera) -> tuple[int, F64]:
-    """(code, numbers) of a camera's lens, as `kernels/layout.py` lays them out."""
+    """(code, numbers) of a camera's lens, as `kernels/layout.py` lays them out; the same array again each time."""
     lens = np.zeros(at.LENS_SIZE)
     code = _CODES[camera.model]
     lens[at.CX], lens[at.CY] = camera.number("cx"), camera.number("cy")

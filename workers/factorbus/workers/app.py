@@ -17,6 +17,7 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
+from factorbus.idp.heap import keep_freed_memory
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
@@ -37,6 +38,7 @@ def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event)
     `on_ready` gets the worker's name once it can be found.  Raises BadConfig, BadName.
     """
     checked(config)
+    keep_freed_memory()
     if config.warm:
         from factorbus.idp import warm as warm_idp
         from factorbus.solver import compiled_seconds, warm
@@ -148,7 +150,7 @@ def _do(query: zenoh.Query) -> None:
         _refuse(query, Internal(reference))
     else:
         seconds = time.perf_counter() - started
-        log.info("job %s (%s) done in %.3f s", job.job, job.kind, seconds)
+        log.log(logging.INFO if seconds > 0.1 else logging.DEBUG, "job %s (%s): %.3f s", job.job, job.kind, seconds)
         query.reply(query.key_expr, codec.encode_job_done(JobDone(job.job, job.kind, result, seconds)))
 
 

@@ -1,0 +1,146 @@
+"""Features for filters over the bus: cut up, done by processes that may die or freeze, and every one arrives."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bare import Bare, bare
+from naive.random_sightings import random_sighting
+from processes import PATIENCE_S, Process
+
+from factorbus import idp
+from factorbus.idp import minimal
+from factorbus.proto import keys
+from factorbus.proto.features import Answer, Ask, Sighting
+from factorbus.proto.features_codec import decode_answer, encode_ask
+from factorbus.proto.problems import Refused
+from factorbus.proto.segments import PAGE, Memory
+
+Spawn = Callable[..., Process]
+Question = tuple[Sighting, np.ndarray, np.ndarray]
+N = 200
+
+
+@contextmanager
+def service(spawn: Spawn, folder: Path, deadline_s: float = 60.0) -> Iterator[tuple[Process, str, Bare]]:
+    settings = folder / "service.toml"
+    settings.write_text(f'name = "s"\njob_deadline_s = {deadline_s}\nwarm = false\n')
+    process = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
+    (endpoint,) = process.ready()
+    with bare(endpoint) as client:
+        client.create("m")
+        yield process, endpoint, client
+
+
+def worker(spawn: Spawn, client: Bare, endpoint: str, name: str) -> Process:
+    """A worker whose way has been measured."""
+    started = spawn("-m", "factorbus.workers", "--connect", endpoint, "--name", name, "--no-warm")
+    started.ready()
+    measured(client, name)
+    return started
+
+
+def measured(client: Bare, name: str) -> None:
+    """Until the service knows the way to a worker: its stats are answered while it measures, in turns."""
+    rows = iter(lambda: client.stats("m")["workers"], None)
+    assert next(row for table in rows for row in table if row["name"] == name and "trip_ms" in row)
+
+
+def answer(client: Bare, ask: Ask) -> Answer:
+    came = client.ask(keys.features_key("s"), encode_ask(ask))
+    assert isinstance(came, bytes), came
+    return decode_answer(came)
+
+
+@pytest.fixture(scope="module")
+def question() -> Question:
+    """(sighting, all its y, all its new rows)."""
+    sighting = random_sighting(31, N, 3)[0]
+    seen = idp.see(sighting)
+    rows = np.empty((6 * N, sighting.width + 6 * N))
+    minimal.Parts(sighting, seen).rows(0, N, rows)
+    return sighting, seen.y, rows
+
+
+def put_together(got: Answer) -> bytes:
+    """y of all features, which come once each and in order."""
+    edges = [(done.shard.first, done.shard.last) for done in got.shards]
+    assert [first for first, _ in edges] == [0, *(last for _, last in edges[:-1])]
+    assert edges[-1][1] == N
+    return np.concatenate([done.shard.y for done in got.shards]).tobytes()
+
+
+@contextmanager
+def into_memory(question: Question) -> Iterator[tuple[Ask, np.ndarray]]:
+    """The question with shared memory for its rows: then little travels, and the way to a worker pays."""
+    sighting, _, rows = question
+    with Memory(PAGE + rows.nbytes) as memory:
+        yield Ask(sighting, "rows", memory.segment(PAGE)), memory.array(PAGE, rows.shape)
+
+
+def test_whoever_computes_the_bits_are_the_same(spawn: Spawn, tmp_path: Path, question: Question) -> None:
+    sighting, y, rows = question
+    with service(spawn, tmp_path) as (process, endpoint, client):
+        workers: list[Process] = []
+        for new, names in (("", {"in-place"}), ("a", {"a"}), ("b", {"a", "b"})):
+            workers += [worker(spawn, client, endpoint, new)] if new else []
+            got = answer(client, Ask(sighting))
+            assert put_together(got) == y.tobytes()
+            assert np.concatenate([done.shard.rows for done in got.shards]).tobytes() == rows.tobytes()
+            with into_memory(question) as (ask, array):
+                stored = answer(client, ask)
+                assert {done.worker for done in stored.shards} == names
+                assert (put_together(stored), stored.clean) == (y.tobytes(), True)
+                assert array.tobytes() == rows.tobytes()
+        few = Sighting(sighting.camera, sighting.state, sighting.covariance, sighting.pixels[:2])
+        assert [done.worker for done in answer(client, Ask(few)).shards] == ["in-place"], "too little for the way"
+        for each in (process, *workers):
+            each.signal(signal.SIGTERM)
+            assert each.wait() == 0
+
+
+def test_a_question_that_cannot_be_is_refused_with_its_code(spawn: Spawn, tmp_path: Path, question: Question) -> None:
+    sighting, *_ = question
+    with service(spawn, tmp_path) as (_, endpoint, client):
+        for helped in (False, True):
+            if helped:
+                worker(spawn, client, endpoint, "a")
+            pixels = sighting.pixels.copy()
+            pixels[150] = [-10.0, 3.0]
+            bad = Sighting(sighting.camera, sighting.state, sighting.covariance, pixels)
+            came = client.ask(keys.features_key("s"), encode_ask(Ask(bad)))
+            assert isinstance(came, Refused)
+            assert (came.code, came.detail["index"]) == ("bad_pixel", 150)
+            came = client.ask(keys.features_key("s"), b"\xc1")
+            assert isinstance(came, Refused)
+            assert came.code == "bad_message"
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_worker_that_dies_or_freezes_costs_a_retry_and_no_feature(
+    spawn: Spawn, tmp_path: Path, question: Question, how: signal.Signals
+) -> None:
+    _, y, rows = question
+    with service(spawn, tmp_path, deadline_s=0.5) as (_, endpoint, client), into_memory(question) as (ask, array):
+        first, _ = (worker(spawn, client, endpoint, name) for name in ("a", "b"))
+        first.signal(signal.SIGSTOP)  # the shard is with a worker that does not answer
+        waiting = client.send(keys.features_key("s"), encode_ask(ask))
+        in_flight = iter(lambda: client.stats("m")["workers"], None)
+        assert next(row for table in in_flight for row in table if row["name"] == "a" and row["in_flight"])
+        if how == signal.SIGKILL:
+            first.signal(signal.SIGKILL)
+        came = waiting.get(timeout=PATIENCE_S)
+        assert isinstance(came, bytes), came
+        got = decode_answer(came)
+        assert put_together(got) == y.tobytes()
+        assert array.tobytes() == rows.tobytes()
+        assert "a" not in {done.worker for done in got.shards}
+        assert not got.clean, "somebody was given up"
+        if how == signal.SIGSTOP:
+            assert answer(client, ask).clean, "a suspect is given nothing"
+            first.signal(signal.SIGCONT)
+            seen = iter(lambda: {done.worker for done in answer(client, ask).shards}, None)
+            assert next(names for names in seen if "a" in names), "it is heard of again"
