@@ -13,8 +13,8 @@ Every run is a process of its own on one core, three repetitions, medians, and i
 --quick takes two minutes, and does not judge what it shortens.  Without data sets it replays simulated worlds.
 
 NAME is a part (replays, growth, full-pass, overhead), a data set (intel, w10000, ...) or a solver: auto, isam2-0.1, and
-when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop), all-batch, inc-l.
-The exit code is 1 when a target is missed.
+when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop) or another of our
+modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code is 1 when a target is missed.
 """
 
 import argparse
@@ -30,13 +30,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets
 from bench.replays.bars import Begin, Tell, bars
 from bench.replays.command import add_options, hand_out
-from bench.replays.contestants import AHEAD, ENTRIES, PEER, STAND_IN, Entry
+from bench.replays.contestants import ENTRIES, OURS, PEER, STAND_IN, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
 
 PARTS = ("replays", "growth", "full-pass", "overhead")
+OUR_MODES = tuple(name for name, entry in ENTRIES.items() if entry.solver == OURS)
 SOLVERS = {
-    **{name: name for name in ("auto", "gn-loop", "all-batch", "inc-l")},
+    **{name: name for name in (*OUR_MODES, "gn-loop")},
     **{f"isam2-{threshold}": f"isam2-{threshold}-update" for threshold in ("0.1", "0.01")},
 }
 GROWTH = Problem("manhattan", "Manhattan", poses=100_000, seed=1)
@@ -54,6 +55,7 @@ class Plan:
     entries: list[Entry]
     repetitions: int
     quick: bool
+    judged: str
 
     def jobs(self) -> int:
         """How many."""
@@ -99,7 +101,7 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
         world = GROWTH.shortened(_QUICK_GROWTH) if plan.quick else GROWTH
         for repetition in range(plan.repetitions):
             begin(f"growth to {world.poses}", world.poses)
-            more = {"limit_s": settings.limit_s}
+            more = {"limit_s": settings.limit_s, "mode": plan.judged}
             found["growth"].append(_measured(settings, world, "growth", more, progress, repetition))
     if "full-pass" in plan.parts:
         count = _QUICK_PASSES if plan.quick else _PASSES
@@ -110,7 +112,8 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
     if "overhead" in plan.parts:
         world = GROWTH.shortened(_OVERHEAD_POSES)
         begin("overhead", world.poses)
-        found["overhead"] = _measured(settings, world, "overhead", {"cold": not plan.quick}, progress)
+        more = {"cold": not plan.quick, "mode": plan.judged}
+        found["overhead"] = _measured(settings, world, "overhead", more, progress)
     return found
 
 
@@ -147,7 +150,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
         said.append(f"overhead was not measured: {crashed}")
         overhead = None
     verdicts = [
-        *peer_targets.judge(rows, ends),
+        *peer_targets.judge(rows, ends, plan.judged),
         *peer_targets.judge_growth(growth),
         *peer_targets.judge_passes(found["full_pass"]),
         *peer_targets.judge_overhead(overhead),
@@ -155,6 +158,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
     return {
         "machine": runner.machine(),
         "notes": said,
+        "judged": plan.judged,
         "rows": rows,
         "growth": growth,
         "full_pass": found["full_pass"],
@@ -174,10 +178,10 @@ def draw(folder: Path, found: dict[str, Any], document: dict[str, Any], plan: Pl
         paths = [folder / f"peers_{name}.png" for name in ("steps", "time", "ratios")]
         peer_figures.steps_figure(paths[0], runs, titles)
         figures.time_figure(paths[1], runs, titles, "")
-        peer_figures.ratios_figure(paths[2], document["rows"])
+        peer_figures.ratios_figure(paths[2], document["rows"], plan.judged)
     if document["growth"] and document["growth"]["windows"]:
         paths.append(folder / "peers_growth.png")
-        peer_figures.growth_figure(paths[-1], document["growth"])
+        peer_figures.growth_figure(paths[-1], document["growth"], plan.judged)
     return paths
 
 
@@ -218,16 +222,17 @@ def _plan(options: argparse.Namespace, chosen: list[Problem]) -> tuple[Plan, lis
         )
     if not parts:
         parts = ("replays",) if wanted or names else PARTS
-    entries = [ENTRIES[name] for name in names or AHEAD]
+    entries = [ENTRIES[name] for name in names or (options.judge, PEER)]
     absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
     entries = [entry for entry in entries if not entry.missing()]
     repetitions = options.repetitions or (1 if options.quick else 3)
-    return Plan(parts, wanted or chosen, entries, repetitions, options.quick), absent
+    return Plan(parts, wanted or chosen, entries, repetitions, options.quick, options.judge), absent
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_options(parser, "peers", repetitions=None)
+    parser.add_argument("--judge", choices=OUR_MODES, default="auto", help="the mode that the targets are for")
     return parser.parse_args()
 
 

@@ -152,14 +152,14 @@ def test_growth_is_held_between_the_first_and_the_last_window() -> None:
 def test_growth_of_a_short_drive() -> None:
     seen: list[int] = []
     world = Problem("manhattan", "Manhattan", poses=1200, seed=3)
-    found = growth.growth({"limit_s": 100}, world, lambda message: seen.append(message["done"]))
+    found = growth.growth({"limit_s": 100, "mode": "auto"}, world, lambda message: seen.append(message["done"]))
     assert (found["status"], found["poses"], found["factors"]) == ("done", 1200, factors_of(world))
     assert [(w["from"], w["to"]) for w in found["windows"]] == [(500, 1000), (1000, 1200)]
     assert all(0 < w["p50"] <= w["p99"] <= w["max"] for w in found["windows"])
     assert [each["poses"] for each in found["memory"]] == [500, 1000, 1200]
     assert found["memory"][-1]["resident"] > 0
     assert seen == list(range(1, 1201))
-    ended = growth.growth({"limit_s": 1e-9}, world, SILENT)
+    ended = growth.growth({"limit_s": 1e-9, "mode": "inc-l"}, world, SILENT)
     assert (ended["status"], ended["poses"]) == ("limit", 1)
     text = peer_table.growth_table(found)
     assert "| 1000 to 1200 |" in text
@@ -216,7 +216,7 @@ def test_a_pass_counts_only_against_openblas_and_with_the_same_solution() -> Non
 def test_time_inside_compiled_calls_is_part_of_the_step() -> None:
     steps = load(Problem("manhattan", "Manhattan", poses=150, seed=1))
     with overhead.timed_calls() as inside:
-        found = overhead._drive(steps, inside)
+        found = overhead._drive("auto", steps, inside)
     for part in ("all", "odometry"):
         row = found[part]
         assert 0 < row["inside_us"] < row["total_us"]
@@ -235,7 +235,7 @@ def test_the_solvers_own_account_of_compiled_time_is_preferred() -> None:
 
 def test_a_start_compiles_nothing() -> None:
     warm()
-    started = overhead.starts()
+    started = overhead.starts("auto")
     assert started["compiled_s"] == 0.0
     assert 0 < started["cpu_s"] < 60
 

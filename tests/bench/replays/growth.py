@@ -1,4 +1,4 @@
-"""How a step's time and the memory grow with the map: a simulated drive of any length through the default mode.
+"""How a step's time and the memory grow with the map: a simulated drive of any length through one of our modes.
 
 What is on the clock is stage, step and `changed`, what a robot gets after every step: a copy of all variables would
 grow with the map whatever the solver does.  The world is made by another process, so its memory is not counted.
@@ -28,9 +28,9 @@ _TOUCH = 1e-9  # any number but 0: memory counts when it has been written to
 def growth(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """windows: {from, to, p50, p95, p99, max, mean (ms)}; memory: by number of poses."""
     warm()
-    _drive(Solver(Options()), problem.shortened(_WARM), np.full(_WARM, _TOUCH), lambda _: None, np.inf)
+    _drive(Solver(Options(mode=job["mode"])), problem.shortened(_WARM), np.full(_WARM, _TOUCH), lambda _: None, np.inf)
     seconds, memory = np.full(problem.poses, _TOUCH), []
-    solver = Solver(Options())
+    solver = Solver(Options(mode=job["mode"]))
     gc.collect()
     gc.freeze()
     gc.disable()

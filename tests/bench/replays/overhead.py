@@ -30,6 +30,7 @@ from factorbus.solver import Options, Solver, warm
 from .problems import Problem, load
 
 _FIRST_STEP = """
+import sys
 import numpy as np
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, compiled_seconds
@@ -37,7 +38,7 @@ ends = np.array([[0, 1], [1, 2], [0, 2]])
 measured = np.array([[1.0, 0.0, 0.1], [1.0, 0.0, 0.1], [2.1, 0.1, 0.2]])
 information = np.tile([100.0, 0.0, 0.0, 100.0, 0.0, 400.0], (3, 1))
 start = Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True)
-solver = Solver(Options())
+solver = Solver(Options(mode=sys.argv[1]))
 batch = Batch((start, Variables("se2", np.array([1, 2]))), (Factors("between_se2", ends, measured, information),))
 solver.stage(batch)
 assert solver.step().iterations > 0
@@ -50,15 +51,15 @@ def overhead(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, An
     """step: microseconds by kind of step; start: seconds; cold: seconds, when job["cold"]."""
     warm()
     steps = load(problem)
-    _drive(steps[:100], _nothing_inside)
+    _drive(job["mode"], steps[:100], _nothing_inside)
     with timed_calls() as inside:
-        found = _drive(steps, inside, lambda k: tell({"done": k}))
-    return {"step": found, "start": starts(), "cold": cold_compile() if job["cold"] else None}
+        found = _drive(job["mode"], steps, inside, lambda k: tell({"done": k}))
+    return {"step": found, "start": starts(job["mode"]), "cold": cold_compile() if job["cold"] else None}
 
 
-def starts() -> dict[str, float]:
+def starts(mode: str) -> dict[str, float]:
     """Medians of a few: CPU and wall seconds of a process that makes one step, of a small loop; compiled_s: in it."""
-    rows = [_timed([sys.executable, "-c", _FIRST_STEP], dict(os.environ)) for _ in range(_STARTS)]
+    rows = [_timed([sys.executable, "-c", _FIRST_STEP, mode], dict(os.environ)) for _ in range(_STARTS)]
     return {
         "cpu_s": float(np.median([row[0] for row in rows])),
         "wall_s": float(np.median([row[1] for row in rows])),
@@ -99,9 +100,9 @@ def timed_calls() -> Iterator[Callable[[Any], float]]:
 
 
 def _drive(
-    steps: Sequence[Batch], inside: Callable[[Any], float], tell: Callable[[int], None] = lambda _: None
+    mode: str, steps: Sequence[Batch], inside: Callable[[Any], float], tell: Callable[[int], None] = lambda _: None
 ) -> dict[str, Any]:
-    solver, rows = Solver(Options()), np.zeros((len(steps), 2))
+    solver, rows = Solver(Options(mode=mode)), np.zeros((len(steps), 2))
     own = False
     gc.collect()
     gc.disable()

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from factorbus.viz import style
 
-from .contestants import ENTRIES
 from .figures import LOOKS, handles_of, in_order, sheet
-from .peer_targets import BARS, MEAN_TIMES, OURS, times_faster
+from .peer_targets import BARS, MEAN_TIMES, times_faster
 
 
 def steps_figure(path: Path, curves: dict[str, list[dict[str, Any]]], titles: dict[str, str]) -> None:
@@ -31,9 +30,9 @@ def steps_figure(path: Path, curves: dict[str, list[dict[str, Any]]], titles: di
     finish(path, handles_of({run["contestant"] for runs in curves.values() for run in runs}))
 
 
-def ratios_figure(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+def ratios_figure(path: Path, rows: Sequence[dict[str, Any]], judged: str) -> None:
     """iSAM2's time over ours on each data set, and what was to be reached."""
-    known = [row for row in rows if row["name"] == OURS and times_faster(row)]
+    known = [row for row in rows if row["name"] == judged and times_faster(row)]
     with mpl.rc_context(style.SETTINGS):
         figure = Figure(figsize=(7.5, 0.42 * max(len(known), 2) + 1.6), layout="constrained")
         axes = figure.subplots()
@@ -45,11 +44,11 @@ def ratios_figure(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         axes.axvline(MEAN_TIMES, color="#999999", linestyle=":", zorder=1)
         axes.set_yticks(places, [row["title"] for row in known])
         axes.set_xlabel("times the CPU time of iSAM2's update(); a stroke: to be reached; dotted: in the mean")
-        figure.suptitle("iSAM2 / auto", x=0.012, ha="left", fontsize=13)
+        figure.suptitle(f"iSAM2 / {judged}", x=0.012, ha="left", fontsize=13)
         figure.savefig(path, dpi=150)
 
 
-def growth_figure(path: Path, found: dict[str, Any]) -> None:
+def growth_figure(path: Path, found: dict[str, Any], judged: str) -> None:
     """Median and p99 of the steps in windows of a long drive."""
     with mpl.rc_context(style.SETTINGS):
         figure = Figure(figsize=(7.0, 3.8), layout="constrained")
@@ -62,5 +61,5 @@ def growth_figure(path: Path, found: dict[str, Any]) -> None:
         axes.set_xlabel("poses")
         axes.set_ylabel("ms")
         axes.legend()
-        figure.suptitle(f"{ENTRIES[OURS].label}: the time of a step as the map grows", x=0.012, ha="left", fontsize=13)
+        figure.suptitle(f"{judged}: the time of a step as the map grows", x=0.012, ha="left", fontsize=13)
         figure.savefig(path, dpi=150)

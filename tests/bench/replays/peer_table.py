@@ -18,7 +18,7 @@ def report(document: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
         *(f"> {note}" for note in document["notes"]),
     ]
     if rows:
-        parts += ["## Replays", main_table(rows), _LEGEND, "## Each data set"]
+        parts += ["## Replays", main_table(rows, document["judged"]), _LEGEND, "## Each data set"]
         for dataset in dict.fromkeys(row["dataset"] for row in rows):
             mine = [row for row in rows if row["dataset"] == dataset]
             parts += [f"### {mine[0]['title']}: {mine[0]['steps']} steps", details(mine)]
@@ -34,13 +34,13 @@ def report(document: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def main_table(rows: Sequence[dict[str, Any]]) -> str:
-    """A line for each data set and contestant: time, against iSAM2 and the bar, long steps, quality."""
+def main_table(rows: Sequence[dict[str, Any]], judged: str = OURS) -> str:
+    """A line for each data set and contestant: time, against iSAM2, long steps, quality; bars for who is judged."""
     head = ["", "", "s", "read s", "iSAM2 / it", "bar", "p50 ms", "p99", "bar", "max"]
     head += ["χ²/batch median", "p95", "max", "settled χ²"]
     lines = [line(head), line(["---", "---", *["---:"] * (len(head) - 2)])]
     for row in rows:
-        bar = BARS.get(row["dataset"]) if row["name"] == OURS else None
+        bar = BARS.get(row["dataset"]) if row["name"] == judged else None
         step, quality, times = row["step_ms"], row["chi2_ratio"], times_faster(row)
         factor = number(times, "{:.2f}") + ("" if row["ratio_steps"] == row["steps"] or not times else "*")
         cells = [row["title"], ENTRIES[row["name"]].label + ("" if row["status"] == "done" else f" ({row['status']})")]

@@ -43,16 +43,19 @@ GROWN_FROM, GROWN_TO = 1_000, 100_000
 OVERHEAD_US, ODOMETRY_US, START_S, COLD_S = 15.0, 10.0, 1.5, 60.0
 
 
-def judge(rows: Sequence[dict[str, Any]], ends: dict[str, float]) -> list[Verdict]:
-    """The data sets in `ends`, which maps them to the reference optimum; what is not a whole data set has no bars."""
+def judge(rows: Sequence[dict[str, Any]], ends: dict[str, float], judged: str = OURS) -> list[Verdict]:
+    """The data sets in `ends`, which maps them to the reference optimum; what is not a whole data set has no bars.
+
+    judged: the contestant that is to show it.
+    """
     table: Rows = {(row["dataset"], row["name"]): row for row in rows}
     found: list[Verdict] = []
     for dataset, optimum in ends.items():
-        ours = table.get((dataset, OURS))
+        ours = table.get((dataset, judged))
         if dataset not in BARS or ours is None:
             continue
         if ours["status"] != "done":
-            found.append(Verdict(f"{dataset}: auto goes through without an exception", ours["note"], MISSED))
+            found.append(Verdict(f"{dataset}: {judged} goes through without an exception", ours["note"], MISSED))
             continue
         found += [
             _time(dataset, ours, table.get((dataset, ours["ratio_against"]))),
@@ -61,7 +64,7 @@ def judge(rows: Sequence[dict[str, Any]], ends: dict[str, float]) -> list[Verdic
             _no_worse(dataset, ours, table.get((dataset, PEER))),
             _settled(dataset, ours, optimum),
         ]
-    return [*found, _mean(table, ends)] if found else []
+    return [*found, _mean([table[d, judged] for d in ends if d in BARS and (d, judged) in table])] if found else []
 
 
 def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
@@ -196,10 +199,9 @@ def _settled(dataset: str, ours: dict[str, Any], optimum: float) -> Verdict:
     return _verdict(what, f"{ours['chi2_settled']:.10g} against {optimum:.10g} ({off:+.1e})", abs(off) <= SETTLED)
 
 
-def _mean(table: Rows, ends: Iterable[str]) -> Verdict:
+def _mean(rows: Iterable[dict[str, Any]]) -> Verdict:
     what = f"geometric mean of iSAM2's time over ours on all {len(BARS)} data sets at least {MEAN_TIMES:g}"
-    times = [times_faster(table[dataset, OURS]) for dataset in ends if dataset in BARS and (dataset, OURS) in table]
-    known = [each for each in times if each]
+    known = [times for row in rows if (times := times_faster(row))]
     if not known:
         return Verdict(what, "", NOT_MEASURED)
     mean = math.exp(sum(math.log(each) for each in known) / len(known))
