@@ -1,5 +1,6 @@
 """Features for filters over the bus: cut up, done by processes that may die or freeze, and every one arrives."""
 
+import asyncio
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,11 +13,12 @@ from naive.random_sightings import random_sighting
 from processes import PATIENCE_S, Process
 
 from factorbus import idp
+from factorbus.client import aio, connect
 from factorbus.idp import minimal
 from factorbus.proto import keys
-from factorbus.proto.features import Answer, Ask, Sighting
+from factorbus.proto.features import Answer, Ask, Segment, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_ask
-from factorbus.proto.problems import Refused
+from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
 from factorbus.proto.segments import PAGE, Memory
 
 Spawn = Callable[..., Process]
@@ -144,3 +146,63 @@ def test_a_worker_that_dies_or_freezes_costs_a_retry_and_no_feature(
             first.signal(signal.SIGCONT)
             seen = iter(lambda: {done.worker for done in answer(client, ask).shards}, None)
             assert next(names for names in seen if "a" in names), "it is heard of again"
+
+
+def test_a_front_end_on_another_host_gets_the_same_without_shared_memory(
+    spawn: Spawn, tmp_path: Path, question: Question, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the service a file that has another nonce is a file on another host."""
+    sighting = question[0]
+    P = random_sighting(31, N, 3)[1]
+    x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
+    after = minimal.covariance(P, sighting, idp.see(sighting)).P.tobytes()
+    large = random_sighting(32, 1070)[0]  # 330 MB as rows, 165 as the upper half
+    prior = {name: getattr(sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+    with service(spawn, tmp_path) as (_, endpoint, _), connect(endpoint, client="camera", timeout_s=60) as bus:
+        with bus.features(sighting.camera, **prior) as front:
+            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
+            assert front._shared
+            monkeypatch.setattr(Memory, "segment", segment_elsewhere)
+            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
+            assert not front._shared, "so the upper half is sent from now on"
+            assert front.grow(x, P, sighting.pixels).P.tobytes() == after
+        with bus.features(large.camera, **prior) as front:
+            grown = front.grow(large.state, large.covariance, large.pixels)
+            assert grown.P.shape == (13 + 6 * 1070,) * 2
+            assert np.array_equal(grown.P[-60:], grown.P[:, -60:].T)
+            with pytest.raises(TooLarge):
+                front.grow(large.state, large.covariance, np.tile(large.pixels, (2, 1)))
+
+
+def segment_elsewhere(memory: Memory, offset: int) -> Segment:
+    return Segment(memory._path.name, "0" * 32, memory.size, offset)
+
+
+def test_a_filter_gets_factors_and_its_problems_by_name(spawn: Spawn, tmp_path: Path, question: Question) -> None:
+    sighting, y, rows = question
+    x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
+    prior = {name: getattr(sighting, name) for name in ("rho", "sigma_rho", "sigma_pixel")}
+    with (
+        service(spawn, tmp_path) as (_, endpoint, _),
+        connect(endpoint, client="camera", timeout_s=60) as bus,
+        bus.features(sighting.camera, service="s", **prior) as front,
+    ):
+        parts = front.factor(x, sighting.covariance, sighting.pixels)
+        assert parts.y.tobytes() == y.tobytes()
+        m = sighting.width
+        np.testing.assert_allclose(parts.block(3, 170), rows[18:24, m + 6 * 170 :][:, :6], atol=1e-13)
+        with pytest.raises(Refused) as refused:
+            front.factor(x, sighting.covariance, np.array([[np.inf, 0.0]]))
+        assert refused.value.code == "bad_pixel"
+
+        async def on_a_loop() -> tuple[bytes, bytes]:
+            async with aio.connect(endpoint, client="loop") as loop, loop.features(sighting.camera, **prior) as slow:
+                parts = await slow.factor(x, sighting.covariance, sighting.pixels)
+                return parts.y.tobytes(), (await slow.grow(x[:13], np.eye(13), sighting.pixels)).y.tobytes()
+
+        assert asyncio.run(on_a_loop()) == (y.tobytes(), y.tobytes())
+        for wrong in (x[:12], x[None]):
+            with pytest.raises(BadShape):
+                front.grow(wrong, np.eye(13), sighting.pixels)
+        with pytest.raises(Unavailable):
+            bus.features(sighting.camera, service="another").factor(x, sighting.covariance, sighting.pixels, 0.2)

@@ -9,14 +9,23 @@
 
 from factorbus.client.bus import Bus, connect
 from factorbus.client.draft import Draft
+from factorbus.client.features import Features, Growing
+from factorbus.client.grown import Factored, Grown
 from factorbus.client.map import Map, MapRow
 from factorbus.client.mirror import Mirror, Snapshot
 from factorbus.client.ticket import NoAnswerYet, Ticket
+from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import Problem, Refused, Unavailable
 
 __all__ = [
+    "BadCamera",
     "Bus",
+    "Camera",
     "Draft",
+    "Factored",
+    "Features",
+    "Growing",
+    "Grown",
     "Map",
     "MapRow",
     "Mirror",

@@ -6,7 +6,7 @@
             ...
 
 Answers come from the bus's threads straight into futures of the loop; only connecting, joining and leaving, which
-are rare, borrow a thread of the loop's executor.
+are rare, and putting large covariances together borrow a thread of the loop's executor.
 """
 
 import asyncio
@@ -14,13 +14,18 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from factorbus.client import bus as sync
 from factorbus.client.draft import Draft, Key
+from factorbus.client.features import Features as SyncFeatures
+from factorbus.client.grown import Factored, Grown
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
 from factorbus.client.mirror import Mirror
 from factorbus.client.stream import DeltaStream
 from factorbus.client.ticket import NoAnswerYet, Ticket
+from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, Graph
 
 
@@ -59,6 +64,15 @@ class Bus:
         finally:
             await asyncio.to_thread(joined.close)
 
+    @asynccontextmanager
+    async def features(self, camera: Camera, **prior: Any) -> AsyncIterator["Features"]:
+        """As `factorbus.client.Bus.features`, in `async with`."""
+        front = self._bus.features(camera, **prior)
+        try:
+            yield Features(front)
+        finally:
+            front.close()
+
     async def maps(self) -> list[MapRow]:
         """The maps of the service.  Raises Refused, Unavailable."""
         return await asyncio.to_thread(self._bus.maps)
@@ -70,6 +84,22 @@ class Bus:
     async def drop(self, name: str) -> None:
         """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
         await asyncio.to_thread(self._bus.drop, name)
+
+
+class Features:
+    """Where a filter has its features made; see `factorbus.client.Features`."""
+
+    def __init__(self, front: SyncFeatures) -> None:
+        self._front = front
+
+    async def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Grown:
+        """State and covariance with a new feature for each pixel.  Raises as `factorbus.client.Features.grow`."""
+        growing = await asyncio.to_thread(self._front.send, x, P, pixels, timeout_s)
+        return await asyncio.to_thread(growing.result)
+
+    async def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
+        """The new features as factors.  Raises as `factorbus.client.Features.grow`."""
+        return await asyncio.to_thread(self._front.factor, x, P, pixels, timeout_s)
 
 
 class Map:

@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from factorbus.client.courier import Courier, Errand
+from factorbus.client.features import Features
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import Map, MapRow
 from factorbus.proto import codec, fields, keys
+from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import UnknownMap
@@ -39,6 +41,7 @@ class Bus:
         self._link = link
         self._courier = Courier(link)
         self._maps: list[Map] = []
+        self._features: list[Features] = []
 
     def __enter__(self) -> "Bus":
         return self
@@ -71,6 +74,27 @@ class Bus:
             raise
         return joined
 
+    def features(
+        self, camera: Camera, *, rho: float = 1.0, sigma_rho: float = 1.0, sigma_pixel: float = 1.0, service: str = ""
+    ) -> Features:
+        """Where a filter with `camera` has its inverse-depth features made; no map is involved.
+
+        rho, sigma_rho: prior of every feature's inverse distance (1/metre).  sigma_pixel: standard deviation of u and
+        of v (pixels).  service: its name; empty: whichever is there.
+        """
+        made = Features(
+            self._link,
+            self._courier,
+            self.timeout_s,
+            camera,
+            rho=rho,
+            sigma_rho=sigma_rho,
+            sigma_pixel=sigma_pixel,
+            service=service,
+        )
+        self._features.append(made)
+        return made
+
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
         """The maps of the service.  Raises Refused, Unavailable."""
         return self._admin("maps", {}, _rows, timeout_s)
@@ -85,8 +109,8 @@ class Bus:
 
     def close(self) -> None:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
-        for joined in self._maps:
-            joined.close()
+        for opened in (*self._maps, *self._features):
+            opened.close()
         self._courier.close()
         self._link.close()
 

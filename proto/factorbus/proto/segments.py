@@ -36,7 +36,7 @@ _OLD_S = 600.0
 
 
 class Memory:
-    """A file made for one answer.  `close` it, or use it in `with`; arrays from it live on."""
+    """A file for answers, one at a time.  `close` it, or use it in `with`; arrays from it live on."""
 
     def __init__(self, size: int) -> None:
         """Make one of `size` bytes.  Raises OSError: no /dev/shm here, or no room in it."""
@@ -44,18 +44,15 @@ class Memory:
         room = os.statvfs(FOLDER)
         if room.f_bavail * room.f_frsize < size:
             raise OSError(errno.ENOSPC, f"no room for {size} bytes", str(FOLDER))
+        self.size = size
         self._path = FOLDER / f"factorbus-{os.getpid()}-{secrets.token_hex(16)}"
-        self._nonce, self._size = secrets.token_hex(_NONCE // 2), size
-        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
-            os.truncate(descriptor, size)
-            self._map = mmap.mmap(descriptor, size)
+            os.truncate(self._descriptor, size)
+            self.renew()
         except BaseException:
-            self._path.unlink(missing_ok=True)
+            self.close()
             raise
-        finally:
-            os.close(descriptor)
-        self._map[:_NONCE] = self._nonce.encode()
 
     def __enter__(self) -> "Memory":
         return self
@@ -63,17 +60,29 @@ class Memory:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def renew(self) -> None:
+        """Another nonce, for another question: who comes late with the one before finds nothing."""
+        self._nonce = secrets.token_hex(_NONCE // 2)
+        os.pwrite(self._descriptor, self._nonce.encode(), 0)
+
     def segment(self, offset: int) -> Segment:
         """What to send along."""
-        return Segment(self._path.name, self._nonce, self._size, offset)
+        return Segment(self._path.name, self._nonce, self.size, offset)
 
     def array(self, offset: int, shape: tuple[int, ...]) -> F64:
         """The numbers from byte `offset` on; the array keeps the memory, also after `close`."""
-        return np.ndarray(shape, np.float64, self._map, offset)
+        return np.ndarray(shape, np.float64, self.mapped(), offset)
+
+    def mapped(self) -> mmap.mmap:
+        """The bytes, as long as somebody holds what this returns or an array made of it."""
+        return mmap.mmap(self._descriptor, self.size)
 
     def close(self) -> None:
         """Remove the name."""
-        self._path.unlink(missing_ok=True)
+        if self._descriptor >= 0:
+            self._path.unlink(missing_ok=True)
+            os.close(self._descriptor)
+            self._descriptor = -1
 
 
 @contextmanager

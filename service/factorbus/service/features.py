@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 # A worker has so much longer than the shard should take, and this much besides: for one that is merely busy.
 _PATIENCE, _BESIDES_S = 20.0, 1.0
+# Nobody waits longer than this for features; every shard is done long before, in place if need be.
+_GIVE_UP_S = 600.0
 
 
 @dataclass(slots=True)
@@ -130,7 +132,7 @@ class Features:
                 encode_shard(shard),
                 lambda job, place=place: self._came(question, place, job),
                 deadline_s,
-                self._deadline_s,
+                _GIVE_UP_S,
             )
 
     def _came(self, question: _Question, place: int, job: Ended) -> None:

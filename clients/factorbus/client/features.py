@@ -1,0 +1,192 @@
+"""New features for a monocular filter: pixels go to a service and its workers, a grown state and covariance come back.
+
+    with connect("tcp/127.0.0.1:7447", client="camera1") as bus, bus.features(camera, rho=0.5, sigma_rho=0.25) as front:
+        x, P = front.grow(x, P, pixels).state
+
+The filter's state begins with the camera: r (3), q (4, scalar first, camera to world), v (3), ω (3); new features are
+appended, six numbers each.  No map is involved, and no compiler is needed here.
+"""
+
+import threading
+import time
+from concurrent.futures import Future
+from contextlib import ExitStack
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorbus.client.courier import Courier, Errand
+from factorbus.client.grown import Factored, Grown, factored, grown
+from factorbus.client.link import Link
+from factorbus.client.memories import Lent, Memories
+from factorbus.proto import keys
+from factorbus.proto.arrays import F64
+from factorbus.proto.camera import Camera
+from factorbus.proto.features import CAMERA_STATE, FEATURE, Answer, Ask, Sighting, answer_size, rows_size
+from factorbus.proto.features_codec import decode_answer, encode_ask
+from factorbus.proto.limits import ANSWER_LIMITS
+from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
+from factorbus.proto.segments import PAGE
+
+# A smaller answer is sooner sent than shared memory is made for it.
+_SHARED_FROM_BYTES = 64 << 10
+
+
+class Features:
+    """Where a front end with one camera has its features made.  Close it, or use it in `with`.
+
+    camera: with its lens.  rho, sigma_rho: prior of every feature's inverse distance (1/metre).  sigma_pixel: standard
+    deviation of u and of v (pixels).  service: its name; empty: whichever answers.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        courier: Courier,
+        timeout_s: float,
+        camera: Camera,
+        *,
+        rho: float = 1.0,
+        sigma_rho: float = 1.0,
+        sigma_pixel: float = 1.0,
+        service: str = "",
+    ) -> None:
+        self.camera, self.rho, self.sigma_rho, self.sigma_pixel = camera, rho, sigma_rho, sigma_pixel
+        self._link, self._courier, self._timeout_s, self._service = link, courier, timeout_s, service
+        self._memories = Memories()
+        self._shared = True  # until an answer shows that nobody there shares memory with us
+        self._stack = ExitStack()
+        self._changed = threading.Condition()
+        self._services: set[str] = set()
+        self._stack.enter_context(link.watching(keys.any_features_token(), self._see))
+
+    def __enter__(self) -> "Features":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def grow(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Grown:
+        """State and covariance with a new feature for each pixel, and wait for them.
+
+        x (m,), P (m, m): as they are.  pixels (n, 2): distorted, u v.
+        Raises BadShape, TooLarge, Unavailable, and Refused with bad_pixel, bad_state, bad_camera: nothing was added.
+        """
+        return self.send(x, P, pixels, timeout_s).result()
+
+    def send(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> "Growing":
+        """The same without waiting: several may be on their way.  x and P must not be changed until `result`."""
+        state, covariance = _matching(x, P)
+        sighting = self._sighting(state, covariance, pixels)
+        m, n = sighting.width, sighting.count
+        lent = None
+        if self._shared and rows_size(n, m) >= _SHARED_FROM_BYTES:
+            lent = self._memories.try_lend(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
+        ask = Ask(sighting, "rows", lent.segment) if lent else Ask(sighting, "half")
+        return Growing(self, state, covariance, ask, lent, self._ask(ask, timeout_s))
+
+    def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
+        """The new features as factors: O(m + n) numbers, from which any block of the covariance is formed on demand.
+
+        Of P, its first 13 rows will do.  Raises as `grow`.
+        """
+        sighting = self._sighting(np.asarray(x, np.float64), np.asarray(P, np.float64), pixels)
+        answer: Answer = self._ask(Ask(sighting, "factored"), timeout_s).future.result()
+        return factored(sighting, answer)
+
+    def close(self) -> None:
+        """Ask nothing more."""
+        self._stack.close()
+        self._memories.close()
+
+    def settle(self, lent: Lent, clean: bool, stored: bool) -> None:
+        """For Growing: what became of the memory of an answer."""
+        self._shared &= stored
+        self._memories.settle(lent, clean)
+
+    def again_without_memory(self, ask: Ask, timeout_s: float | None = None) -> Errand:
+        """For Growing: the same question, for somebody who shares no memory with us."""
+        self._shared = False
+        return self._ask(Ask(ask.sighting, "half"), timeout_s)
+
+    def _sighting(self, x: F64, P: F64, pixels: ArrayLike) -> Sighting:
+        seen = np.asarray(pixels, np.float64)
+        if seen.ndim != 2 or seen.shape[1] != 2:
+            raise BadShape("pixels", " × ".join(map(str, seen.shape)), "n × 2")
+        if x.ndim != 1 or x.size < CAMERA_STATE or P.ndim != 2 or P.shape[0] < CAMERA_STATE or P.shape[1] != x.size:
+            raise BadShape("x and P", f"{x.shape} and {P.shape}", "(m,) and (m, m) with m ≥ 13, the camera first")
+        state, rows = x[:CAMERA_STATE], P[:CAMERA_STATE]
+        return Sighting(self.camera, state, rows, seen, self.rho, self.sigma_rho, self.sigma_pixel)
+
+    def _ask(self, ask: Ask, timeout_s: float | None) -> Errand:
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        if answer_size(ask) > ANSWER_LIMITS.max_bytes:
+            raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
+        started = time.monotonic()
+        service = self._service or self._any_service(timeout_s)
+        left = max(0.001, timeout_s - (time.monotonic() - started))
+        what = f"service {service}, asked for {ask.sighting.count} features,"
+        return self._courier.carry(Errand(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
+
+    def _any_service(self, timeout_s: float) -> str:
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._services, timeout_s):
+                raise Unavailable("features", timeout_s, "no service on this bus makes features: is one running?")
+            return min(self._services)
+
+    def _see(self, token: str, alive: bool) -> None:
+        with self._changed:
+            (self._services.add if alive else self._services.discard)(keys.service_of(token))
+            self._changed.notify_all()
+
+
+class Growing:
+    """A filter's growth that is on its way."""
+
+    def __init__(self, features: Features, x: F64, P: F64, ask: Ask, lent: Lent | None, errand: Errand) -> None:
+        self._features, self._x, self._P, self._ask, self._lent = features, x, P, ask, lent
+        self._errand = errand
+        self._result: Grown | None = None
+
+    @property
+    def future(self) -> Future[Answer]:
+        """For callbacks and asyncio: it is done when `result` need not wait for the bus."""
+        return self._errand.future
+
+    def result(self) -> Grown:
+        """Wait for it, and put it together on this thread.  Raises as `Features.grow`."""
+        if self._result is None:
+            self._result = self._put_together()
+        return self._result
+
+    def _put_together(self) -> Grown:
+        try:
+            answer = self._errand.future.result()
+        except Refused as refused:
+            if self._lent is None or refused.code != "too_large":
+                self._settle(clean=False, stored=True)
+                raise
+            # Nobody there could store it, and as rows it is too large to send; as the upper half it may not be.
+            self._settle(clean=False, stored=False)
+            self._lent = None
+            answer = self._features.again_without_memory(self._ask).future.result()
+        except BaseException:
+            self._settle(clean=False, stored=True)
+            raise
+        matrix = self._lent.matrix if self._lent else None
+        result = grown(self._x, self._P, self._ask.sighting, answer, matrix)
+        stored = all(done.shard.stored for done in answer.shards)
+        self._settle(clean=answer.clean and self._errand.attempt == 1, stored=stored)
+        return result
+
+    def _settle(self, clean: bool, stored: bool) -> None:
+        lent, self._lent = self._lent, None
+        if lent is not None:
+            self._features.settle(lent, clean, stored)
+
+
+def _matching(x: ArrayLike, P: ArrayLike) -> tuple[F64, F64]:
+    state, covariance = np.asarray(x, np.float64), np.asarray(P, np.float64)
+    if state.ndim != 1 or covariance.shape != (state.size, state.size):
+        raise BadShape("x and P", f"{state.shape} and {covariance.shape}", "(m,) and (m, m)")
+    return state, covariance

@@ -1,0 +1,164 @@
+"""The client's side of features: what comes back put together, shared memory used again, what cannot be believed."""
+
+import gc
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from naive.random_sightings import random_sighting
+
+from factorbus import idp
+from factorbus.client.grown import factored, grown
+from factorbus.client.memories import Memories
+from factorbus.idp import job, minimal
+from factorbus.proto.features import Answer, Ask, Done, Shard, ShardDone, Sighting
+from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
+from factorbus.proto.problems import BadMessage
+from factorbus.proto.segments import FOLDER, PAGE
+
+N, CUTS = 150, ((0, 7), (7, 8), (8, 150))
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Sighting, np.ndarray, np.ndarray]:
+    """(sighting, P before, P after)."""
+    sighting, P = random_sighting(41, N, 2)
+    return sighting, P, minimal.covariance(P, sighting, idp.see(sighting)).P
+
+
+def answered(ask: Ask, cuts: tuple[tuple[int, int], ...] = CUTS) -> Answer:
+    """What workers would answer, over the wire's bytes."""
+    data = encode_ask(ask)
+    shards = [(job.do(encode_shard(Shard(data, *cut))), f"w{cut[0]}", 0.5) for cut in cuts]
+    return decode_answer(encode_answer(shards, clean=True))
+
+
+@pytest.mark.parametrize("form", ["rows", "half"])
+def test_shards_become_the_grown_covariance(seen, form: str) -> None:
+    sighting, P, after = seen
+    x = np.arange(float(sighting.width))
+    found = grown(x, P, sighting, answered(Ask(sighting, form)), None)
+    assert found.P.tobytes() == after.tobytes()
+    assert found.x[: x.size].tobytes() == x.tobytes()
+    assert found.x[x.size :].tobytes() == found.y.tobytes() == idp.see(sighting).y.tobytes()
+    assert (found.workers, found.seconds) == (("w0", "w7", "w8"), 0.5)
+
+
+def test_rows_in_memory_and_rows_that_came_as_bytes_are_put_together(seen) -> None:
+    """One worker shares memory with us, another does not."""
+    sighting, P, after = seen
+    memories = Memories()
+    m = sighting.width
+    lent = memories.try_lend(PAGE, after.shape, m)
+    assert lent is not None
+    here = answered(Ask(sighting, "rows", lent.segment), CUTS[:2])
+    elsewhere = answered(Ask(sighting, "rows"), CUTS[2:])
+    assert [done.shard.stored for done in here.shards] == [True, True]
+    found = grown(np.zeros(m), P, sighting, Answer((*here.shards, *elsewhere.shards), True), lent.matrix)
+    assert found.P.tobytes() == after.tobytes()
+    memories.settle(lent, clean=False)
+    memories.close()
+
+
+def test_factors_give_every_block(seen) -> None:
+    sighting, _, after = seen
+    found = factored(sighting, answered(Ask(sighting, "factored")))
+    m = sighting.width
+    assert found.y.tobytes() == idp.see(sighting).y.tobytes()
+    scale = abs(after).max()
+    for i, k in ((0, 0), (3, 140), (140, 3), (149, 149)):
+        wanted = after[m + 6 * i : m + 6 * i + 6, m + 6 * k : m + 6 * k + 6]
+        np.testing.assert_allclose(found.block(i, k), wanted, rtol=0, atol=1e-14 * scale)
+        np.testing.assert_allclose(found.before(i), after[m + 6 * i : m + 6 * i + 6, :m], rtol=0, atol=1e-14 * scale)
+
+
+def test_no_pixels_leave_everything_as_it_was(seen) -> None:
+    sighting, P, _ = seen
+    none = Sighting(sighting.camera, sighting.state, sighting.covariance, np.empty((0, 2)))
+    x = np.arange(float(sighting.width))
+    found = grown(x, P, none, answered(Ask(none, "half"), ((0, 0),)), None)
+    assert (found.x.tobytes(), found.P.tobytes(), found.y.shape) == (x.tobytes(), P.tobytes(), (0, 6))
+
+
+def broken(change: Callable[[Done], Done | None]) -> Callable[[Answer], Answer]:
+    """An answer with its middle shard changed, or left out."""
+
+    def apply(answer: Answer) -> Answer:
+        first, middle, last = answer.shards
+        changed = change(middle)
+        return answer._replace(shards=(first, changed, last) if changed else (first, last))
+
+    return apply
+
+
+def other(**fields: object) -> Callable[[Done], Done]:
+    return lambda done: done._replace(shard=ShardDone(**{**done.shard._asdict(), **fields}))
+
+
+@pytest.mark.parametrize(
+    ("form", "change"),
+    [
+        ("rows", lambda _: None),
+        ("rows", other(first=6)),
+        ("rows", other(rows=None)),
+        ("rows", other(rows=np.zeros((6, 3)))),
+        ("rows", other(rows=None, stored=True)),
+        ("half", other(cross=None)),
+        ("half", other(blocks=np.zeros(35))),
+    ],
+)
+def test_an_answer_that_cannot_be_is_no_covariance(seen, form: str, change: Callable[[Done], Done | None]) -> None:
+    sighting, P, _ = seen
+    with pytest.raises(BadMessage):
+        grown(np.zeros(sighting.width), P, sighting, broken(change)(answered(Ask(sighting, form))), None)
+
+
+def files() -> set[str]:
+    return {path.name for path in FOLDER.glob("factorbus-*")}
+
+
+def test_memory_is_used_again_when_nobody_looks_at_it() -> None:
+    before, memories = files(), Memories()
+    first = memories.try_lend(PAGE, (300, 300), 10)
+    assert first is not None
+    name, view = first.segment.name, first.matrix[5:7]
+    memories.settle(first, clean=True)
+    del first
+    gc.collect()
+    second = memories.try_lend(PAGE, (300, 300), 10)
+    assert second is not None
+    assert second.segment.name != name, "a view of the first is still looked at"
+    view[:] = 1.0
+    del view
+    gc.collect()
+    third = memories.try_lend(PAGE, (290, 290), 10)
+    assert third is not None
+    assert third.segment.name == name
+    assert third.segment.nonce != second.segment.nonce
+    memories.settle(second, clean=False)
+    memories.settle(third, clean=False)
+    memories.close()
+    assert files() == before
+
+
+def test_memory_that_somebody_may_still_write_to_is_not_used_again() -> None:
+    before, memories = files(), Memories()
+    lent = memories.try_lend(PAGE, (300, 300), 0)
+    assert lent is not None
+    name = lent.segment.name
+    memories.settle(lent, clean=False)
+    del lent
+    gc.collect()
+    again = memories.try_lend(PAGE, (300, 300), 0)
+    assert again is not None
+    assert again.segment.name != name
+    memories.settle(again, clean=True)
+    memories.close()
+    again.matrix[:] = 2.0  # lives on
+    del again
+    gc.collect()
+    assert files() == before
+
+
+def test_without_room_there_is_no_memory() -> None:
+    assert Memories().try_lend(PAGE, (1 << 25, 1 << 25), 0) is None
