@@ -110,8 +110,10 @@ J, padded = classical.matrices(P, A[0], B[0], padd)
 check("classical", product(counting(J), counting(padded), room(*J.shape)))
 At = A.transpose(2, 0, 1).reshape(13, -1)
 out = room(m + 6 * n, m + 6 * n)
-check("independent", rows.independent(
-    0, n, counting(P[:13]), counting(A), counting(At), counting(B), counting(padd), room(6, m), room(12, 6), out))
+counts = np.zeros(rows.COUNTS, np.int64)
+given = [counting(array) for array in (P[:13], A, At, B, padd)]
+rows.independent(0, n, *given, room(6, m), room(12, 6), out, counts)
+check("independent", counts.sum())
 U, S, V, W, own = room(6, m), room(3, 3), room(n, 6), room(n, 6), room(n, 3)
 turn, slope = counting(seen.turn), counting(seen.slope)
 x = sighting.state

@@ -3,8 +3,8 @@
 import numpy as np
 
 from factorbus.idp.classical import Counted
-from factorbus.idp.kernels.compile import F64
-from factorbus.idp.kernels.independent import independent
+from factorbus.idp.kernels.compile import F64, I64
+from factorbus.idp.kernels.independent import COUNTS, independent
 from factorbus.proto.features import CAMERA_STATE, FEATURE
 
 
@@ -17,15 +17,17 @@ def covariance(P: F64, A: F64, B: F64, padd: F64, out: F64 | None = None) -> Cou
     m, n = len(P), len(A)
     after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
     after[:m, :m] = P
-    count = some_rows(0, n, np.ascontiguousarray(P[:CAMERA_STATE]), A, B, padd, after)
-    return Counted(after, count)
+    counts = np.zeros(COUNTS, np.int64)
+    some_rows(0, n, np.ascontiguousarray(P[:CAMERA_STATE]), A, B, padd, after, counts)
+    return Counted(after, int(counts.sum()))
 
 
-def some_rows(first: int, last: int, before: F64, A: F64, B: F64, padd: F64, out: F64) -> int:
-    """The rows and columns of features first .. last−1 in `out`; gives the number of multiplications.
+def some_rows(first: int, last: int, before: F64, A: F64, B: F64, padd: F64, out: F64, counts: I64) -> None:
+    """The rows and columns of features first .. last−1 in `out`.
 
     in   before (13, m): the camera's rows of P
+    out  counts (5,): multiplications are added, by part (`kernels/independent.py`)
     """
     At = np.ascontiguousarray(A.transpose(2, 0, 1).reshape(CAMERA_STATE, -1))
     left, own = np.empty((FEATURE, before.shape[1])), np.empty((2 * FEATURE, FEATURE))
-    return independent(first, last, before, A, At, B, padd, left, own, out)
+    independent(first, last, before, A, At, B, padd, left, own, out, counts)

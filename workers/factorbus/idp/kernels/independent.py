@@ -7,26 +7,30 @@
 No feature waits for another one.  Everything is multiplied out, zeros included, as in the paper.
 """
 
-from factorbus.idp.kernels.compile import F64, inline_kernel, kernel
+from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel
 from factorbus.idp.kernels.layout import CAMERA, FEATURE
+
+# Entries of `counts`.
+LEFT, RIGHT, OWN_LEFT, OWN, BLOCKS = 0, 1, 2, 3, 4
+COUNTS = 5
 
 
 @kernel(
-    "int64(int64, int64, float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1], "
-    "float64[:,::1], float64[:,::1], float64[:,::1])"
+    "void(int64, int64, float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1], "
+    "float64[:,::1], float64[:,::1], float64[:,::1], int64[::1])"
 )
 def independent(
-    first: int, last: int, before: F64, A: F64, At: F64, B: F64, padd: F64, left: F64, own: F64, out: F64
-) -> int:
-    """Rows and columns of the new features first .. last−1 of P after; gives the number of multiplications.
+    first: int, last: int, before: F64, A: F64, At: F64, B: F64, padd: F64, left: F64, own: F64, out: F64, counts: I64
+) -> None:
+    """Rows and columns of the new features first .. last−1 of P after.
 
     in   before (13, m): the camera's rows of P before   A (n, 6, 13)   At (13, 6 n): all A_kᵀ side by side
          B (n, 6, 3)   padd (3, 3)
     work left (6, m)   own (12, 6)
     out  out (m + 6 n, m + 6 n): from row and column m on
+         counts (5,): multiplications are added for left, right, B Padd, (B Padd) Bᵀ, and blocks
     """
     m, width = before.shape[1], At.shape[1]
-    count = 0
     for i in range(first, last):
         row = m + FEATURE * i
         for a in range(FEATURE):
@@ -34,7 +38,7 @@ def independent(
                 total = 0.0
                 for t in range(CAMERA):
                     total += A[i, a, t] * before[t, c]
-                    count += 1
+                    counts[LEFT] += 1
                 left[a, c] = total
                 out[row + a, c] = total
         for c in range(m):
@@ -42,15 +46,15 @@ def independent(
                 total = 0.0
                 for t in range(CAMERA):
                     total += before[t, c] * A[i, a, t]
-                    count += 1
+                    counts[RIGHT] += 1
                 out[c, row + a] = total
         for a in range(FEATURE):
-            count += row_of_blocks(left[a], At, out[row + a, m : m + width])
-        count += own_block(B[i], padd, own)
+            counts[BLOCKS] += row_of_blocks(left[a], At, out[row + a, m : m + width])
+        counts[OWN_LEFT] += own_left(B[i], padd, own)
+        counts[OWN] += own_block(B[i], own)
         for a in range(FEATURE):
             for b in range(FEATURE):
                 out[row + a, row + b] += own[FEATURE + a, b]
-    return count
 
 
 @inline_kernel
@@ -70,8 +74,8 @@ def row_of_blocks(left: F64, At: F64, out: F64) -> int:
 
 
 @inline_kernel
-def own_block(B: F64, padd: F64, own: F64) -> int:
-    """B Padd into the first six rows of `own` (6 × 3 used), B Padd Bᵀ into the last six."""
+def own_left(B: F64, padd: F64, own: F64) -> int:
+    """B Padd into the first six rows of `own`, 6 × 3."""
     count = 0
     for a in range(FEATURE):
         for c in range(3):
@@ -80,6 +84,13 @@ def own_block(B: F64, padd: F64, own: F64) -> int:
                 total += B[a, t] * padd[t, c]
                 count += 1
             own[a, c] = total
+    return count
+
+
+@inline_kernel
+def own_block(B: F64, own: F64) -> int:
+    """(B Padd) Bᵀ into the last six rows of `own`."""
+    count = 0
     for a in range(FEATURE):
         for b in range(FEATURE):
             total = 0.0
