@@ -10,7 +10,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
-MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch")
+MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "tree")
 WORLDS = ("manhattan", "city-trees", "sphere")
 
 

@@ -130,6 +130,11 @@ class BlockFactor:
         solve_block_rows(self.rec, self.index, self.numbers, self.counts, d, x, delta)
         return delta
 
+    def memory_bytes(self) -> int:
+        """Bytes in use of all arenas."""
+        positions, index, numbers = (int(self.counts[entry]) for entry in (br.POSITIONS, br.INDEX, br.NUMBERS))
+        return 8 * (positions * (br.RECORD + 1) + index + numbers + self.d.size)
+
     def nonzeros(self) -> int:
         """Doubles of R on and above the diagonal, the zeros of joined fronts among them."""
         rec = self.rec[: self.counts[br.POSITIONS]]

@@ -51,6 +51,10 @@ class Elimination:
         """δ = PᵀR⁻¹d, in insertion order."""
         return self._cholesky.back(d)
 
+    def memory_bytes(self) -> int:
+        """Bytes of the fronts that were made last."""
+        return 8 * self.symbolic.arena if self.symbolic else 0
+
     def fronts(self) -> tuple[Symbolic, F64]:
         """The factor made last: its analysis, and the arena with the numbers."""
         symbolic = self.symbolic

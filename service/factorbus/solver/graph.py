@@ -62,6 +62,11 @@ class Graph:
         if (need := counts[at.PAYLOAD] + more * size) > self.payload.size:
             self.payload = grown(self.payload, need)
 
+    def memory_bytes(self) -> int:
+        """Bytes in use of all arenas."""
+        variables, factors, values, payload, columns, _ = self.counts.tolist()
+        return 8 * (variables * (at.V_WIDTH + 1) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
+
     def find(self, key: int) -> int:
         """Index of the variable `key`, or −1."""
         return int(find_variable(key, self.table, self.keys))

@@ -45,6 +45,10 @@ class Incremental:
         """Whether there is an undamped R of the present Λ."""
         return self._have is not Where.NOWHERE
 
+    def memory_bytes(self) -> int:
+        """Bytes of R, in fronts and in block rows."""
+        return self.elimination.memory_bytes() + self.rows.memory_bytes()
+
     def fold(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
         """R and d follow what came after `since`, which Λ and η hold already; or R is given up."""
         if not self.have_r:

@@ -12,11 +12,13 @@ class Mode:
     updates      R and d follow Λ and η by updates; else every step that solves factorises anew
     batch_every  new variables after which the whole system is solved anew, and only then is the linearisation point
                  moved: between batches the estimate is that of the linear problem; 0: whenever a step needs it
+    tree         the tree of cliques, MATH §9
     """
 
     name: str
     updates: bool
     batch_every: int = 0
+    tree: bool = False
 
 
 MODE_OF_NAME = {
@@ -26,6 +28,7 @@ MODE_OF_NAME = {
         Mode("inc-l-b10", updates=True, batch_every=10),
         Mode("inc-l-b100", updates=True, batch_every=100),
         Mode("all-batch", updates=False),
+        Mode("tree", updates=True, tree=True),
     )
 }
 AUTO = "inc-l"

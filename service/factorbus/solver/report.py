@@ -11,17 +11,20 @@ class StepReport:
 
     mode         the solver's mode
     strategy     "extend": the gradient was zero, there was nothing to solve; "omega", "lambda", "full": how R was
-                 brought up to date in the incremental modes (MATH §8); "all-batch": all was factorised, in that mode
+                 brought up to date in the incremental modes (MATH §8); "all-batch": all was factorised, in that mode;
+                 "tree", "batch": part of R was made again, or all was solved by Gauss-Newton, in the mode "tree"
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
-    chi2, chi2_before        Σ rᵀ Ω r of all factors after and before solving (the new factors included in both)
+    chi2, chi2_before        Σ rᵀ Ω r of all factors after and before solving (the new factors included in both); in the
+                 mode "tree" χ² of the linear problem at its solution, after solving, except after a batch
     new_variables, new_factors   taken in by this step
     changed      variables whose values differ from before, the new ones included
     relinearised linearisation points that were moved, counted once per iteration
     eliminated   variables eliminated, counted once per factorisation
     nnz_r, flops of one factorisation; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
     converged    the next iteration would not have lowered χ² by more than the tolerance
-    phases_ms    milliseconds by phase;  step_ms: the whole step
+    phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
+                 where that does the work (mode "tree"), else None
     """
 
     mode: str
@@ -41,11 +44,15 @@ class StepReport:
     converged: bool = True
     phases_ms: dict[str, float] = field(default_factory=dict)
     step_ms: float = 0.0
+    compiled_ms: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
         # By hand: asdict copies deeply and costs 50 µs, a third of a small step.
-        return {name: getattr(self, name) for name in self.__slots__} | {"phases_ms": dict(self.phases_ms)}
+        told = {name: getattr(self, name) for name in self.__slots__} | {"phases_ms": dict(self.phases_ms)}
+        if self.compiled_ms is None:
+            del told["compiled_ms"]
+        return told
 
 
 class Stopwatch:

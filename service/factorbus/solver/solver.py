@@ -20,6 +20,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.strategy import Plan
 from factorbus.solver.system import System
+from factorbus.solver.tree_steps import TreeSteps
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
@@ -53,6 +54,7 @@ class Solver:
         self._graph = Graph()
         self._mode = mode_named(self._options.mode)
         self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
+        self._tree = TreeSteps(self._graph, self._options) if self._mode.tree else None
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
@@ -86,6 +88,8 @@ class Solver:
         Raises Underconstrained or NotFinite; what was staged since the last step is taken back then, and the solver is
         as it was after that step, bit for bit.
         """
+        if self._tree:
+            return self._tree.step(settle)
         watch = Stopwatch(self._options.clock)
         try:
             # 1. What is new goes to a good place; linearised there it is added to Λ and η.
@@ -115,11 +119,15 @@ class Solver:
 
     def changed(self) -> list[Group]:
         """The variables whose values have other bits than before the last step, new ones included, in the same form."""
-        return self._graph.variables(self._changed)
+        return self._graph.variables(self._tree.changed() if self._tree else self._changed)
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
-        return self._done.chi2
+        return self._tree.chi2() if self._tree else self._done.chi2
+
+    def memory_bytes(self) -> int:
+        """Bytes in use for the graph and for what solves it."""
+        return self._graph.memory_bytes() + (self._tree.tree if self._tree else self._system).memory_bytes()
 
     def graph(self) -> tuple[list[Group], list[FactorGroup]]:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids."""

@@ -126,6 +126,12 @@ class System:
         self._have_lambda, self.drifted = True, False
         self.factor.forget()
 
+    def memory_bytes(self) -> int:
+        """Bytes in use for Λ, η (both twice) and R."""
+        blocks, numbers = self.blocks.fill.tolist()
+        scalars = int(self.graph.counts[at.SCALARS])
+        return 8 * (3 * blocks + 2 * (numbers + scalars)) + self.factor.memory_bytes()
+
     def underconstrained(self, variable: int, missing: str = _FREE_DIRECTION) -> errors.Underconstrained:
         """The error that names `variable`, its factors, and what is missing."""
         return errors.Underconstrained(int(self.graph.keys[variable]), self.graph.factors_of(variable), missing)

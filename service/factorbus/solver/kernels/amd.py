@@ -25,18 +25,33 @@ def amd(dims: I64, rows: I64, cols: I64, group: I64) -> I64:
 
     in   dims (n,) > 0   rows, cols (m,): each pair once, loops ignored   group (n,) >= 0
     """
-    n, total, left = dims.size, 0, 0
+    n = dims.size
     begin, length, lists = _graph(n, rows, cols)
     used = begin[-1] + length[-1] if n > 0 else 0
-    length_at_first = length.copy()
-    weight, kind, elements, mark = dims.copy(), np.zeros(n, np.int64), np.zeros(n, np.int64), np.ones(n, np.int64)
+    degree = np.zeros(n, np.int64)
+    return eliminate(n, dims, begin, length, np.zeros(n, np.int64), np.zeros(n, np.int64), lists, used, degree, group)
+
+
+@part
+def eliminate(
+    n: int, dims: I64, begin: I64, length: I64, elements: I64, kind: I64, lists: I64, used: int, degree: I64, group: I64
+) -> I64:
+    """The order of the n nodes of a quotient graph that may have elements from the start; all arguments are used up.
+
+    dims, group (n,); begin, length, elements, kind and degree have entries for the nodes, then for the elements, which
+    have their kind, and their weight as degree.
+    """
+    total, left, room = 0, 0, begin.size
+    length_at_first = length[:n].copy()
+    weight, mark = np.ones(room, np.int64), np.ones(room, np.int64)
     dense = max(16.0, 10.0 * np.sqrt(n))
     for i in range(n):
+        weight[i] = dims[i]
         total += dims[i]
         if length[i] > dense:  # its place barely matters and its degree costs much: it becomes last of its group
             weight[i], kind[i] = 0, GONE
         left += weight[i]
-    degree = _first_degrees(begin, length, lists, weight)
+    _first_degrees(n, left, begin, length, elements, lists, weight, degree)
     next_member, last_member = np.full(n, NONE), np.arange(n)
     head, after, before = np.full(total + 1, NONE), np.full(n, NONE), np.full(n, NONE)
     bucket, chain, code = np.full(n, NONE), np.full(n, NONE), np.zeros(n, np.int64)
@@ -44,6 +59,8 @@ def amd(dims: I64, rows: I64, cols: I64, group: I64) -> I64:
     perm = np.empty(n, np.int64)
 
     placed, clock, widest = 0, np.int64(2), 0
+    for e in range(n, room):
+        widest = max(widest, degree[e])
     for g in range(member_from.size - 1):
         lowest, waiting = _open_group(members[member_from[g] : member_from[g + 1]], weight, degree, head, after, before)
         while waiting > 0:
@@ -167,12 +184,15 @@ def _graph(n: int, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
 
 
 @part
-def _first_degrees(begin: I64, length: I64, lists: I64, weight: I64) -> I64:
-    degree = np.zeros(begin.size, np.int64)
-    for i in range(begin.size):
+def _first_degrees(
+    n: int, left: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, degree: I64
+) -> None:
+    for i in range(n):
+        degree[i] = 0
         for p in range(begin[i], begin[i] + length[i]):
-            degree[i] += weight[lists[p]]
-    return degree
+            near = lists[p]
+            degree[i] += degree[near] - weight[i] if p < begin[i] + elements[i] else weight[near]
+        degree[i] = max(min(degree[i], left - weight[i]), 0)
 
 
 @part

@@ -35,7 +35,7 @@ def factor_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int, floo
         end = min(top + DEPTH, p)
         for i in range(top, end, TILE_ROWS):
             rows = min(TILE_ROWS, end - i)
-            _take_off(a, rows, r + i * ld, ld, r + top * ld, ld, i, i, p + m, padded(p) - p, i - top)
+            take_off(a, rows, r + i * ld, ld, r + top * ld, ld, i, i, p + m, padded(p) - p, i - top)
             failed = pivot_rows(a, rows, r + i * ld + i, ld, floors, k + i)
             if failed >= 0:
                 return i + failed
@@ -43,17 +43,17 @@ def factor_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int, floo
             first = i - (lead + i) % LANES
             solve_rows(a, rows, (padded(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, 0)
         for i in range(end, p, TILE_ROWS):
-            _take_off(a, min(TILE_ROWS, p - i), r + i * ld, ld, r + top * ld, ld, i, i, p + m, padded(p) - p, end - top)
+            take_off(a, min(TILE_ROWS, p - i), r + i * ld, ld, r + top * ld, ld, i, i, p + m, padded(p) - p, end - top)
         for left in range(0, m, WIDTH):
             right = min(left + WIDTH, m)
             for i in range(0, right, TILE_ROWS):
                 rows = min(TILE_ROWS, m - i)
-                _take_off(a, rows, u + i * ldu, ldu, r + top * ld + p, ld, i, max(i, left), right, 0, end - top)
+                take_off(a, rows, u + i * ldu, ldu, r + top * ld + p, ld, i, max(i, left), right, 0, end - top)
     return -1
 
 
 @inline_kernel
-def _take_off(
+def take_off(
     a: F64, rows: int, c: int, ldc: int, x: int, ld: int, i: int, first: int, last: int, lead: int, depth: int
 ) -> None:
     """Columns first .. last of `rows` rows at c (row i of a matrix) lose XᵀX, X of `depth` rows at x.

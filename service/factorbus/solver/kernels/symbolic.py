@@ -31,11 +31,11 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     label, dim = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         label[perm[k]], dim[k] = k, dims[perm[k]]
-    begin, earlier = _by_later(n, label, rows, cols)
-    parent = _tree(n, begin, earlier)
-    variables, scalars = _counts(n, begin, earlier, parent, dim)
-    top_of, pivots = _join(n, parent, dim, scalars)
-    order, home, tops, front_of = _arrange(n, perm, parent, top_of)
+    begin, earlier = by_later(n, label, rows, cols)
+    parent = elimination_tree(n, begin, earlier)
+    variables, scalars = count_rows(n, begin, earlier, parent, dim)
+    top_of, pivots = join_columns(n, parent, dim, scalars)
+    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
     work = _work(n, dim, scalars)
 
     first_scalar = np.empty(n + 1, np.int64)
@@ -43,10 +43,10 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     for k in range(n):
         label[order[k]], dim[k] = k, dims[order[k]]
         first_scalar[k + 1] = first_scalar[k] + dim[k]
-    records = _records(tops, home, parent, front_of, pivots, scalars, first_scalar)
+    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
     sizes = _place(records)
-    begin, earlier = _by_later(n, label, rows, cols)
-    border_at, border_of = _borders(n, begin, earlier, home, tops, variables, records)
+    begin, earlier = by_later(n, label, rows, cols)
+    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
     border = _border_scalars(records, border_at, border_of, dim, first_scalar)
     runs, blocks = _maps(label, rows, cols, dim, first_scalar, border_at, border_of, records)
     place = np.empty(n, np.int64)
@@ -56,7 +56,7 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
 
 
 @part
-def _by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
+def by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
     """Off-diagonal blocks sorted by the end that is eliminated later; gives the other ends."""
     begin = np.zeros(n + 2, np.int64)
     for b in range(rows.size):
@@ -74,7 +74,7 @@ def _by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
 
 
 @part
-def _tree(n: int, begin: I64, earlier: I64) -> I64:
+def elimination_tree(n: int, begin: I64, earlier: I64) -> I64:
     """The elimination tree: parent[k] is the first off-diagonal entry in row k of R."""
     parent, ancestor = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
@@ -90,7 +90,7 @@ def _tree(n: int, begin: I64, earlier: I64) -> I64:
 
 
 @part
-def _counts(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I64, I64]:
+def count_rows(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I64, I64]:
     """Off-diagonal variables and scalars in row k of R."""
     variables, scalars, seen = np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
@@ -106,7 +106,7 @@ def _counts(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I6
 
 
 @part
-def _join(n: int, parent: I64, dim: I64, border: I64) -> tuple[I64, I64]:
+def join_columns(n: int, parent: I64, dim: I64, border: I64) -> tuple[I64, I64]:
     """Join columns into fronts: the last column of each column's front, and the pivot scalars of that front."""
     into, pivots, entries = np.empty(n, np.int64), dim.copy(), np.empty(n, np.int64)
     for k in range(n):
@@ -138,7 +138,7 @@ def _top(into: I64, k: int) -> int:
 
 
 @part
-def _arrange(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64, I64]:
+def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64, I64]:
     """Number the fronts in postorder, their columns one after another.
 
     order (n,): the variables so   home (n,): the front of each   tops: the old last column of each front
@@ -187,7 +187,7 @@ def _work(n: int, dim: I64, border: I64) -> F64:
 
 
 @part
-def _records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, border: I64, first_scalar: I64) -> I64:
+def make_records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, border: I64, first_scalar: I64) -> I64:
     """The front records without places and maps."""
     records = np.zeros((tops.size, fr.FRONT), np.int64)
     for k in range(home.size - 1, -1, -1):
@@ -235,7 +235,9 @@ def _place(records: I64) -> I64:
 
 
 @part
-def _borders(n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: I64, records: I64) -> tuple[I64, I64]:
+def list_borders(
+    n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: I64, records: I64
+) -> tuple[I64, I64]:
     """The border variables of each front, ascending: walk the tree of fronts from every entry of every row."""
     fronts = tops.size
     at = np.zeros(fronts + 1, np.int64)

@@ -1,0 +1,74 @@
+"""How far a factor is bent between its linearisation point and the estimate.  MATH §9.6.
+
+What a pose i sees of j at a distance d is u = Rᵢᵀ (tⱼ − tᵢ), and between factors and sightings are linear in it.  With
+a turn of i by φ, and shifts sᵢ and sⱼ in the map's frame, the linear model misses of it, to second order,
+
+    bend = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                                     (9.4)
+
+standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearisation point of i alone
+makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range bend with the shift as well,
+
+    bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
+
+and there both ends have to move.
+"""
+
+import math
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, inline_kernel
+from factorbus.solver.kernels.simd import at as load
+
+
+@inline_kernel
+def turn_of(kind: int, delta: F64, d: int) -> float:
+    """The angle by which δ at offset d turns a pose; 0 of a point."""
+    if kind == at.SE2:
+        return abs(load(delta, d + 2))
+    if kind == at.SE3:
+        a, b, c = load(delta, d + 3), load(delta, d + 4), load(delta, d + 5)
+        return math.sqrt(a * a + b * b + c * c)
+    return 0.0
+
+
+@inline_kernel
+def shift_between(planar: bool, x: int, y: int, values: F64, lin: F64) -> float:
+    """|sⱼ − sᵢ| of the values at offsets x and y."""
+    total = 0.0
+    for a in range(2 if planar else 3):
+        gap = load(values, y + a) - load(lin, y + a) - (load(values, x + a) - load(lin, x + a))
+        total += gap * gap
+    return math.sqrt(total)
+
+
+@inline_kernel
+def bend_of(kind: int, root: float, d: float, phi: float, shift: float) -> float:
+    """(9.4)"""
+    bend = root * (0.5 * d * phi * phi + phi * shift)
+    if kind == at.BEARING_RANGE_SE2 and d > 0.0:
+        bend += root * shift * shift / d
+    return bend
+
+
+@inline_kernel
+def lever_of(kind: int, p: F64, k: int) -> float:
+    """d: the distance at which a factor sees something; its measurement is at offset k of the payload."""
+    if kind == at.BETWEEN_SE2 or kind == at.LANDMARK_SE2:
+        return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1])
+    if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
+        return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1] + p[k + 2] * p[k + 2])
+    if kind == at.BEARING_RANGE_SE2:
+        return p[k + 1]
+    return 0.0
+
+
+@inline_kernel
+def root_weight(kind: int, w: F64, d: float) -> float:
+    """√ω of (9.4); 0 of a prior, which is as good as linear."""
+    if kind == at.BEARING_RANGE_SE2:
+        return math.sqrt(w[1, 1]) + math.sqrt(w[0, 0]) / d
+    if kind == at.BETWEEN_SE2 or kind == at.LANDMARK_SE2:
+        return math.sqrt(max(w[0, 0], w[1, 1]))
+    if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
+        return math.sqrt(max(w[0, 0], w[1, 1], w[2, 2]))
+    return 0.0

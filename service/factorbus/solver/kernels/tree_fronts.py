@@ -1,0 +1,141 @@
+"""Fronts for affected variables, with their place in memory.  MATH §9.4."""
+
+import numpy as np
+
+from factorbus.solver.kernels import fronts as fr
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.symbolic import (
+    arrange_fronts,
+    by_later,
+    count_rows,
+    elimination_tree,
+    join_columns,
+    list_borders,
+    make_records,
+)
+from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_store import (
+    give_clique,
+    give_list,
+    give_numbers,
+    size_class,
+    take_clique,
+    take_list,
+    take_numbers,
+)
+
+
+@part
+def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols: I64) -> tuple:
+    """The fronts of n affected variables eliminated in the order perm, or in one with the same fill.
+
+    out  order (n,): local indices as eliminated   place (n,): the inverse   home (n,): the front of each place
+         records: see `fronts`   border_at, border_of: places of each front's border, ascending
+    """
+    label, dim = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        label[perm[k]], dim[k] = k, dim_of_variable(var, affected[perm[k]])
+    begin, earlier = by_later(n, label, rows, cols)
+    parent = elimination_tree(n, begin, earlier)
+    variables, scalars = count_rows(n, begin, earlier, parent, dim)
+    top_of, pivots = join_columns(n, parent, dim, scalars)
+    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
+    first_scalar = np.empty(n + 1, np.int64)
+    first_scalar[0] = 0
+    for k in range(n):
+        label[order[k]] = k
+        first_scalar[k + 1] = first_scalar[k] + dim_of_variable(var, affected[order[k]])
+    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
+    begin, earlier = by_later(n, label, rows, cols)
+    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
+    return order, label, home, records, border_at, border_of
+
+
+@inline_kernel
+def row_layout(p: int, m: int) -> tuple:
+    """(offset of the rows in their block, stride, offset of the used δ, size of the block)."""
+    lead = fr.padded(p) - p
+    stride = fr.row_stride(fr.padded(p) + m + 1)
+    used = p * stride + fr.LANES
+    return lead, stride, used, used + p + m
+
+
+@inline_kernel
+def update_layout(m: int) -> tuple:
+    """(stride, size) of an update matrix."""
+    stride = fr.row_stride(m + 1)
+    return stride, (m + 1) * stride + fr.LANES
+
+
+@part
+def place_fronts(
+    records: I64, order: I64, affected: I64, border_at: I64, border_of: I64,
+    clique: I64, lists: I64, numbers: F64, state: I64,
+) -> tuple:  # fmt: skip
+    """A record, a list and blocks for every front; gives (ids, whether there was room).  Without it none is taken."""
+    count = len(records)
+    ids, n = np.empty(count, np.int64), order.size
+    if not has_room(records, border_at, n, clique, lists, numbers, state):
+        return ids, False
+    for f in range(count):
+        c = take_clique(clique, state)
+        ids[f] = c
+        p, m = records[f, fr.PIVOTS], records[f, fr.BORDER]
+        first = records[f, fr.VARIABLE]
+        last = records[f + 1, fr.VARIABLE] if f + 1 < count else n
+        row = clique[c]
+        row[tl.C_FRONTALS], row[tl.C_SEPARATORS] = last - first, border_at[f + 1] - border_at[f]
+        row[tl.C_PIVOTS], row[tl.C_BORDER] = p, m
+        start, row[tl.C_LIST_SIZE] = take_list(row[tl.C_FRONTALS] + row[tl.C_SEPARATORS], lists, state)
+        row[tl.C_LIST] = start
+        for k in range(first, last):
+            lists[start] = affected[order[k]]
+            start += 1
+        for e in range(border_at[f], border_at[f + 1]):
+            lists[start] = affected[order[border_of[e]]]
+            start += 1
+        lead, row[tl.C_LD], used, size = row_layout(p, m)
+        row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
+        row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used
+        row[tl.C_LDU], size = update_layout(m)
+        row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = take_numbers(size, numbers, state)
+        row[tl.C_PARENT] = row[tl.C_CHILD] = row[tl.C_NEXT] = -1
+        row[tl.C_ABOVE] = 0
+        row[tl.C_MARK], row[tl.C_FIRST] = state[tl.S_STAMP], -1
+    return ids, True
+
+
+@part
+def has_room(records: I64, border_at: I64, n: int, clique: I64, lists: I64, numbers: F64, state: I64) -> bool:
+    """Whether the arenas have room behind what is in use for all fronts; else `state` says what is needed."""
+    count, listed, doubles = len(records), 0, 0
+    for f in range(count):
+        p, m = records[f, fr.PIVOTS], records[f, fr.BORDER]
+        last = records[f + 1, fr.VARIABLE] if f + 1 < count else n
+        listed += size_class(last - records[f, fr.VARIABLE] + border_at[f + 1] - border_at[f])[1]
+        doubles += size_class(row_layout(p, m)[3])[1] + size_class(update_layout(m)[1])[1]
+    cliques = state[tl.S_CLIQUES] + count
+    listed += state[tl.S_LISTS]
+    doubles += state[tl.S_NUMBERS]
+    if cliques <= len(clique) and listed <= lists.size and doubles <= numbers.size:
+        return True
+    state[tl.S_NEED_CLIQUES], state[tl.S_NEED_LISTS], state[tl.S_NEED_NUMBERS] = cliques, listed, doubles
+    return False
+
+
+@part
+def give_back_fronts(ids: I64, clique: I64, lists: I64, numbers: F64, state: I64) -> None:
+    """Free the records of fronts, their lists and blocks."""
+    for f in range(ids.size - 1, -1, -1):
+        free_clique(ids[f], clique, lists, numbers, state)
+
+
+@inline_kernel
+def free_clique(c: int, clique: I64, lists: I64, numbers: F64, state: I64) -> None:
+    """Give back all that clique c has."""
+    row = clique[c]
+    give_numbers(row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], numbers, state)
+    give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
+    give_list(row[tl.C_LIST], row[tl.C_LIST_SIZE], lists, state)
+    give_clique(c, clique, state)

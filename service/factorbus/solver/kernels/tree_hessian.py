@@ -1,0 +1,113 @@
+"""The Hessian of a factor at its variables' linearisation points, kept until one of them moves.  MATH §9.2."""
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.linearise import evaluate, multiply
+from factorbus.solver.kernels.omega import information_at, residual_dim
+from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.tail import dim_of
+from factorbus.solver.kernels.tree_bend import lever_of, root_weight
+
+
+@inline_kernel
+def hessian_size(di: int, dj: int) -> int:
+    """Doubles that the Hessian of a factor takes; dj is 0 where there is no second variable."""
+    return di * di + di * dj + dj * dj + di + dj + 1
+
+
+@part
+def linearise_factor(
+    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, r: F64, H: F64, W: F64
+) -> None:
+    """Write the Hessian of factor f at the linearisation points.  r (6,), H (4, 6, 6), W (6, 6) are scratch."""
+    kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
+    p = fac[f, at.F_AT] + information_at(kind)
+    evaluate(f, var, fac, lin, payload, r, H[0], H[1])
+    # Sizes as constants, so that each call becomes straight code.
+    if kind == at.BETWEEN_SE2:
+        _write(3, 3, 3, p, payload, r, H, W, h, hessian)
+    elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
+        _write(2, 3, 2, p, payload, r, H, W, h, hessian)
+    elif kind == at.BETWEEN_SE3:
+        _write(6, 6, 6, p, payload, r, H, W, h, hessian)
+    elif kind == at.LANDMARK_SE3:
+        _write(3, 6, 3, p, payload, r, H, W, h, hessian)
+    else:
+        dim = residual_dim(kind)
+        _write(dim, dim, 0, p, payload, r, H, W, h, hessian)
+
+
+@inline_kernel
+def _write(dr: int, di: int, dj: int, p: int, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+    A, B, WA, WB = H[0], H[1], H[2], H[3]
+    for a in range(dr):
+        for b in range(a, dr):
+            W[a, b] = W[b, a] = payload[p]
+            p += 1
+    chi2 = 0.0
+    for a in range(dr):
+        e = 0.0
+        for b in range(dr):
+            e += W[a, b] * r[b]
+        chi2 += r[a] * e
+    multiply(dr, di, W, A, WA)
+    h = _product(dr, di, di, A, WA, h, out)
+    if dj > 0:
+        multiply(dr, dj, W, B, WB)
+        h = _product(dr, di, dj, A, WB, h, out)
+        h = _product(dr, dj, dj, B, WB, h, out)
+    h = _gradient(dr, di, WA, r, h, out)
+    if dj > 0:
+        h = _gradient(dr, dj, WB, r, h, out)
+    put(out, h, chi2)
+
+
+@inline_kernel
+def _product(dr: int, d: int, e: int, A: F64, WB: F64, h: int, out: F64) -> int:
+    """Aᵀ Ω B, row by row."""
+    for a in range(d):
+        for b in range(e):
+            total = 0.0
+            for k in range(dr):
+                total += A[k, a] * WB[k, b]
+            put(out, h + a * e + b, total)
+    return h + d * e
+
+
+@inline_kernel
+def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
+    """−Aᵀ Ω r."""
+    for a in range(d):
+        total = 0.0
+        for k in range(dr):
+            total += WA[k, a] * r[k]
+        put(out, h + a, -total)
+    return h + d
+
+
+@part
+def weigh_factor(
+    f: int, var: I64, fac: I64, payload: F64, link: I64, hessian: F64, scalars: F64, stiff: F64, lever: F64, W: F64
+) -> None:
+    """Add a factor that was just linearised to what measures δ: the diagonal sums, and how it bends.
+
+    W holds its information, as `linearise_factor` left it.
+    """
+    kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    di = dim_of(var[i, at.V_KIND])
+    dj = dim_of(var[j, at.V_KIND]) if j >= 0 else 0
+    s = var[i, at.V_SCALAR]
+    if s >= 0:
+        for a in range(di):
+            scalars[1, s + a] += hessian[h + a * di + a]
+    distance = lever_of(kind, payload, fac[f, at.F_AT])
+    root = root_weight(kind, W, distance)
+    lever[i] = max(lever[i], distance * root)
+    if j >= 0:
+        s = var[j, at.V_SCALAR]
+        if s >= 0:
+            for a in range(dj):
+                scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
+    stiff[f, 0], stiff[f, 1] = distance, root

@@ -1,0 +1,132 @@
+"""The tree of cliques: what its records hold and where its numbers lie.  MATH §9.
+
+A clique is a set of variables eliminated together (its frontals, F) given those they still depend on (its separator,
+S).  It keeps its rows of R, with d as the last column, and its update matrix U: what eliminating its subtree leaves on
+S, with a last column for the right-hand side and a corner for χ²,
+
+    rows   p × (p + m + 1):   [ R_F  R_S  d ]           U   (m + 1) × (m + 1):   [ Λ'_S  η'_S ; ·  χ²' ]
+
+p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
+
+The arenas of a tree are:
+    node    (n, 10) int64     one row per variable, by its index in the graph
+    link    (m, 8) int64     one row per factor, by its id
+    clique  (c, 20) int64    records of cliques
+    lists   int64            variables of cliques
+    numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
+    hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
+    stiff   (m, 2) float64   d and √ω of each factor, (9.4)
+    lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
+                             before the step, of what it changes
+    scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
+                             back to while variables are relinearised
+    lever   (n,) float64     the largest d √ω of what a variable sees
+    pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
+                             since they were looked at last
+    state   int64            counters and the heads of free lists
+    account (4,) float64     what a step found
+"""
+
+# Columns of `node`.
+N_CLIQUE = 0  # where it is a frontal; -1: nowhere yet, or fixed
+N_PLACE = 1  # its index in that clique's list
+N_OWN = 2  # first factor that is added where this variable is eliminated; -1: none
+N_ADJ = 3  # first incidence, 2 · factor + end; -1: none
+N_STAMP = 4  # the last elimination it took part in
+N_LOCAL = 5  # its index there
+N_SEEN = 6  # the last step that brought a factor of it
+N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
+N_MOVED = 8  # the last step that changed its estimate
+N_LISTED = 9  # 1: it is in `moved`
+N_WIDTH = 10
+
+# Columns of `link`.
+L_OWN = 0  # next factor added at the same variable
+L_I = 1  # next incidence of the first variable
+L_J = 2  # next incidence of the second one
+L_AT = 3  # where its Hessian starts
+L_STAMP = 4  # the last sweep that linearised it
+L_KIND = 5  # as in the graph, so that one cache line has all
+L_FAR = 6  # the second variable's place in the graph's values; -1: none
+L_SECOND = 7  # the second variable; -1: none
+L_WIDTH = 8
+
+# Columns of `clique`.
+C_LIST = 0
+C_FRONTALS = 1  # variables
+C_SEPARATORS = 2  # variables
+C_PIVOTS = 3  # p
+C_BORDER = 4  # m
+C_ROWS = 5  # column j of row i of R is at ROWS + i · LD + j
+C_LD = 6
+C_UPDATE = 7  # column j of row i of U is at UPDATE + i · LDU + j
+C_LDU = 8
+C_PARENT = 9  # -1: a root
+C_CHILD = 10
+C_NEXT = 11  # next child of the same parent; next free record
+C_ABOVE = 12  # place in the parent's list of the first separator variable to be eliminated
+C_MARK = 13  # the last elimination that touched it
+C_FIRST = 14  # the first place touched then
+C_USED = 15  # where the separator's δ is that the frontals were solved with last, m doubles
+C_BLOCK = 16  # the block that holds rows and used δ, and its size
+C_BLOCK_SIZE = 17
+C_UPDATE_BLOCK_SIZE = 18
+C_LIST_SIZE = 19
+C_WIDTH = 20
+
+# Entries of `state`.
+S_STAMP = 0  # of the present elimination
+S_STEP = 1
+S_CLIQUES = 2  # records ever used
+S_FREE_CLIQUE = 3  # first free record; -1: none
+S_LISTS = 4  # end of `lists` in use
+S_NUMBERS = 5  # end of `numbers` in use
+S_HESSIAN = 6
+S_VARIABLES = 7  # of the graph, taken in
+S_FACTORS = 8
+S_PENDING = 9  # variables that wait to be relinearised
+S_ALIVE = 10  # cliques
+S_NONZEROS = 11  # of R, doubles of rows on and above the diagonal
+S_NEED_CLIQUES = 12  # what the last call lacked
+S_NEED_LISTS = 13
+S_NEED_NUMBERS = 14
+S_ELIMINATED = 15  # the account of the last step: variables eliminated,
+S_RELINEARISED = 16  # linearisation points moved,
+S_SOLVED = 17  # cliques solved again
+S_CHANGED = 18  # variables whose estimate changed
+S_FLOPS = 19
+S_FAILED = 20  # variable whose pivot failed, or -1
+S_ROOTS = 28
+S_ROUNDS = 22  # eliminations in the last step
+S_TAKEN = 23  # factors that are in the tree: S_FACTORS but for those of a step under way
+S_SWEEP = 24  # counts relinearisations
+S_FIRST_NEW = 25  # variables that are in the tree: S_VARIABLES but for those of a step under way
+S_MOVED = 27  # variables in `moved`
+S_WAIT = 26  # 1: the step under way relinearises nothing, because that failed
+S_CYCLES = 32  # of the phases of the last step, PHASES of them
+S_FREE = 48  # heads of free lists: numbers, then lists
+CLASSES = 256
+S_SIZE = S_FREE + 2 * CLASSES
+
+# What a step comes to.
+DONE, NO_ROOM, FAILED = 0, 1, 2
+
+# Settings of a step.
+P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again
+P_BENT = 1  # what is bent by more is relinearised in the next step
+P_BENT_NOW = 2  # or at once
+P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
+P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
+P_EVERY = 5  # so many steps apart it is looked for what is bent
+P_SIZE = 6
+
+# The phases of a step, in the order of `tree_step`.
+PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")
+LINEARISE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
+
+# Entries of `account`.
+A_CHI2 = 0  # χ² of the linear problem at its solution
+A_BEND = 1  # the largest bend of what moved, units of (9.6)
+A_CONSTANT = 2  # χ² of factors between fixed variables
+A_TURN = 3  # the largest ½ d √ω φ² of what moved, σ
+A_SIZE = 4

@@ -1,0 +1,361 @@
+"""Eliminating the affected variables: fronts from the leaves to the roots.  MATH §9.5.
+
+A front takes in the factors that its pivots own and the update matrices of its children, which may be fronts of this
+step or orphans of earlier ones, whose separators may now be eliminated in another order than their columns have.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels import fronts as fr
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.dense import PIVOT_TOLERANCE, factor_front, take_off
+from factorbus.solver.kernels.multifrontal import clear_front
+from factorbus.solver.kernels.simd import TILE_ROWS, add_run, put, zero
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.tree_fronts import update_layout
+from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
+from factorbus.solver.kernels.tree_store import give_numbers, size_class, take_numbers
+
+
+@part
+def eliminate_fronts(
+    ids: I64, records: I64, order: I64, affected: I64, home: I64, place: I64, factors: I64, orphans: I64, lowest: I64,
+    update: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
+    scalars: F64, state: I64,
+) -> int:  # fmt: skip
+    """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
+
+    update (orphans, 2): where the update matrix of each orphan is, and its stride
+    """
+    count, n, stamp = ids.size, order.size, state[tl.S_STAMP]
+    first_factor, factor_of = _by_front(count, factors, home, place, var, fac, node)
+    orphan_of = np.full(count, -1)
+    after = np.empty(orphans.size, np.int64)
+    for e in range(orphans.size - 1, -1, -1):
+        f = home[place[lowest[e]]]
+        after[e], orphan_of[f] = orphan_of[f], e
+    column = np.empty(n, np.int64)
+    widest, most = 0, 0
+    for f in range(count):
+        widest = max(widest, records[f, fr.PIVOTS])
+        most = max(most, clique[ids[f], tl.C_SEPARATORS])
+    for e in range(orphans.size):
+        first, end = separators_of(orphans[e], stamp, clique)
+        most = max(most, end - first)
+    floors, runs = np.empty(widest), np.empty((most + 1, fr.RUN), np.int64)
+    flops = 0
+    for f in range(count):
+        row = clique[ids[f]]
+        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+        width, start = 0, row[tl.C_LIST]
+        for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+            v = lists[s]
+            column[node[v, tl.N_LOCAL]] = width
+            dim = dim_of_variable(var, v)
+            if width < p:
+                d = var[v, at.V_SCALAR]
+                for a in range(dim):
+                    floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
+            width += dim
+        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
+        for q in range(first_factor[f], first_factor[f + 1]):
+            add_hessian(factor_of[q], row, column, var, fac, node, link, hessian, numbers)
+        child = records[f, fr.CHILD]
+        while child >= 0:
+            other = clique[ids[child]]
+            start = other[tl.C_LIST] + other[tl.C_FRONTALS]
+            k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
+            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_LDU], runs, k, row)
+            child = records[child, fr.SIBLING]
+        e = orphan_of[f]
+        while e >= 0:
+            start = clique[orphans[e], tl.C_LIST]
+            first, end = separators_of(orphans[e], stamp, clique)
+            k = list_runs(start + first, start + end, column, p, m, var, node, lists, runs)
+            extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
+            e = after[e]
+        failed = factor_front(
+            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU], floors, 0
+        )
+        if failed >= 0:
+            return _variable_at(failed, row, var, lists)
+        flops += p * (p + m + 1) * (p + m + 1)
+    state[tl.S_FLOPS] += flops
+    return -1
+
+
+@part
+def _by_front(count: int, factors: I64, home: I64, place: I64, var: I64, fac: I64, node: I64) -> tuple[I64, I64]:
+    """The factors sorted by the front that takes them in."""
+    begin, front = np.zeros(count + 2, np.int64), np.empty(factors.size, np.int64)
+    for q in range(factors.size):
+        front[q] = home[first_end(factors[q], place, var, fac, node)]
+        begin[front[q] + 2] += 1
+    for f in range(count):
+        begin[f + 2] += begin[f + 1]
+    out = np.empty(factors.size, np.int64)
+    for q in range(factors.size):
+        out[begin[front[q] + 1]] = factors[q]
+        begin[front[q] + 1] += 1
+    return begin, out
+
+
+@inline_kernel
+def first_end(f: int, place: I64, var: I64, fac: I64, node: I64) -> int:
+    """The place in the order of the first end of factor f that is eliminated."""
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    if j < 0 or var[j, at.V_COLUMN] < 0:
+        return int(place[node[i, tl.N_LOCAL]])
+    if var[i, at.V_COLUMN] < 0:
+        return int(place[node[j, tl.N_LOCAL]])
+    return int(min(place[node[i, tl.N_LOCAL]], place[node[j, tl.N_LOCAL]]))
+
+
+@inline_kernel
+def _variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
+    """The frontal variable of a clique that has this pivot scalar."""
+    s = row[tl.C_LIST]
+    scalar -= dim_of_variable(var, lists[s])
+    while scalar >= 0:
+        s += 1
+        scalar -= dim_of_variable(var, lists[s])
+    return int(lists[s])
+
+
+@inline_kernel
+def row_of(c: int, row: I64) -> int:
+    """Where column 0 of the row of column c is, in the rows of R or in the update matrix."""
+    p = row[tl.C_PIVOTS]
+    if c < p:
+        return row[tl.C_ROWS] + c * row[tl.C_LD]
+    return row[tl.C_UPDATE] + (c - p) * row[tl.C_LDU] - p
+
+
+@part
+def add_hessian(
+    f: int, row: I64, column: I64, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
+) -> None:
+    """Add the Hessian of factor f, its gradient and its χ² to a front."""
+    i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
+    last = row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    di = dim_of_variable(var, i)
+    dj = dim_of_variable(var, j) if j >= 0 else 0
+    ci = column[node[i, tl.N_LOCAL]] if var[i, at.V_COLUMN] >= 0 else -1
+    cj = column[node[j, tl.N_LOCAL]] if j >= 0 and var[j, at.V_COLUMN] >= 0 else -1
+    g = h + di * di + di * dj + dj * dj
+    if ci >= 0:
+        _add_diagonal(di, ci, last, h, g, row, hessian, numbers)
+    if cj >= 0:
+        _add_diagonal(dj, cj, last, h + di * di + di * dj, g + di, row, hessian, numbers)
+    if ci >= 0 and cj >= 0:
+        h += di * di
+        if ci < cj:
+            for a in range(di):
+                target = row_of(ci + a, row) + cj
+                for b in range(dj):
+                    put(numbers, target + b, load(numbers, target + b) + load(hessian, h + a * dj + b))
+        else:
+            for b in range(dj):
+                target = row_of(cj + b, row) + ci
+                for a in range(di):
+                    put(numbers, target + a, load(numbers, target + a) + load(hessian, h + a * dj + b))
+    corner = row_of(last, row) + last
+    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+
+
+@inline_kernel
+def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: F64, numbers: F64) -> None:
+    for a in range(d):
+        target = row_of(c + a, row)
+        for b in range(a, d):
+            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
+        put(numbers, target + last, load(numbers, target + last) + load(hessian, g + a))
+
+
+@part
+def list_runs(start: int, end: int, column: I64, p: int, m: int, var: I64, node: I64, lists: I64, runs: I64) -> int:
+    """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
+
+    A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.
+    """
+    count, first, stop = 0, 0, -1
+    for s in range(start, end):
+        v = lists[s]
+        into, dim = column[node[v, tl.N_LOCAL]], dim_of_variable(var, v)
+        if into == stop and stop != p:
+            runs[count - 1, 1] += dim
+        else:
+            runs[count, 0], runs[count, 1], runs[count, 2] = first, dim, into
+            count += 1
+        stop = into + dim
+        first += dim
+    runs[count, 0], runs[count, 1], runs[count, 2] = first, 1, p + m
+    return count + 1
+
+
+@part
+def extend_add(a: F64, child: int, ld_child: int, runs: I64, count: int, row: I64) -> None:
+    """Add the update matrix at `child` into a front, run by run; a pair of runs in another order there is turned."""
+    for s in range(count):
+        first, length, into = runs[s, 0], runs[s, 1], runs[s, 2]
+        for i in range(length):
+            source, target = child + (first + i) * ld_child, row_of(into + i, row)
+            add_few(a, target + into + i, source + first + i, length - i)
+            for t in range(s + 1, count):
+                other = runs[t, 2]
+                if other > into:
+                    add_few(a, target + other, source + runs[t, 0], runs[t, 1])
+                else:
+                    for j in range(runs[t, 1]):
+                        turned = row_of(other + j, row) + into + i
+                        put(a, turned, load(a, turned) + load(a, source + runs[t, 0] + j))
+
+
+@inline_kernel
+def add_few(a: F64, i: int, j: int, count: int) -> None:
+    """a[i : i+count] += a[j : j+count]; short runs without a call."""
+    if count >= 16:
+        add_run(a, i, j, count)
+    else:
+        for k in range(count):
+            put(a, i + k, load(a, i + k) + load(a, j + k))
+
+
+@part
+def update_orphans(
+    orphans: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
+    state: I64, column: I64, update: I64,
+) -> bool:  # fmt: skip
+    """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
+
+    update (orphans, 3): its place, its stride, and the size of its block where it was made here (else 0)
+    """
+    stamp, need = state[tl.S_STAMP], state[tl.S_NUMBERS]
+    for e in range(orphans.size):
+        c = orphans[e]
+        update[e, 0], update[e, 1], update[e, 2] = clique[c, tl.C_UPDATE], clique[c, tl.C_LDU], 0
+        if clique[c, tl.C_MARK] == stamp:
+            need += size_class(update_layout(split_sizes(c, var, clique, lists)[1])[1])[1]
+    if need > numbers.size:
+        state[tl.S_NEED_NUMBERS] = need
+        return False
+    for e in range(orphans.size):
+        c = orphans[e]
+        if clique[c, tl.C_MARK] == stamp:
+            p, m = split_sizes(c, var, clique, lists)
+            ldu, size = update_layout(m)
+            u, size = take_numbers(size, numbers, state)
+            update[e, 0], update[e, 1], update[e, 2] = u, ldu, size
+            split_update(c, p, m, u, ldu, column, var, fac, node, link, clique, lists, numbers, hessian)
+    return True
+
+
+@part
+def give_back_updates(update: I64, numbers: F64, state: I64) -> None:
+    """Free what `update_orphans` made."""
+    for e in range(len(update)):
+        if update[e, 2] > 0:
+            give_numbers(update[e, 0], update[e, 2], numbers, state)
+
+
+@inline_kernel
+def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
+    """(p, m) of what is kept of a clique that is split."""
+    p, start = 0, clique[c, tl.C_LIST]
+    for s in range(start, start + clique[c, tl.C_FIRST]):
+        p += dim_of_variable(var, lists[s])
+    return p, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER] - p
+
+
+@part
+def split_update(
+    c: int, p: int, m: int, u: int, ldu: int, column: I64,
+    var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
+) -> None:  # fmt: skip
+    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)
+
+    column: scratch, one entry per variable
+    """
+    row = clique[c]
+    start, kept = row[tl.C_LIST], row[tl.C_FIRST]
+    width = 0
+    for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        column[lists[s]] = width - p
+        width += dim_of_variable(var, lists[s])
+    zero(numbers, u, (m + 1) * ldu)
+    for s in range(start, start + kept):
+        f = node[lists[s], tl.N_OWN]
+        while f >= 0:
+            _add_far_end(f, lists[s], m, u, ldu, column, var, fac, link, hessian, numbers)
+            f = link[f, tl.L_OWN]
+    child = row[tl.C_CHILD]
+    while child >= 0:
+        if clique[child, tl.C_ABOVE] < kept:
+            _add_child(child, m, u, ldu, column, var, clique, lists, numbers)
+        child = clique[child, tl.C_NEXT]
+    for i in range(0, m + 1, TILE_ROWS):
+        rows = min(TILE_ROWS, m + 1 - i)
+        take_off(numbers, rows, u + i * ldu, ldu, row[tl.C_ROWS] + p, row[tl.C_LD], i, i, m + 1, 0, p)
+
+
+@inline_kernel
+def _add_far_end(
+    f: int, v: int, m: int, u: int, ldu: int, column: I64, var: I64, fac: I64, link: I64, hessian: F64, numbers: F64
+) -> None:
+    """What a factor owned by v adds to its other end, if that is not kept, and to the corner."""
+    i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
+    di = dim_of_variable(var, i)
+    dj = dim_of_variable(var, j) if j >= 0 else 0
+    g = h + di * di + di * dj + dj * dj
+    corner = u + m * ldu + m
+    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+    other = j if i == v else i
+    if other < 0 or var[other, at.V_COLUMN] < 0 or column[other] < 0:
+        return
+    c, d = column[other], dj if i == v else di
+    if i == v:
+        h += di * di + di * dj
+        g += di
+    for a in range(d):
+        target = u + (c + a) * ldu
+        for b in range(a, d):
+            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
+        put(numbers, target + m, load(numbers, target + m) + load(hessian, g + a))
+
+
+@inline_kernel
+def _add_child(
+    child: int, m: int, u: int, ldu: int, column: I64, var: I64, clique: I64, lists: I64, numbers: F64
+) -> None:
+    """Add what a child's update matrix has in the columns of the separator and the right-hand side."""
+    start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
+    end, source, stride = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_UPDATE], clique[child, tl.C_LDU]
+    last = clique[child, tl.C_BORDER]
+    x = 0
+    for s in range(start, end):
+        v = lists[s]
+        dim, into = dim_of_variable(var, v), column[v]
+        if into >= 0:
+            for a in range(dim):
+                line, target = source + (x + a) * stride, u + (into + a) * ldu
+                for b in range(a, dim):
+                    put(numbers, target + into + b, load(numbers, target + into + b) + load(numbers, line + x + b))
+                put(numbers, target + m, load(numbers, target + m) + load(numbers, line + last))
+            y = x + dim
+            for t in range(s + 1, end):
+                w = lists[t]
+                wide, across = dim_of_variable(var, w), column[w]
+                if across >= 0:
+                    for a in range(dim):
+                        line = source + (x + a) * stride + y
+                        for b in range(wide):
+                            target = u + (into + a) * ldu + across + b
+                            if across < into:
+                                target = u + (across + b) * ldu + into + a
+                            put(numbers, target, load(numbers, target) + load(numbers, line + b))
+                y += wide
+        x += dim
+    corner = u + m * ldu + m
+    put(numbers, corner, load(numbers, corner) + load(numbers, source + last * stride + last))

@@ -1,0 +1,114 @@
+"""The order in which affected variables are eliminated again, and the fronts that follow.  MATH §9.4.
+
+Affected variables are the nodes of a quotient graph, what hangs from them its elements: an orphan joins its separator
+as if it had just been eliminated.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import I64, inline_kernel, part
+from factorbus.solver.kernels.amd import ELEMENT, eliminate
+from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
+
+
+@part
+def order_affected(
+    n: int, affected: I64, factors: I64, orphans: I64, recent: int,
+    var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64,
+) -> I64:  # fmt: skip
+    """perm (n,): affected[perm[k]] is eliminated k-th.  Variables with a factor in the last `recent` steps go last."""
+    dims, group = np.empty(n, np.int64), np.zeros(n, np.int64)
+    since = state[tl.S_STEP] - recent
+    for k in range(n):
+        v = affected[k]
+        dims[k] = dim_of_variable(var, v)
+        if node[v, tl.N_SEEN] > since:
+            group[k] = 1
+    stamp, m = state[tl.S_STAMP], orphans.size
+    length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
+    for e in range(m):
+        start = clique[orphans[e], tl.C_LIST]
+        first, end = separators_of(orphans[e], stamp, clique)
+        length[n + e] = end - first
+        for s in range(start + first, start + end):
+            k = node[lists[s], tl.N_LOCAL]
+            degree[n + e] += dims[k]
+            elements[k] += 1
+            length[k] += 1
+    for q in range(factors.size):
+        i, j = _ends(factors[q], var, fac, node)
+        if j >= 0:
+            length[i] += 1
+            length[j] += 1
+    begin, total = np.empty(n + m, np.int64), 0
+    for k in range(n + m):
+        begin[k] = total
+        total += length[k]
+    near, kind = np.empty(total + total // 2 + 4 * n, np.int64), np.zeros(n + m, np.int64)
+    put, put_element = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        put_element[k], put[k] = begin[k], begin[k] + elements[k]
+    for e in range(m):
+        kind[n + e] = ELEMENT
+        start, at_element = clique[orphans[e], tl.C_LIST], begin[n + e]
+        first, end = separators_of(orphans[e], stamp, clique)
+        for s in range(start + first, start + end):
+            k = node[lists[s], tl.N_LOCAL]
+            near[at_element] = k
+            near[put_element[k]] = n + e
+            at_element += 1
+            put_element[k] += 1
+    for q in range(factors.size):
+        i, j = _ends(factors[q], var, fac, node)
+        if j >= 0:
+            near[put[i]], near[put[j]] = j, i
+            put[i] += 1
+            put[j] += 1
+    return eliminate(n, dims, begin, length, elements, kind, near, total, degree, group)
+
+
+@part
+def list_pairs(
+    n: int, label: I64, factors: I64, orphans: I64, var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64
+) -> tuple[I64, I64, I64]:
+    """Pairs (rows, cols) that have the same fill as factors and orphans; and each orphan's first variable to go.
+
+    label (n,): the place in the order.  An orphan joins the first variable of its separator to the others.
+    """
+    stamp, count = state[tl.S_STAMP], 0
+    for e in range(orphans.size):
+        first, end = separators_of(orphans[e], stamp, clique)
+        count += end - first
+    rows, cols, put = np.empty(count + factors.size, np.int64), np.empty(count + factors.size, np.int64), 0
+    lowest = np.empty(orphans.size, np.int64)
+    for q in range(factors.size):
+        i, j = _ends(factors[q], var, fac, node)
+        if j >= 0:
+            rows[put], cols[put] = i, j
+            put += 1
+    for e in range(orphans.size):
+        start = clique[orphans[e], tl.C_LIST]
+        first, end = separators_of(orphans[e], stamp, clique)
+        low = node[lists[start + first], tl.N_LOCAL]
+        for s in range(start + first + 1, start + end):
+            k = node[lists[s], tl.N_LOCAL]
+            if label[k] < label[low]:
+                low = k
+        lowest[e] = low
+        for s in range(start + first, start + end):
+            k = node[lists[s], tl.N_LOCAL]
+            if k != low:
+                rows[put], cols[put] = low, k
+                put += 1
+    return rows[:put], cols[:put], lowest
+
+
+@inline_kernel
+def _ends(f: int, var: I64, fac: I64, node: I64) -> tuple:
+    """Local indices of the two ends of a factor between free variables; (-1, -1) of any other."""
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    if j < 0 or var[i, at.V_COLUMN] < 0 or var[j, at.V_COLUMN] < 0:
+        return -1, -1
+    return node[i, tl.N_LOCAL], node[j, tl.N_LOCAL]

@@ -1,0 +1,68 @@
+"""Moving linearisation points of single variables to the estimate, and back.  MATH §9.6."""
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, part
+from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.tree_hessian import linearise_factor
+from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_take_in import next_incidence
+
+WAITS, MOVES = 1, 2
+
+
+@part
+def relinearise(
+    pending: I64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64,
+    scalars: F64, state: I64,
+) -> None:  # fmt: skip
+    """Move the pending variables to the estimate, and linearise their factors there."""
+    for k in range(pending.size):
+        v = pending[k]
+        if node[v, tl.N_FLAGS] != WAITS:
+            continue
+        x, d = var[v, at.V_AT], var[v, at.V_SCALAR]
+        for a in range(size_of(var[v, at.V_KIND])):
+            lin[1, x + a], lin[0, x + a] = lin[0, x + a], values[x + a]
+        for a in range(dim_of_variable(var, v)):
+            scalars[2, d + a], scalars[0, d + a] = scalars[0, d + a], 0.0
+        node[v, tl.N_FLAGS] = MOVES
+        state[tl.S_RELINEARISED] += 1
+    linearise_around(pending, var, fac, payload, node, link, hessian, lin, state)
+
+
+@part
+def go_back(
+    pending: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
+    state: I64,
+) -> None:  # fmt: skip
+    """Undo `relinearise`: its variables wait again."""
+    for k in range(pending.size):
+        v = pending[k]
+        x, d = var[v, at.V_AT], var[v, at.V_SCALAR]
+        for a in range(size_of(var[v, at.V_KIND])):
+            lin[0, x + a] = lin[1, x + a]
+        for a in range(dim_of_variable(var, v)):
+            scalars[0, d + a] = scalars[2, d + a]
+        node[v, tl.N_FLAGS] = WAITS
+        state[tl.S_RELINEARISED] -= 1
+    linearise_around(pending, var, fac, payload, node, link, hessian, lin, state)
+
+
+@part
+def linearise_around(
+    variables: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, state: I64
+) -> None:
+    """Linearise the factors of some variables, each once."""
+    r, H, W = np.zeros(6), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    state[tl.S_SWEEP] += 1
+    for k in range(variables.size):
+        slot = node[variables[k], tl.N_ADJ]
+        while slot >= 0:
+            f = slot // 2
+            if link[f, tl.L_STAMP] != state[tl.S_SWEEP]:
+                link[f, tl.L_STAMP] = state[tl.S_SWEEP]
+                linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W)
+            slot = next_incidence(slot, link)

@@ -1,0 +1,188 @@
+"""Back-substitution from the new roots down, as far as anything changes.  MATH §9.7.
+
+A clique that was there before is solved again only when its separator has moved by more than `ripple` standard
+deviations since the clique was solved last; so what is left undone never adds up over the steps.
+"""
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.points import move_point2, move_point3
+from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.se2 import move_se2
+from factorbus.solver.kernels.se3 import move_se3
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.tree_bend import bend_of, shift_between, turn_of
+from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_relinearise import WAITS
+from factorbus.solver.kernels.tree_take_in import next_incidence
+
+
+@part
+def substitute(
+    ids: I64, ripple: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, lin: F64, scalars: F64,
+    lever: F64, values: F64, changed: I64, moved: I64, state: I64, account: F64,
+) -> None:  # fmt: skip
+    """Solve the new cliques and whatever moves with them.
+
+    changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2]
+    gets what they were.  moved: gets them too, where they are not there yet
+    """
+    far, delta, weight = ripple * ripple, scalars[0], scalars[1]
+    for f in range(ids.size - 1, -1, -1):
+        if clique[ids[f], tl.C_PARENT] >= 0:
+            continue
+        c = ids[f]
+        while c >= 0:
+            row = clique[c]
+            gather_separator(row, var, lists, delta, numbers)
+            solve_rows(row, numbers)
+            row[tl.C_FIRST] = 0
+            state[tl.S_SOLVED] += 1
+            move_frontals(
+                row, var, node, lists, numbers, delta, lin[0], lin[2], lever, values, changed, moved, state, account
+            )
+            c = next_clique(row[tl.C_CHILD], c, far, var, clique, lists, numbers, delta, weight)
+
+
+@inline_kernel
+def next_clique(
+    child: int, above: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64
+) -> int:
+    """The next clique to solve, from `child` of clique `above` on, depth first; −1: none is left."""
+    while True:
+        while child >= 0:
+            row = clique[child]
+            if row[tl.C_FIRST] == -1 or has_moved(row, far, var, lists, numbers, delta, weight):
+                return child
+            child = row[tl.C_NEXT]
+        if clique[above, tl.C_PARENT] < 0:
+            return -1
+        child, above = clique[above, tl.C_NEXT], clique[above, tl.C_PARENT]
+
+
+@inline_kernel
+def has_moved(row: I64, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64) -> bool:
+    """Whether a scalar of the separator is further than √far σ from where the frontals were solved with it."""
+    start = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    used = row[tl.C_USED] + row[tl.C_PIVOTS]
+    for s in range(start, start + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        d = var[v, at.V_SCALAR]
+        for a in range(dim_of_variable(var, v)):
+            gap = load(delta, d + a) - load(numbers, used)
+            if gap * gap * load(weight, d + a) > far:
+                return True
+            used += 1
+    return False
+
+
+@inline_kernel
+def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -> None:
+    """δ_S behind the place of δ_F."""
+    start = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    x = row[tl.C_USED] + row[tl.C_PIVOTS]
+    for s in range(start, start + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        d = var[v, at.V_SCALAR]
+        for a in range(dim_of_variable(var, v)):
+            put(numbers, x, load(delta, d + a))
+            x += 1
+
+
+@inline_kernel
+def solve_rows(row: I64, numbers: F64) -> None:
+    """δ_F = R_F⁻¹ (d − R_S δ_S)"""
+    p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
+    width = p + row[tl.C_BORDER]
+    for i in range(p - 1, -1, -1):
+        line, total = row[tl.C_ROWS] + i * ld, 0.0
+        for k in range(i + 1, width):
+            total += load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, (load(numbers, line + width) - total) / load(numbers, line + i))
+
+
+@inline_kernel
+def move_frontals(
+    row: I64, var: I64, node: I64, lists: I64, numbers: F64, delta: F64, lin: F64, before: F64, lever: F64,
+    values: F64, changed: I64, moved: I64, state: I64, account: F64,
+) -> None:  # fmt: skip
+    """The estimate of the frontals whose δ is another one."""
+    start, solved, step = row[tl.C_LIST], row[tl.C_USED], state[tl.S_STEP]
+    for s in range(start, start + row[tl.C_FRONTALS]):
+        v = lists[s]
+        kind, d, differs = var[v, at.V_KIND], var[v, at.V_SCALAR], False
+        for a in range(dim_of_variable(var, v)):
+            differs |= load(delta, d + a) != load(numbers, solved)
+            put(delta, d + a, load(numbers, solved))
+            solved += 1
+        if differs:
+            x = var[v, at.V_AT]
+            if node[v, tl.N_MOVED] != step:
+                node[v, tl.N_MOVED] = step
+                changed[state[tl.S_CHANGED]] = v
+                state[tl.S_CHANGED] += 1
+                for a in range(size_of(kind)):
+                    put(before, x + a, load(values, x + a))
+            if node[v, tl.N_LISTED] == 0:
+                node[v, tl.N_LISTED] = 1
+                moved[state[tl.S_MOVED]] = v
+                state[tl.S_MOVED] += 1
+            move_to(kind, lin, x, delta, d, values)
+            phi = turn_of(kind, delta, d)
+            account[tl.A_TURN] = max(account[tl.A_TURN], 0.5 * lever[v] * phi * phi)
+
+
+@part
+def find_bent(
+    bent: float, var: I64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64, values: F64, pending: I64,
+    moved: I64, state: I64,
+) -> float:  # fmt: skip
+    """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
+    more than `bent`, (9.4).  Gives the largest bend, and empties `moved`.
+    """
+    most, delta = 0.0, scalars[0]
+    for k in range(state[tl.S_MOVED]):
+        v = moved[k]
+        node[v, tl.N_LISTED] = 0
+        phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
+        if phi == 0.0:
+            continue
+        planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
+        slot = node[v, tl.N_ADJ]
+        while slot >= 0:
+            f = slot // 2
+            if slot % 2 == 0 and link[f, tl.L_FAR] >= 0:
+                shift = shift_between(planar, x, link[f, tl.L_FAR], values, lin)
+                bend = bend_of(link[f, tl.L_KIND], stiff[f, 1], stiff[f, 0], phi, shift)
+                most = max(most, bend)
+                if bend > bent:
+                    await_move(v, node, pending, state)
+                    if link[f, tl.L_KIND] == at.BEARING_RANGE_SE2 and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
+                        await_move(link[f, tl.L_SECOND], node, pending, state)
+            slot = next_incidence(slot, link)
+    state[tl.S_MOVED] = 0
+    return most
+
+
+@inline_kernel
+def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
+    """Variable v is to be relinearised."""
+    if node[v, tl.N_FLAGS] == 0:
+        node[v, tl.N_FLAGS] = WAITS
+        pending[state[tl.S_PENDING]] = v
+        state[tl.S_PENDING] += 1
+
+
+@inline_kernel
+def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
+    """out = lin ⊞ δ."""
+    if kind == at.SE2:
+        move_se2(lin, x, delta, d, out)
+    elif kind == at.SE3:
+        move_se3(lin, x, delta, d, out)
+    elif kind == at.POINT2:
+        move_point2(lin, x, delta, d, out)
+    else:
+        move_point3(lin, x, delta, d, out)

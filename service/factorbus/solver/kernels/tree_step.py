@@ -1,0 +1,213 @@
+"""One step of the incremental solver, in one call.  MATH §9.
+
+1  take in        new variables and factors, linearised
+2  relinearise    variables whose factors have bent since they were linearised
+3  touch, detach  the cliques that these and the new factors change; what hangs from them are orphans
+4  order          the affected variables, constrained approximate minimum degree
+5  fronts         elimination tree, amalgamation, memory
+6  eliminate      front by front; orphans lend their update matrices
+7  commit         new cliques take the place of the old ones
+8  substitute     back down from the new roots, as far as anything changes
+9  again from 2   while something has bent so far that it cannot wait
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.cycles import cycles
+from factorbus.solver.kernels.tree_commit import add_constants, commit
+from factorbus.solver.kernels.tree_fronts import analyze_affected, give_back_fronts, place_fronts
+from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
+from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
+from factorbus.solver.kernels.tree_order import list_pairs, order_affected
+from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
+from factorbus.solver.kernels.tree_solve import find_bent, substitute
+from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
+
+FREE = 0
+LEAST_CHI2 = 1e-3
+
+
+@kernel(
+    "int64(int64, int64, int64, int64, float64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1],"
+    " int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], float64[::1], float64[:,::1],"
+    " float64[:,::1], float64[:,::1], float64[::1], int64[::1], int64[::1], int64[::1], float64[:,::1], int64[::1],"
+    " float64[::1])"
+)
+def tree_step(
+    v1: int, f1: int, recent: int, most_rounds: int, settings: F64, var: I64, fac: I64, values: F64, payload: F64,
+    node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64,
+    scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64, moved: I64, saved: F64, state: I64, account: F64,
+) -> int:  # fmt: skip
+    """Take in the variables up to v1 and the factors up to f1, and solve.
+
+    Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or FAILED: the
+    pivot of S_FAILED was not positive, and the tree is as it was before the step.
+    """
+    began = cycles()
+    unit = residual_unit(f1, account)
+    scaled = settings.copy()
+    scaled[tl.P_RIPPLE] *= unit
+    scaled[tl.P_BENT] *= unit
+    scaled[tl.P_BENT_NOW] *= unit
+    v0 = state[tl.S_FIRST_NEW]
+    take_in_variables(v1, var, values, node, lin, scalars, lever, state)
+    take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state)
+    wait = state[tl.S_WAIT] != 0
+    while True:
+        if not wait:
+            some = pending[: state[tl.S_PENDING]]
+            relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
+        lap(began, tl.LINEARISE, state)
+        bow, status = eliminate_again(
+            v0, v1, f1, recent, wait, scaled, var, fac, values, node, link, clique, lists, numbers, hessian, lin,
+            scalars, stiff, lever, pending, changed, moved, state, account,
+        )  # fmt: skip
+        if status == tl.NO_ROOM:
+            return tl.NO_ROOM
+        began = cycles()
+        if status == tl.FAILED:
+            relinearised = False
+            if not wait:
+                some = pending[: state[tl.S_PENDING]]
+                relinearised = some.size > 0
+                go_back(some, var, fac, payload, node, link, hessian, lin, scalars, state)
+            if state[tl.S_ROUNDS] > 0:
+                break
+            if relinearised:
+                wait = True
+                state[tl.S_WAIT] = 1
+                continue
+            take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
+            state[tl.S_WAIT] = 0
+            return tl.FAILED
+        account[tl.A_BEND] = max(account[tl.A_BEND], bow / unit)
+        v0 = v1
+        state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
+        state[tl.S_ROUNDS] += 1
+        if wait or not bow > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= most_rounds:
+            break
+    state[tl.S_WAIT] = 0
+    return tl.DONE
+
+
+@inline_kernel
+def residual_unit(factors: int, account: F64) -> float:
+    """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
+    return math.sqrt((max(account[tl.A_CHI2], 0.0) + LEAST_CHI2) / max(factors, 1))
+
+
+@part
+def eliminate_again(
+    v0: int, v1: int, f1: int, recent: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64,
+    node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64,
+    scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64, moved: I64, state: I64, account: F64,
+) -> tuple[float, int]:  # fmt: skip
+    """Steps 3 to 8; gives the largest bend of what moved, and the status."""
+    # 3
+    now = cycles()
+    state[tl.S_STAMP] += 1
+    marked, count = np.empty(state[tl.S_ALIVE], np.int64), 0
+    for f in range(state[tl.S_TAKEN], f1):
+        count = touch_ends(f, fac, node, clique, state, marked, count)
+    if not wait:
+        for k in range(state[tl.S_PENDING]):
+            slot = node[pending[k], tl.N_ADJ]
+            while slot >= 0:
+                count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
+                slot = next_incidence(slot, link)
+    marked = marked[:count]
+    room = v1 - v0
+    hanging = 0
+    for k in range(count):
+        room += clique[marked[k], tl.C_FRONTALS]
+        hanging += 1
+        child = clique[marked[k], tl.C_CHILD]
+        while child >= 0:
+            hanging += 1
+            child = clique[child, tl.C_NEXT]
+    affected, orphans = np.empty(room, np.int64), np.empty(hanging, np.int64)
+    n, hanging = detach(marked, settings, var, node, clique, lists, state, affected, orphans)
+    for v in range(v0, v1):
+        if var[v, at.V_COLUMN] >= 0:
+            node[v, tl.N_STAMP], node[v, tl.N_LOCAL] = state[tl.S_STAMP], n
+            affected[n] = v
+            n += 1
+    orphans = orphans[:hanging]
+    if n == 0:
+        add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
+        return 0.0, tl.DONE
+    factors = gather_factors(n, affected, state[tl.S_TAKEN], f1, node, link, fac, var)
+    now = lap(now, tl.MARK, state)
+    # 4
+    perm = order_affected(n, affected, factors, orphans, recent, var, fac, node, clique, lists, state)
+    label = np.empty(n, np.int64)
+    for k in range(n):
+        label[perm[k]] = k
+    now = lap(now, tl.ORDER, state)
+    # 5
+    rows, cols, lowest = list_pairs(n, label, factors, orphans, var, fac, node, clique, lists, state)
+    order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
+    update = np.empty((orphans.size, 3), np.int64)
+    column = np.empty(v1, np.int64)
+    if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, column, update):
+        return 0.0, tl.NO_ROOM
+    ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
+    if not placed:
+        give_back_updates(update, numbers, state)
+        return 0.0, tl.NO_ROOM
+    now = lap(now, tl.SYMBOLIC, state)
+    # 6
+    failed = eliminate_fronts(
+        ids, records, order, affected, home, place, factors, orphans, lowest, update, var, fac, node, link, clique,
+        lists, numbers, hessian, scalars, state,
+    )  # fmt: skip
+    if failed >= 0:
+        state[tl.S_FAILED] = failed
+        give_back_fronts(ids, clique, lists, numbers, state)
+        give_back_updates(update, numbers, state)
+        return 0.0, tl.FAILED
+    now = lap(now, tl.ELIMINATE, state)
+    # 7
+    commit(
+        marked, orphans, update, lowest, ids, records, order, place, home, border_at, border_of, affected, factors,
+        var, fac, node, link, clique, lists, numbers, state, account,
+    )  # fmt: skip
+    add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
+    if not wait:
+        for k in range(state[tl.S_PENDING]):
+            node[pending[k], tl.N_FLAGS] = FREE
+        state[tl.S_PENDING] = 0
+    now = lap(now, tl.COMMIT, state)
+    # 8
+    account[tl.A_TURN] = 0.0
+    substitute(
+        ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, lever, values, changed, moved,
+        state, account,
+    )  # fmt: skip
+    bow = 0.0
+    if state[tl.S_STEP] % settings[tl.P_EVERY] == 0 or account[tl.A_TURN] > settings[tl.P_BENT_NOW]:
+        bow = find_bent(settings[tl.P_BENT], var, node, link, stiff, lin[0], scalars, values, pending, moved, state)
+    lap(now, tl.SUBSTITUTE, state)
+    return bow, tl.DONE
+
+
+@inline_kernel
+def lap(since: int, phase: int, state: I64) -> int:
+    """What passed since is the phase's; gives the present count."""
+    now = cycles()
+    state[tl.S_CYCLES + phase] += now - since
+    return now
+
+
+@inline_kernel
+def touch_ends(f: int, fac: I64, node: I64, clique: I64, state: I64, marked: I64, count: int) -> int:
+    """Touch both variables of factor f."""
+    count = touch(fac[f, at.F_I], node, clique, state, marked, count)
+    if fac[f, at.F_J] >= 0:
+        count = touch(fac[f, at.F_J], node, clique, state, marked, count)
+    return count

@@ -1,0 +1,102 @@
+"""Taking new variables and factors into the tree's arenas, and out again when their step fails.  MATH §9.2."""
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.tree_hessian import hessian_size, linearise_factor, weigh_factor
+from factorbus.solver.kernels.tree_mark import dim_of_variable
+
+
+@part
+def take_in_variables(
+    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, lever: F64, state: I64
+) -> None:
+    """Variables up to v1 get a row each; they are linearised at their first values."""
+    for v in range(state[tl.S_VARIABLES], v1):
+        node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
+        node[v, tl.N_PLACE] = node[v, tl.N_LOCAL] = node[v, tl.N_FLAGS] = node[v, tl.N_LISTED] = 0
+        node[v, tl.N_STAMP], node[v, tl.N_SEEN], node[v, tl.N_MOVED] = -1, state[tl.S_STEP], -1
+        x = var[v, at.V_AT]
+        for a in range(size_of(var[v, at.V_KIND])):
+            lin[0, x + a] = values[x + a]
+        d = var[v, at.V_SCALAR]
+        if d >= 0:
+            for a in range(dim_of_variable(var, v)):
+                scalars[0, d + a] = scalars[1, d + a] = 0.0
+        lever[v] = 0.0
+    state[tl.S_VARIABLES] = v1
+
+
+@part
+def take_in_factors(
+    f1: int, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64, stiff: F64,
+    lever: F64, saved: F64, state: I64,
+) -> None:  # fmt: skip
+    """Factors up to f1 are linearised, and join the incidences of their variables.
+
+    saved (2 per factor, 8): what that changes of variables, for `take_out`
+    """
+    f0 = state[tl.S_FACTORS]
+    r, H, W = np.zeros(6), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    for f in range(f0, f1):
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
+        link[f, tl.L_KIND], link[f, tl.L_SECOND] = fac[f, at.F_KIND], j
+        link[f, tl.L_FAR] = var[j, at.V_AT] if j >= 0 else -1
+        link[f, tl.L_AT] = state[tl.S_HESSIAN]
+        state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W)
+        _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
+        if j >= 0:
+            _save(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
+        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, lever, W)
+        link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
+        node[i, tl.N_SEEN] = state[tl.S_STEP]
+        if j >= 0:
+            link[f, tl.L_J], node[j, tl.N_ADJ] = node[j, tl.N_ADJ], 2 * f + 1
+            node[j, tl.N_SEEN] = state[tl.S_STEP]
+    state[tl.S_FACTORS] = f1
+
+
+@part
+def take_out(
+    v0: int, f0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, lever: F64, saved: F64, state: I64
+) -> None:
+    """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
+    for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        if j >= 0:
+            node[j, tl.N_ADJ] = link[f, tl.L_J]
+            _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
+        node[i, tl.N_ADJ] = link[f, tl.L_I]
+        _restore(i, saved[2 * (f - f0)], var, node, scalars, lever)
+        state[tl.S_HESSIAN] = link[f, tl.L_AT]
+    state[tl.S_VARIABLES], state[tl.S_FACTORS] = v0, f0
+
+
+@inline_kernel
+def _save(v: int, out: F64, var: I64, node: I64, scalars: F64, lever: F64) -> None:
+    """What a factor is about to change of variable v."""
+    d = var[v, at.V_SCALAR]
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            out[a] = scalars[1, d + a]
+    out[6], out[7] = lever[v], node[v, tl.N_SEEN]
+
+
+@inline_kernel
+def _restore(v: int, kept: F64, var: I64, node: I64, scalars: F64, lever: F64) -> None:
+    d = var[v, at.V_SCALAR]
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            scalars[1, d + a] = kept[a]
+    lever[v], node[v, tl.N_SEEN] = kept[6], int(kept[7])
+
+
+@inline_kernel
+def next_incidence(slot: int, link: I64) -> int:
+    """The next incidence of the same variable."""
+    return int(link[slot // 2, tl.L_I + slot % 2])

@@ -1,0 +1,154 @@
+"""The tree of cliques: per-step work in proportion to what a step changes.  MATH §9.
+
+This is the memory of `kernels/tree_step.py`, which does the work in one call; here is what grows.
+"""
+
+import numpy as np
+
+from factorbus.solver.graph import Graph, grown
+from factorbus.solver.kernels import fronts as fr
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.tree_moved import exchange, list_moved
+from factorbus.solver.kernels.tree_step import tree_step
+from factorbus.solver.options import Options
+
+_HESSIAN = 6 * 6 * 3 + 13  # doubles of the largest record
+_LINE = 8  # doubles in a cache line
+
+
+class Tree:
+    """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
+
+    def __init__(self, graph: Graph, options: Options) -> None:
+        self._graph = graph
+        self._recent, self._rounds = options.recent_steps, options.rounds
+        self._settings: F64 = np.empty(tl.P_SIZE)
+        self._settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
+        self._settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
+        self._settings[tl.P_EVERY] = options.look_every
+        self.node: I64 = np.empty((16, tl.N_WIDTH), np.int64)
+        self.link: I64 = np.empty((16, tl.L_WIDTH), np.int64)
+        self.clique: I64 = np.empty((16, tl.C_WIDTH), np.int64)
+        self.lists: I64 = np.empty(256, np.int64)
+        self.numbers: F64 = _aligned(4096)
+        self.hessian: F64 = np.empty(1024)
+        self.lin: F64 = np.empty((3, 64))
+        self.scalars: F64 = np.zeros((3, 64))
+        self.stiff: F64 = np.empty((16, 2))
+        self.lever: F64 = np.empty(16)
+        self.pending: I64 = np.empty(16, np.int64)
+        self.changed: I64 = np.empty(16, np.int64)
+        self.moved: I64 = np.empty(16, np.int64)
+        self.saved: F64 = np.empty((16, 8))
+        self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
+        self.account: F64 = np.zeros(tl.A_SIZE)
+        self.state[tl.S_FREE_CLIQUE] = -1
+        self.state[tl.S_NUMBERS] = fr.SCRATCH
+
+    def step(self) -> int:
+        """Take in what is new in the graph and solve; gives −1, or the variable whose pivot failed.
+
+        When one failed nothing has changed, and the graph has to forget what is new.
+        """
+        graph, state = self._graph, self.state
+        counts = graph.counts.tolist()
+        self._reserve(counts)
+        state[tl.S_ELIMINATED : tl.S_ROUNDS + 1] = 0
+        state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)] = 0
+        state[tl.S_FAILED] = -1
+        state[tl.S_STEP] += 1
+        self.account[tl.A_BEND] = 0.0
+        while True:
+            status = tree_step(
+                counts[at.VARIABLES], counts[at.FACTORS], self._recent, self._rounds, self._settings, graph.var,
+                graph.fac, graph.values, graph.payload, self.node, self.link, self.clique, self.lists, self.numbers,
+                self.hessian, self.lin, self.scalars, self.stiff, self.lever, self.pending, self.changed, self.moved,
+                self.saved, state, self.account,
+            )  # fmt: skip
+            if status != tl.NO_ROOM:
+                break
+            self._make_room()
+        if status == tl.FAILED:
+            state[tl.S_STEP] -= 1
+            return int(state[tl.S_FAILED])
+        return -1
+
+    def move_all(self) -> None:
+        """The next step moves the linearisation points of all variables to the estimate."""
+        var = self._graph.var[: self.state[tl.S_VARIABLES]]
+        free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
+        self.node[free, tl.N_FLAGS] = 1
+        self.pending[: free.size] = free
+        self.state[tl.S_PENDING] = free.size
+
+    def list_moved(self, first_new: int) -> I64:
+        """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
+        graph = self._graph
+        found = np.empty(int(graph.counts[at.VARIABLES]), np.int64)
+        count = list_moved(
+            first_new, found.size, self.changed[: self.state[tl.S_CHANGED]], graph.var, self.lin.view(np.int64),
+            graph.values.view(np.int64), found,
+        )  # fmt: skip
+        return np.sort(found[:count])
+
+    def exchange(self) -> None:
+        """Exchange the estimate and the one from before the last step, of the variables that it changed."""
+        changed = self.changed[: self.state[tl.S_CHANGED]]
+        exchange(changed, self._graph.var, self.lin, self._graph.values)
+
+    def memory_bytes(self) -> int:
+        """Bytes in use of all arenas."""
+        variables, factors, cliques, lists, numbers, hessian = (
+            int(self.state[entry])
+            for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
+        )
+        counts = self._graph.counts
+        rows = variables * (tl.N_WIDTH + 4) + factors * (tl.L_WIDTH + 2) + cliques * tl.C_WIDTH
+        columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
+        return 8 * (rows + columns + lists + numbers + hessian)
+
+    def _reserve(self, counts: list[int]) -> None:
+        variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
+        if variables > len(self.node):
+            self.node, self.lever, self.pending, self.changed, self.moved = (
+                grown(array, variables) for array in (self.node, self.lever, self.pending, self.changed, self.moved)
+            )
+        if factors > len(self.link):
+            self.link, self.stiff = grown(self.link, factors), grown(self.stiff, factors)
+        if counts[at.VALUES] > self.lin.shape[1]:
+            self.lin = _widened(self.lin, counts[at.VALUES])
+        if counts[at.SCALARS] > self.scalars.shape[1]:
+            self.scalars = _widened(self.scalars, counts[at.SCALARS])
+        new = factors - int(self.state[tl.S_FACTORS])
+        if (need := int(self.state[tl.S_HESSIAN]) + new * _HESSIAN) > self.hessian.size:
+            self.hessian = grown(self.hessian, need)
+        if 2 * new > len(self.saved):
+            self.saved = np.empty((4 * new, 8))
+
+    def _make_room(self) -> None:
+        state = self.state
+        if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
+            self.clique = grown(self.clique, need)
+        if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
+            self.lists = grown(self.lists, need)
+        if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
+            larger = _aligned(max(need, 2 * self.numbers.size))
+            larger[: self.numbers.size] = self.numbers
+            self.numbers = larger
+        state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
+
+
+def _aligned(size: int) -> F64:
+    """Doubles that start at a cache line, and a line more: tiles are read whole."""
+    raw = np.zeros(size + 2 * _LINE)
+    skip = (-raw.ctypes.data // 8) % _LINE
+    return raw[skip : skip + size]
+
+
+def _widened(array: F64, need: int) -> F64:
+    """A copy with columns for at least `need`, twice as many as before where that is more."""
+    wider = np.zeros((len(array), max(need, 2 * array.shape[1])))
+    wider[:, : array.shape[1]] = array
+    return wider

@@ -1,0 +1,252 @@
+"""The tree of cliques keeps R, d and δ of its linearisation points, whatever was affected, split or moved."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from naive.dense_factors import boxplus
+from naive.dense_least_squares import DenseGraph, distance
+from naive.random_graphs import factor, random_steps
+from naive.tree_records import assert_is_a_tree, tree_of
+
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.simulate import city_trees, manhattan
+from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_batch
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+
+EXACT = {"mode": "tree", "ripple": 0.0}
+# Whole cliques only, as the default, and every clique at every place.
+SPLITS = {"never": (10**9, 1.0), "default": (48, 0.5), "always": (0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A graph as a batch."""
+
+    variables: list[Group]
+    factors: list[FactorGroup]
+
+
+def linearised(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
+    """A dense graph at the linearisation points, and δ."""
+    tree, graph, dense = tree_of(solver), solver._graph, DenseGraph()
+    variables, factors = solver.graph()
+    dense.add(Whole(variables, factors))
+    dense.kinds, delta = {}, []
+    for v in range(solver.variable_count):
+        kind, x, d = (int(graph.var[v, column]) for column in (at.V_KIND, at.V_AT, at.V_SCALAR))
+        key, form = int(graph.keys[v]), VARIABLE_KIND_OF_CODE[kind]
+        dense.kinds[key] = form.name
+        dense.values[key] = tree.lin[0, x : x + form.size].copy()
+        step = tree.scalars[0, d : d + form.dim] if d >= 0 else np.zeros(form.dim)
+        delta.append(step if d >= 0 else step[:0])
+        here = boxplus(form.name, dense.values[key], step)
+        assert distance(form.name, graph.values[x : x + form.size], here) < 1e-7
+    return dense, np.concatenate(delta)
+
+
+def assert_solves(solver: Solver) -> None:
+    """δ is the dense solution at the linearisation points, and the account has its χ²."""
+    assert_is_a_tree(solver)
+    dense, delta = linearised(solver)
+    information, eta = dense.system()
+    if delta.size:
+        scale = np.sqrt(np.diag(information))
+        right = np.linalg.solve(information / scale / scale[:, None], eta / scale)
+        tell = max(2e-8, 1e-15 * np.linalg.cond(information / scale / scale[:, None]))
+        np.testing.assert_allclose(delta * scale, right, rtol=0, atol=tell * max(np.abs(right).max(), 1.0))
+    chi2 = dense.chi2()
+    model = chi2 - (delta @ eta if delta.size else 0.0)
+    assert tree_of(solver).account[tl.A_CHI2] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
+
+
+def follow(steps: Iterable[Batch], **options) -> Solver:
+    solver = Solver(Options(**{**EXACT, **options}))
+    for batch in steps:
+        solver.stage(batch)
+        solver.step()
+        assert_solves(solver)
+    return solver
+
+
+@pytest.mark.parametrize("split", sorted(SPLITS))
+@pytest.mark.parametrize("seed", range(2))
+def test_delta_is_the_dense_solution_in_maps_of_all_kinds(seed: int, split: str) -> None:
+    pivots, share = SPLITS[split]
+    solver = follow(random_steps(seed, steps=12), split_pivots=pivots, split_share=share, look_every=1)
+    assert solver.factor_count > 60
+
+
+@st.composite
+def drives(draw: st.DrawFn) -> list[Batch]:
+    """A chain of poses, in the plane or in space, with loops of drawn lengths and points that are seen again."""
+    plane = draw(st.booleans())
+    pose, between = ("se2", "between_se2") if plane else ("se3", "between_se3")
+    point, sight = ("point2", "landmark_se2") if plane else ("point3", "landmark_se3")
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    zero = np.zeros(3) if plane else np.array([0, 0, 0, 0, 0, 0, 1.0])
+    truth: dict[int, np.ndarray] = {0: zero}
+    steps = [Batch((Variables(pose, np.array([0]), zero[None], fixed=draw(st.booleans())),))]
+    if not steps[0].variables[0].fixed:
+        steps[0] = Batch(steps[0].variables, (factor("prior_" + pose, [0], truth, 0.01, rng),))
+    points: list[int] = []
+    for n in range(1, draw(st.integers(4, 24))):
+        move = rng.normal(0.5, 0.3, 3 if plane else 6) * (1 if plane else 0.5)
+        truth[n] = boxplus(pose, truth[n - 1], move)
+        factors = [factor(between, [n - 1, n], truth, 0.1, rng)]
+        lengths = [length for length in draw(st.lists(st.integers(2, 24), max_size=2)) if length <= n]
+        factors += [factor(between, [n, n - length], truth, 0.1, rng) for length in lengths]
+        variables = [Variables(pose, np.array([n]))]
+        if draw(st.booleans()):
+            key = 1000 + n
+            size = 2 if plane else 3
+            truth[key] = truth[n][:size] + rng.uniform(1, 2, size)
+            variables.append(Variables(point, np.array([key])))
+            points.append(key)
+            factors.append(factor(sight, [n, key], truth, 0.1, rng))
+        if points and draw(st.booleans()):
+            seen = points[draw(st.integers(0, len(points) - 1))]
+            factors.append(factor(sight, [n, seen], truth, 0.1, rng))
+        steps.append(Batch(tuple(variables), tuple(factors)))
+    return steps
+
+
+@settings(max_examples=40)
+@given(steps=drives(), split=st.sampled_from(sorted(SPLITS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
+def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], split: str, bent: float) -> None:
+    pivots, share = SPLITS[split]
+    solver = follow(steps, split_pivots=pivots, split_share=share, bent=bent, look_every=1, trust=1e9)
+    settled = solver.step(settle=True).chi2
+    assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
+
+
+@settings(max_examples=20)
+@given(steps=drives(), ripple=st.sampled_from([0.01, 0.1, 1.0]))
+def test_what_is_left_undone_does_not_add_up(steps: list[Batch], ripple: float) -> None:
+    solver, exact = Solver(Options(mode="tree", ripple=ripple, bent=1e9)), Solver(Options(**EXACT, bent=1e9))
+    for batch in steps:
+        for one in (solver, exact):
+            one.stage(batch)
+            one.step()
+    weight = np.sqrt(tree_of(exact).scalars[1])
+    gap = np.abs(tree_of(solver).scalars[0] - tree_of(exact).scalars[0]) * weight
+    assert gap.max() <= ripple * len(steps)
+    assert solver.chi2() >= exact.chi2() - 1e-6 * max(exact.chi2(), 1.0) or ripple > 0
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6))
+def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool]) -> None:
+    tried, spared = Solver(Options(mode="tree")), Solver(Options(mode="tree"))
+    for n, batch in enumerate(random_steps(seed, steps=6)):
+        for solver in (tried, spared):
+            solver.stage(batch)
+            solver.step()
+        if refuse[n]:
+            tried.stage(unheld(np.random.default_rng(seed)))
+            with pytest.raises(errors.Underconstrained):
+                tried.step()
+        assert_is_a_tree(tried)
+        assert bits(tried) == bits(spared)
+        assert tried.chi2() == spared.chi2()
+
+
+def unheld(rng: np.random.Generator) -> Batch:
+    """A pose in the plane that two points hold in two of its three directions, and new points on it."""
+    keys = np.array([[-1, -2], [-1, -3]])
+    return Batch(
+        (
+            Variables("se2", np.array([-1]), rng.normal(size=(1, 3))),
+            Variables("point2", np.array([-2, -3]), rng.normal(size=(2, 2))),
+        ),
+        (Factors("landmark_se2", keys, rng.normal(size=(2, 2)), np.tile([2.0, 0.5, 1.0], (2, 1))),),
+    )
+
+
+def bits(solver: Solver) -> list[tuple[str, list[int], bytes]]:
+    return [(group.kind, group.keys.tolist(), group.values.tobytes()) for group in solver.estimate()]
+
+
+def by_key(groups: list[Group]) -> dict[int, bytes]:
+    return {int(k): v.tobytes() for group in groups for k, v in zip(group.keys, group.values, strict=True)}
+
+
+@pytest.mark.parametrize("world", [manhattan, city_trees])
+def test_the_estimate_along_a_drive_is_the_batch_answer(world) -> None:
+    solver, ratios = Solver(Options(mode="tree")), []
+    for n, step in enumerate(world(400, 3)):
+        solver.stage(step.batch)
+        report = solver.step()
+        if n % 50 == 49:
+            best = solve_batch(*solver.graph()).chi2
+            ratios.append(solver.chi2() / best if best > 1e-3 else 1.0)
+            assert report.chi2 == pytest.approx(solver.chi2(), rel=0.02, abs=1e-3)
+    assert np.median(ratios) < 1.001
+    assert max(ratios) < 1.02
+
+
+def test_a_long_drive_does_not_drift() -> None:
+    solver = Solver(Options(**EXACT, look_every=1))
+    for step in manhattan(1500, 5):
+        solver.stage(step.batch)
+        solver.step()
+    tree, fresh = tree_of(solver), Solver(Options(**EXACT, bent=1e9, place_new=False))
+    delta = tree.scalars[0, : solver._graph.counts[at.SCALARS]].copy()
+    variables, factors = solver.graph()
+    graph = solver._graph
+    for group in variables:
+        rows = [int(graph.find(int(key))) for key in group.keys]
+        for row, v in enumerate(rows):
+            x = graph.var[v, at.V_AT]
+            group.values[row] = tree.lin[0, x : x + group.values.shape[1]]
+    fresh.stage(Whole(variables, factors))
+    fresh.step()
+    order = {int(key): v for v, key in enumerate(fresh._graph.keys[: fresh.variable_count])}
+    again = np.concatenate(
+        [
+            tree_of(fresh).scalars[0, d : d + 3]
+            for v in range(solver.variable_count)
+            if graph.var[v, at.V_SCALAR] >= 0
+            and (d := int(fresh._graph.var[order[int(graph.keys[v])], at.V_SCALAR])) >= 0
+        ]
+    )
+    np.testing.assert_allclose(delta, again, rtol=0, atol=1e-9 * np.abs(again).max())
+
+
+def test_changed_are_the_variables_with_other_bits() -> None:
+    solver, known = Solver(Options(mode="tree")), {}
+    for step in manhattan(200, 7):
+        solver.stage(step.batch)
+        solver.step()
+        changed, now = by_key(solver.changed()), by_key(solver.estimate())
+        assert {key for key in now if known.get(key) != now[key]} == set(changed)
+        known = now
+
+
+def test_a_step_that_would_raise_chi2_is_replaced_by_a_batch() -> None:
+    """A ring of poses, each off by a quarter turn from where its factors want it."""
+    rng, n = np.random.default_rng(2), 12
+    wild = np.column_stack([rng.normal(0, 5, (n, 2)), rng.uniform(-3, 3, n)])
+    wild[0] = 0.0
+    keys = np.array([[i, (i + 1) % n] for i in range(n)])
+    edges = Factors(
+        "between_se2",
+        keys,
+        np.tile([1.0, 0.0, 2 * np.pi / n], (n, 1)),
+        np.tile([100.0, 0, 0, 100.0, 0, 1000.0], (n, 1)),
+    )
+    solver = Solver(Options(mode="tree", place_new=False))
+    fixed = Variables("se2", np.array([0]), wild[:1], fixed=True)
+    solver.stage(Batch((fixed, Variables("se2", np.arange(1, n), wild[1:])), (edges,)))
+    first = DenseGraph()
+    first.add(Batch((fixed, Variables("se2", np.arange(1, n), wild[1:])), (edges,)))
+    first.values = dict(enumerate(wild))
+    report = solver.step()
+    assert solver.chi2() <= first.chi2()
+    assert report.strategy in ("tree", "batch")
+    assert solver.step(settle=True).chi2 <= solve_batch(*solver.graph()).chi2 + 1e-6
