@@ -130,7 +130,7 @@ def _bus(bus: dict[str, Any]) -> list[str]:
         f"  questions/s: {rates['in_place']} in place, {rates['one']} with one worker, {rates['two']} with two",
         f"  two against one, in turns: {ratios}; median {bus['ratio']:.2f}",
         f"  the way to a worker takes {bus['way_ms']:.2f} ms and {bus['byte_ns']:.2f} ns a byte that travels back",
-        f"  an answer takes {bus['overhead_ms']:.2f} ms beyond the {bus['work_ms']:.1f} ms that its slowest worker works",
+        f"  an answer takes {bus['overhead_ms']:.2f} ms beyond the {bus['work_ms']:.1f} ms of work of the slowest",
     ]
 
 

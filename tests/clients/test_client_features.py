@@ -2,6 +2,7 @@
 
 import gc
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from factorbus.idp import job, minimal
 from factorbus.proto.features import Answer, Ask, Done, Shard, ShardDone, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
 from factorbus.proto.problems import BadMessage
-from factorbus.proto.segments import FOLDER, PAGE
+from factorbus.proto.segments import PAGE
 
 N, CUTS = 150, ((0, 7), (7, 8), (8, 150))
 
@@ -113,52 +114,55 @@ def test_an_answer_that_cannot_be_is_no_covariance(seen, form: str, change: Call
         grown(np.zeros(sighting.width), P, sighting, broken(change)(answered(Ask(sighting, form))), None)
 
 
-def files() -> set[str]:
-    return {path.name for path in FOLDER.glob("factorbus-*")}
+def descriptors() -> set[str]:
+    """Of shared memory that this process holds."""
+    links = {path: path.readlink() for path in Path("/proc/self/fd").iterdir() if path.is_symlink()}
+    return {path.name for path, target in links.items() if "memfd:factorbus" in str(target)}
 
 
 def test_memory_is_used_again_when_nobody_looks_at_it() -> None:
-    before, memories = files(), Memories()
+    before, memories = descriptors(), Memories()
     first = memories.try_lend(PAGE, (300, 300), 10)
     assert first is not None
-    name, view = first.segment.name, first.matrix[5:7]
+    descriptor, view = first.segment.descriptor, first.matrix[5:7]
     memories.settle(first, clean=True)
     del first
     gc.collect()
     second = memories.try_lend(PAGE, (300, 300), 10)
     assert second is not None
-    assert second.segment.name != name, "a view of the first is still looked at"
+    assert second.segment.descriptor != descriptor, "a view of the first is still looked at"
     view[:] = 1.0
     del view
     gc.collect()
     third = memories.try_lend(PAGE, (290, 290), 10)
     assert third is not None
-    assert third.segment.name == name
+    assert third.segment.descriptor == descriptor
     assert third.segment.nonce != second.segment.nonce
     memories.settle(second, clean=False)
     memories.settle(third, clean=False)
     memories.close()
-    assert files() == before
+    del second, third
+    gc.collect()
+    assert descriptors() == before
 
 
 def test_memory_that_somebody_may_still_write_to_is_not_used_again() -> None:
-    before, memories = files(), Memories()
+    before, memories = descriptors(), Memories()
     lent = memories.try_lend(PAGE, (300, 300), 0)
     assert lent is not None
-    name = lent.segment.name
     memories.settle(lent, clean=False)
     del lent
     gc.collect()
+    assert descriptors() == before
     again = memories.try_lend(PAGE, (300, 300), 0)
     assert again is not None
-    assert again.segment.name != name
     memories.settle(again, clean=True)
     memories.close()
     again.matrix[:] = 2.0  # lives on
     del again
     gc.collect()
-    assert files() == before
+    assert descriptors() == before
 
 
-def test_without_room_there_is_no_memory() -> None:
-    assert Memories().try_lend(PAGE, (1 << 25, 1 << 25), 0) is None
+def test_there_is_no_memory_for_more_than_one_question_may_use() -> None:
+    assert Memories().try_lend(PAGE, (1 << 15, 1 << 15), 0) is None

@@ -89,7 +89,7 @@ def asks(draw: st.DrawFn) -> Ask:
     m, n = draw(st.integers(13, 30)), draw(st.integers(0, 5))
     sighting = Sighting(camera, draw(block(13)), draw(block(13, m)), draw(block(n, 2)), *(draw(NUMBER) for _ in "123"))
     size_ = st.integers(0, 2**62)
-    segment = st.builds(Segment, st.text(max_size=9), st.text(max_size=9), size_, size_)
+    segment = st.builds(Segment, size_, size_, st.text(max_size=9), size_, size_)
     return Ask(sighting, draw(st.sampled_from(FORMS)), draw(st.none() | segment))
 
 

@@ -105,6 +105,15 @@ def test_a_worker_that_did_not_answer_in_time_gets_nothing_until_it_is_heard_of(
     assert places(following) == ["b"]
 
 
+def test_short_jobs_may_wait_at_a_worker_once_nobody_is_free() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    dispatch.joined("b", 1)
+    sent = [places(dispatch.submit(job(name), ahead=1)) for name in "jklmn"]
+    assert sent == [["a"], ["b"], ["a"], ["b"], []]
+    assert places(dispatch.submit(job("o"))) == [], "a long one does not"
+
+
 def test_when_all_are_suspects_it_is_done_in_place() -> None:
     dispatch = Dispatch()
     dispatch.joined("a", 1)

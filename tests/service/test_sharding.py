@@ -17,7 +17,7 @@ TRIP = Trip(fixed_s=3e-4, byte_s=1e-9)
 
 
 def stored(n: int) -> Ask:
-    return example("rows", n)._replace(segment=Segment("", "", 0, 0))
+    return example("rows", n)._replace(segment=Segment(0, 0, "", 0, 0))
 
 
 def test_without_workers_it_is_done_in_place() -> None:

@@ -1,6 +1,7 @@
 """Features for filters over the bus: cut up, done by processes that may die or freeze, and every one arrives."""
 
 import asyncio
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -175,7 +176,7 @@ def test_a_front_end_on_another_host_gets_the_same_without_shared_memory(
 
 
 def segment_elsewhere(memory: Memory, offset: int) -> Segment:
-    return Segment(memory._path.name, "0" * 32, memory.size, offset)
+    return Segment(os.getpid(), memory._descriptor, "0" * 32, memory.size, offset)
 
 
 def test_a_filter_gets_factors_and_its_problems_by_name(spawn: Spawn, tmp_path: Path, question: Question) -> None:

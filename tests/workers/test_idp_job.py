@@ -1,8 +1,6 @@
 """The job of kind `idp`: in any shards and by any way of answering the same bits; shared memory that cannot harm."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +50,7 @@ def test_shards_put_together_are_the_whole_in_every_form(sighting: Sighting) -> 
     assert factored.turn.tobytes() == idp.see(sighting).turn[2:4].tobytes()
 
 
-def test_a_shard_in_shared_memory_is_the_same_and_the_name_goes(sighting: Sighting) -> None:
+def test_a_shard_in_shared_memory_is_the_same_and_the_memory_goes(sighting: Sighting) -> None:
     with Memory(PAGE + rows_size(N, M)) as memory:
         array = memory.array(PAGE, (6 * N, M + 6 * N))
         ask = Ask(sighting, "rows", memory.segment(PAGE))
@@ -60,91 +58,70 @@ def test_a_shard_in_shared_memory_is_the_same_and_the_name_goes(sighting: Sighti
             answer = done(ask, *cut)
             assert answer.stored
             assert answer.rows is None
-        path = segments.FOLDER / memory.segment(PAGE).name
-        assert path.stat().st_mode & 0o777 == 0o600
-    assert not path.exists()
-    assert array.tobytes() == whole(sighting).tobytes(), "the array outlives the name"
+        assert done(ask, 4, 4).y.shape == (0, 6)
+    assert array.tobytes() == whole(sighting).tobytes(), "the array outlives the file"
     assert done(ask).rows is not None, "who comes too late answers with bytes"
 
 
-def test_a_large_answer_is_written_in_pieces() -> None:
-    n = 300
+def test_rows_go_where_the_asker_wants_them() -> None:
+    """Anywhere in the file, pages or not."""
+    n = 70
     large = random_sighting(22, n)[0]
-    with Memory(PAGE + rows_size(n, 13)) as memory:
-        array = memory.array(PAGE, (6 * n, 13 + 6 * n))
-        assert done(Ask(large, "rows", memory.segment(PAGE)), 0, n).stored
-    expected = np.empty_like(array)
+    expected = np.empty((6 * n, 13 + 6 * n))
     minimal.Parts(large, idp.see(large)).rows(0, n, expected)
-    assert array.tobytes() == expected.tobytes()
+    for offset in (PAGE, PAGE + 8, 3 * PAGE - 8):
+        with Memory(offset + rows_size(n, 13)) as memory:
+            array = memory.array(offset, expected.shape)
+            ask = Ask(large, "rows", memory.segment(offset))
+            for cut in ((0, 1), (1, 64), (64, n)):
+                assert done(ask, *cut).stored
+            assert array.tobytes() == expected.tobytes()
 
 
-def test_memory_that_is_not_what_it_says_is_not_written_to(sighting: Sighting, tmp_path: Path) -> None:
+def test_a_file_that_is_not_what_it_says_is_not_written_to(sighting: Sighting, tmp_path: Path) -> None:
     size = PAGE + rows_size(N, M)
-    victim = tmp_path / "victim"
-    victim.write_bytes(bytes(size))
-    with Memory(size) as memory:
+    content = ("0" * 32).encode() + bytes(size - 32)
+    (tmp_path / "victim").write_bytes(content)
+    with Memory(size) as memory, (tmp_path / "victim").open("r+b") as victim:
         good = memory.segment(PAGE)
-        link = segments.FOLDER / f"factorbus-{os.getpid()}-{'a' * 32}"
-        link.symlink_to(victim)
-        try:
-            for bad in (
-                good._replace(nonce="0" * 32),
-                good._replace(name="factorbus-1-" + "0" * 32),
-                good._replace(name="../../" + str(victim)),
-                good._replace(name=link.name, nonce="\0" * 32),
-                good._replace(offset=0),
-                good._replace(offset=PAGE + 4),
-                good._replace(offset=PAGE + 8),
-                good._replace(size=size + PAGE),
-            ):
-                answer = done(Ask(sighting, "rows", Segment(*bad)))
-                assert not answer.stored, bad
-                assert answer.rows is not None
-        finally:
-            link.unlink()
+        for bad in (
+            good._replace(nonce="0" * 32),
+            good._replace(process=2**22 + 1),
+            good._replace(process=2**62),
+            good._replace(descriptor=9999),
+            good._replace(descriptor=victim.fileno(), nonce="0" * 32),
+            good._replace(descriptor=0),
+            good._replace(offset=0),
+            good._replace(offset=PAGE + 4),
+            good._replace(offset=PAGE + 8),
+            good._replace(offset=2**62),
+            good._replace(size=size + PAGE),
+        ):
+            answer = done(Ask(sighting, "rows", Segment(*bad)))
+            assert not answer.stored, bad
+            assert answer.rows is not None
         assert not memory.array(PAGE, (6 * N, M + 6 * N)).any()
-    assert not any(victim.read_bytes())
+    assert (tmp_path / "victim").read_bytes() == content
 
 
-def test_memory_that_is_cut_short_ends_nobody(sighting: Sighting) -> None:
-    """A mapping would be a SIGBUS; here it is not the file that was announced, and the rows come as bytes."""
-    with Memory(PAGE + rows_size(N, M)) as memory:
-        segment = memory.segment(PAGE)
-        os.truncate(segments.FOLDER / segment.name, PAGE)
-        assert done(Ask(sighting, "rows", segment)).rows is not None
-
-
-def test_a_full_shared_memory_ends_in_bytes(sighting: Sighting, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with Memory(PAGE + rows_size(N, M)) as memory:
-        monkeypatch.setattr(segments.os, "pwrite", full)
-        assert done(Ask(sighting, "rows", memory.segment(PAGE))).rows is not None
-
-
-def test_what_a_killed_asker_left_is_removed_when_it_is_old() -> None:
-    with subprocess.Popen([sys.executable, "-c", ""]) as gone:
-        gone.wait()
-    left = segments.FOLDER / f"factorbus-{gone.pid}-{'b' * 32}"
-    ours = segments.FOLDER / f"factorbus-{os.getpid()}-{'b' * 32}"
+def test_a_file_that_could_be_cut_short_is_not_mapped(sighting: Sighting) -> None:
+    """Writing to a mapping beyond its file's end would end the worker."""
+    size = PAGE + rows_size(N, M)
+    descriptor = os.memfd_create("not sealed", os.MFD_ALLOW_SEALING)
     try:
-        for path in (left, ours):
-            path.write_bytes(b"")
-        Memory(PAGE).close()
-        assert left.exists(), "somebody in another container may be using it"
-        for path in (left, ours):
-            os.utime(path, (1, 1))
-        Memory(PAGE).close()
-        assert (left.exists(), ours.exists()) == (False, True)
+        os.truncate(descriptor, size)
+        os.pwrite(descriptor, b"0" * 32, 0)
+        segment = Segment(os.getpid(), descriptor, "0" * 32, size, PAGE)
+        assert done(Ask(sighting, "rows", segment)).rows is not None
     finally:
-        left.unlink(missing_ok=True)
-        ours.unlink(missing_ok=True)
+        os.close(descriptor)
+    with Memory(size) as memory, pytest.raises(PermissionError):
+        os.truncate(memory.segment(PAGE).descriptor, PAGE)
 
 
-def test_there_must_be_room() -> None:
-    with pytest.raises(OSError, match="no room"):
-        Memory(1 << 60)
+def test_there_is_an_end_to_what_one_question_may_use() -> None:
+    with pytest.raises(OSError, match="more than"):
+        Memory(segments.MOST_BYTES + 1)
 
 
 def test_what_cannot_be_done_has_a_code(sighting: Sighting) -> None:

@@ -68,12 +68,13 @@ class Sighting:
 
 
 class Segment(NamedTuple):
-    """Shared memory for an answer: the file `name` in /dev/shm, of `size` bytes, that begins with `nonce`.
+    """Shared memory for an answer: `descriptor` of `process` is a file of `size` bytes that begins with `nonce`.
 
     The rows of the form `rows` are written from byte `offset` on.
     """
 
-    name: str
+    process: int
+    descriptor: int
     nonce: str
     size: int
     offset: int

@@ -163,5 +163,7 @@ def _segment(content: Map) -> Segment | None:
     found = fields.mapping("", content, "segment")
     if not found:
         return None
-    name, nonce = (fields.text("segment", found, field) for field in ("name", "nonce"))
-    return Segment(name, nonce, fields.integer("segment", found, "size"), fields.integer("segment", found, "offset"))
+    process, descriptor, size, offset = (
+        fields.integer("segment", found, name) for name in ("process", "descriptor", "size", "offset")
+    )
+    return Segment(process, descriptor, fields.text("segment", found, "nonce"), size, offset)

@@ -1,26 +1,20 @@
-"""Memory that processes of one host share: a file in /dev/shm that the asker makes and others write answers into.
+"""Memory that processes of one host share: anonymous files that the asker makes and others write answers into.
 
-The asker makes a file for one answer, writes a nonce at its beginning and sends both along; whoever finds a file of
-that name with that nonce is on the same host, whatever containers and mounts say.  The asker removes the name when it
-has the answer, and never uses the file for another one.  So one who was frozen, and writes when it wakes, writes into
-memory that nobody else looks at; and what it writes while others still look is what stands there already, because an
-answer is a pure function of its question.
+The asker makes a file without a name (memfd), writes a nonce at its beginning and says by which process and descriptor
+it is found; whoever finds a file there with that nonce is on the same host, under the same user, whatever containers
+and mounts say.  The file is sealed so that it cannot become shorter, so who has mapped it cannot be ended by it; and it
+goes with its last user, so that nothing is left behind, however a process ends.
 
-Only the asker maps the file.  Others write to it, which fails with an error where there is no room or where somebody
-has cut the file short; a mapping would end their process.  It is faster, too: a page that is written whole need not be
-cleared first.
+A file serves one question at a time, and another one only if nobody can write to it for the one before any more.  One
+who was frozen meanwhile and wakes writes what stands there already: an answer is a pure function of its question.
 """
 
 import contextlib
-import errno
+import fcntl
 import mmap
 import os
-import re
 import secrets
 import stat
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -28,27 +22,27 @@ import numpy as np
 from factorbus.proto.arrays import F64
 from factorbus.proto.features import Segment
 
-FOLDER = Path("/dev/shm")
 PAGE = 4096
-_NAME = re.compile(r"factorbus-[0-9]+-[0-9a-f]{32}")
+# What one question may have made: beyond, it would be a way to use up a machine's memory.
+MOST_BYTES = 4 << 30
 _NONCE = 32
-_OLD_S = 600.0
 
 
 class Memory:
     """A file for answers, one at a time.  `close` it, or use it in `with`; arrays from it live on."""
 
     def __init__(self, size: int) -> None:
-        """Make one of `size` bytes.  Raises OSError: no /dev/shm here, or no room in it."""
-        _sweep()
-        room = os.statvfs(FOLDER)
-        if room.f_bavail * room.f_frsize < size:
-            raise OSError(errno.ENOSPC, f"no room for {size} bytes", str(FOLDER))
+        """Make one of `size` bytes.  Raises OSError: this system has no such files, or that is too much."""
+        if not hasattr(os, "memfd_create"):
+            raise OSError("this system has no memfd")
+        if size > MOST_BYTES:
+            raise OSError(f"{size} bytes are more than {MOST_BYTES}")
         self.size = size
-        self._path = FOLDER / f"factorbus-{os.getpid()}-{secrets.token_hex(16)}"
-        self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        self._mapped: mmap.mmap | None = None
+        self._descriptor = os.memfd_create("factorbus", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             os.truncate(self._descriptor, size)
+            fcntl.fcntl(self._descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
             self.renew()
         except BaseException:
             self.close()
@@ -67,66 +61,58 @@ class Memory:
 
     def segment(self, offset: int) -> Segment:
         """What to send along."""
-        return Segment(self._path.name, self._nonce, self.size, offset)
+        return Segment(os.getpid(), self._descriptor, self._nonce, self.size, offset)
 
     def array(self, offset: int, shape: tuple[int, ...]) -> F64:
         """The numbers from byte `offset` on; the array keeps the memory, also after `close`."""
-        return np.ndarray(shape, np.float64, self.mapped(), offset)
-
-    def mapped(self) -> mmap.mmap:
-        """The bytes, as long as somebody holds what this returns or an array made of it."""
-        return mmap.mmap(self._descriptor, self.size)
+        if self._mapped is None:  # kept: finding all its pages again takes as long as reading them
+            self._mapped = mmap.mmap(self._descriptor, self.size)
+        return np.ndarray(shape, np.float64, self._mapped, offset)
 
     def close(self) -> None:
-        """Remove the name."""
+        """No more questions; who has mapped it keeps it."""
         if self._descriptor >= 0:
-            self._path.unlink(missing_ok=True)
             os.close(self._descriptor)
-            self._descriptor = -1
+            self._descriptor, self._mapped = -1, None
 
 
-@contextmanager
-def try_opened(segment: Segment, need: int) -> Iterator[int | None]:
-    """A descriptor to write to `segment` with, if it is on this host and has `need` bytes from its offset on."""
-    descriptor = _try_open(segment, need)
-    try:
-        yield descriptor
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
+def try_array(segment: Segment, need: int, start: int, shape: tuple[int, int]) -> F64 | None:
+    """Numbers of `segment` to write to, from byte `start` after its offset on; None if it is not on this host.
 
-
-def write(descriptor: int, numbers: F64, at: int) -> None:
-    """Write contiguous `numbers` from byte `at` on.  Raises OSError."""
-    left = numbers.reshape(-1).data.cast("B")
-    while left:
-        done = os.pwrite(descriptor, left, at)
-        left, at = left[done:], at + done
-
-
-def _try_open(segment: Segment, need: int) -> int | None:
-    name, nonce, size, offset = segment
-    if not _NAME.fullmatch(name) or offset < PAGE or offset % 8 or offset + need > size:
+    need: bytes that it has to have from its offset on.  The array keeps the memory.
+    """
+    if segment.offset < PAGE or segment.offset % 8 or segment.offset + need > segment.size:
         return None
-    try:
-        descriptor = os.open(FOLDER / name, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return None
-    found = os.fstat(descriptor)
-    regular = stat.S_ISREG(found.st_mode) and found.st_size == size
-    if regular and os.pread(descriptor, _NONCE, 0) == nonce.encode():
-        return descriptor
-    os.close(descriptor)
+    with contextlib.suppress(OSError, ValueError, OverflowError):
+        descriptor = _open(segment)
+        try:
+            return _array(descriptor, segment.offset + start, shape) if descriptor >= 0 else None
+        finally:
+            if descriptor >= 0:
+                os.close(descriptor)
     return None
 
 
-def _sweep() -> None:
-    """Remove what processes that were killed have left: an old file of a process that is not there.
+def _open(segment: Segment) -> int:
+    """A descriptor of the file, or −1 if what is there is not it.  Raises OSError: nothing there, or not for us."""
+    path = Path(f"/proc/{segment.process}/fd/{segment.descriptor}")
+    if not stat.S_ISREG(path.stat().st_mode):
+        return -1
+    descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        sealed = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK  # any other file has no seals
+        same = os.fstat(descriptor).st_size == segment.size
+        if sealed and same and os.pread(descriptor, _NONCE, 0) == segment.nonce.encode():
+            return descriptor
+    except OSError:
+        pass
+    os.close(descriptor)
+    return -1
 
-    Old, too, because a process in another container may be there and not be seen.
-    """
-    for path in FOLDER.glob("factorbus-*"):
-        if _NAME.fullmatch(path.name) and not Path(f"/proc/{path.name.split('-')[1]}").exists():
-            with contextlib.suppress(OSError):  # not ours, or somebody was quicker
-                if time.time() - path.stat().st_mtime > _OLD_S:
-                    path.unlink()
+
+def _array(descriptor: int, at: int, shape: tuple[int, int]) -> F64:
+    """The part of the file that holds the array, mapped with all its pages at once: one by one takes twice as long."""
+    skip = at % mmap.ALLOCATIONGRANULARITY
+    size = skip + 8 * shape[0] * shape[1]
+    mapped = mmap.mmap(descriptor, size, mmap.MAP_SHARED | mmap.MAP_POPULATE, offset=at - skip)
+    return np.ndarray(shape, np.float64, mapped, skip)

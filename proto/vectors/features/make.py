@@ -37,7 +37,7 @@ def vectors() -> dict[str, bytes]:
     ask = features.encode_ask(Ask(_sighting(), "half"))
     half = ShardDone(0, 2, _ramp(2, 6), cross=_ramp(12, 13), blocks=_ramp(3 * 36))
     shard = features.encode_shard_done(half)
-    segment = Segment("factorbus-4711-" + "0f" * 16, "1e" * 16, 8192, 4096)
+    segment = Segment(4711, 12, "1e" * 16, 8192, 4096)
     return {
         "ask": features.encode_ask(Ask(_sighting(), "rows")),
         "ask_half": ask,

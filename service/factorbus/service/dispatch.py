@@ -1,6 +1,7 @@
 """Which worker gets which job, until when, and who is next when one fails.  Pure: the shell sends and times.
 
-The worker with the fewest jobs in flight goes first; nobody gets more than it has slots for.  A job whose worker
+The worker with the fewest jobs in flight goes first; nobody gets more than it has slots for, but for short jobs, of
+which one more may wait at the worker so that it need not wait for the next one's way.  A job whose worker
 leaves, times out, answers nothing or fails goes to another one, and after `TRIES` of them, or when there is no
 worker at all, it is done in place.  Jobs are pure functions of their payload, so two workers on one job do no harm;
 every sending has a tag of its own, and an answer to any but the latest is dropped.
@@ -68,6 +69,7 @@ class _Open:
     """A job that is not done: where it was tried, and where it is (tag 0: waiting for a slot)."""
 
     job: Job
+    ahead: int
     tried: set[str] = field(default_factory=set)
     tries: int = 0
     tag: int = 0
@@ -121,9 +123,9 @@ class Dispatch:
             self._workers[worker].suspect = False
         return self._place_waiting()
 
-    def submit(self, job: Job) -> list[Effect]:
-        """A new job."""
-        self._jobs[job.job] = _Open(job)
+    def submit(self, job: Job, ahead: int = 0) -> list[Effect]:
+        """A new job.  ahead: how many more than its slots a worker may have for this one to be sent there."""
+        self._jobs[job.job] = _Open(job, ahead)
         self._waiting.append(job.job)
         return self._place_waiting()
 
@@ -191,7 +193,7 @@ class Dispatch:
         if found.tries >= TRIES or not untried:
             worker, effect = IN_PLACE, InPlace(tag, found.job)
         else:
-            free = [name for name, worker in untried.items() if len(worker.tags) < worker.slots]
+            free = [name for name, worker in untried.items() if len(worker.tags) < worker.slots + found.ahead]
             if not free:
                 return None
             worker = min(free, key=lambda name: (len(untried[name].tags), name))

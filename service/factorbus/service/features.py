@@ -133,6 +133,7 @@ class Features:
                 lambda job, place=place: self._came(question, place, job),
                 deadline_s,
                 _GIVE_UP_S,
+                ahead=1,
             )
 
     def _came(self, question: _Question, place: int, job: Ended) -> None:

@@ -69,15 +69,22 @@ class Jobs:
         self._perform(self._dispatch.heard(worker))
 
     def submit(
-        self, kind: str, payload: bytes, ended: Callable[[Ended], None], deadline_s: float, timeout_s: float
+        self,
+        kind: str,
+        payload: bytes,
+        ended: Callable[[Ended], None],
+        deadline_s: float,
+        timeout_s: float,
+        ahead: int = 0,
     ) -> None:
         """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the desk.
 
-        deadline_s: for one worker.  timeout_s: until it is given up, with Unavailable.
+        deadline_s: for one worker.  timeout_s: until it is given up, with Unavailable.  ahead: of short jobs, how many
+        may wait at a worker.
         """
         job = Job(secrets.token_hex(8), kind, payload)
         self._open[job.job] = _Open(ended, deadline_s, time.monotonic() + timeout_s, timeout_s)
-        self._perform(self._dispatch.submit(job))
+        self._perform(self._dispatch.submit(job, ahead))
 
     def tick(self) -> None:
         """Give up what has taken too long."""

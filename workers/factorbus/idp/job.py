@@ -1,7 +1,4 @@
-"""The job of kind `idp`: a shard of a question's features, the same bits whoever does it.
-
-What goes to shared memory is written there in pieces that fit the second-level cache.
-"""
+"""The job of kind `idp`: a shard of a question's features, the same bits whoever does it."""
 
 import numpy as np
 
@@ -12,8 +9,6 @@ from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, an
 from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadMessage, TooLarge
-
-_PIECE = 64 << 10  # doubles
 
 
 def do(payload: bytes) -> bytes:
@@ -48,20 +43,12 @@ def done(shard: Shard, ask: Ask) -> ShardDone:
 def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
     """Whether the rows could be written to shared memory."""
     n, m = ask.sighting.count, ask.sighting.width
-    width = m + FEATURE * n
-    parts, step = Parts(ask.sighting, seen), max(1, _PIECE // (FEATURE * width))
-    piece = np.empty((FEATURE * min(step, n), width))
-    with segments.try_opened(segment, rows_size(n, m)) as descriptor:
-        if descriptor is None:
-            return False
-        try:
-            for first in range(shard.first, shard.last, step):
-                last = min(first + step, shard.last)
-                rows = piece[: FEATURE * (last - first)]
-                parts.rows(first, last, rows)
-                segments.write(descriptor, rows, segment.offset + 8 * FEATURE * first * width)
-        except OSError:  # no room: /dev/shm is full
-            return False
+    width, rows = m + FEATURE * n, FEATURE * (shard.last - shard.first)
+    start = 8 * FEATURE * shard.first * width
+    out = segments.try_array(segment, rows_size(n, m), start, (rows, width)) if rows else None
+    if out is None:
+        return False
+    Parts(ask.sighting, seen).rows(shard.first, shard.last, out)
     return True
 
 
