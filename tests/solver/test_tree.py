@@ -125,18 +125,20 @@ def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], split:
     assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
 
 
-@settings(max_examples=20)
-@given(steps=drives(), ripple=st.sampled_from([0.01, 0.1, 1.0]))
-def test_what_is_left_undone_does_not_add_up(steps: list[Batch], ripple: float) -> None:
-    solver, exact = Solver(Options(mode="tree", ripple=ripple, bent=1e9)), Solver(Options(**EXACT, bent=1e9))
-    for batch in steps:
-        for one in (solver, exact):
-            one.stage(batch)
+def test_what_is_left_undone_does_not_add_up() -> None:
+    """χ² along 800 steps, beside a tree that leaves nothing undone."""
+    solvers = {ripple: Solver(Options(mode="tree", ripple=ripple)) for ripple in (0.0, 0.05, 1.0)}
+    ratios = []
+    for n, step in enumerate(manhattan(800, 9)):
+        for one in solvers.values():
+            one.stage(step.batch)
             one.step()
-    weight = np.sqrt(tree_of(exact).scalars[1])
-    gap = np.abs(tree_of(solver).scalars[0] - tree_of(exact).scalars[0]) * weight
-    assert gap.max() <= ripple * len(steps)
-    assert solver.chi2() >= exact.chi2() - 1e-6 * max(exact.chi2(), 1.0) or ripple > 0
+        if n % 10 == 9:
+            exact, default, coarse = (one.chi2() + 1e-3 for one in solvers.values())
+            ratios.append((default / exact, coarse / exact))
+    default, coarse = np.array(ratios).T
+    assert default.max() < 1.002
+    assert coarse.max() > 1.01
 
 
 @settings(max_examples=25)
