@@ -17,13 +17,13 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.idp.heap import keep_freed_memory
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
 from factorbus.workers import jobs
 from factorbus.workers.config import BadConfig, Config, checked
+from factorbus.workers.heap import keep_freed_memory
 
 log = logging.getLogger(__name__)
 
