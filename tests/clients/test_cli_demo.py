@@ -85,3 +85,19 @@ def test_errors_are_distances_of_the_variables_in_both() -> None:
 
 def _truths(poses: int) -> list[Batch]:
     return [Batch(step.truth) for step in manhattan(poses=poses, seed=1)]
+
+
+def test_a_camera_s_rays_become_points(tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [FACTORBUS, "demo", "monocular", "--frames", "60", "--features", "40", "--workers", "1", "--json"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False,
+    )  # fmt: skip
+    assert ran.returncode == OK, ran.stderr
+    found = json.loads(ran.stdout)
+    assert (found["frames"], found["points"]) == (60, 300)
+    assert sum(found["made_by"].values()) > 0
+    assert found["relative_depth"]["last"] < 0.1 < found["relative_depth"]["first"]
+    assert found["inverse_depth_within_3_sigma"] >= 0.95
+    assert found["error_m"]["rms"] < 0.05
+    assert (tmp_path / found["plot"]).read_bytes().startswith(b"\x89PNG")
+    assert "60/60" in ran.stderr

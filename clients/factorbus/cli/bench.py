@@ -11,7 +11,7 @@ from factorbus.cli.exits import FAILED, OK, Stopped
 from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
-BENCHES = ("cholesky", "bus")  # what `all` runs, a minute or two
+BENCHES = ("cholesky", "bus", "idp")  # what `all` runs, a minute or two
 LONG = ("paper", "peers")  # hours; on request
 
 
@@ -25,11 +25,13 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     \b
     cholesky   block Cholesky of real systems against CHOLMOD, same matrix and ordering
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
+    idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
+               --figures FOLDER, --no-workers
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
-    all        cholesky and bus
+    all        cholesky, bus and idp
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
     the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.

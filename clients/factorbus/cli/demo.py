@@ -1,5 +1,6 @@
 """`factorbus demo`: a solver process, workers, a robot and a viewer, on the bus, on this machine."""
 
+import importlib
 import json
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,14 +26,27 @@ class Request:
     plot: Path
 
 
-@click.command()
+class _Demos(click.Group):
+    """The demo, and others by name, imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return ["monocular"]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        return importlib.import_module(f"factorbus.cli.demo_{cmd_name}").command
+
+
+@click.group(cls=_Demos, invoke_without_command=True)
 @click.option("--world", type=click.Choice(WORLDS), default="manhattan", show_default=True)
 @click.option("--poses", type=click.IntRange(10, 1_000_000), default=2000, show_default=True, metavar="N")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
 @click.option("--workers", type=click.IntRange(0, 64), default=2, show_default=True, metavar="N")
 @out_option("--plot", "plot", "The picture.  [default: out/demo.png]", "FILE.png")
 @json_option
-def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
+@click.pass_context
+def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) -> None:
     """Show it all: a simulated robot drives through a world it does not know and the map follows.
 
     Five processes on this machine, talking over Zenoh: the solver, two workers, the robot's front end, and this one,
@@ -43,7 +57,10 @@ def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
     factorbus demo
     factorbus demo --world sphere --poses 1000 --plot sphere.png
     factorbus demo --json
+    factorbus demo monocular                    a camera, and rays that become points
     """
+    if ctx.invoked_subcommand:
+        return
     require("service", "factorbus demo")
     require("viz", "factorbus demo")
     from factorbus.cli import screen

@@ -25,7 +25,8 @@ def command(until_eof: bool, quiet: bool, connect: tuple[str, ...], **given: Any
     """Take jobs from services until Ctrl-C or SIGTERM; those begun are finished. Waits for a service not yet there.
 
     Prints `ready NAME` when it takes jobs. A job is for example the batch optimum of a map, found from scratch while
-    the map's own solver goes on. Start as many workers as there are cores to spare, on any machine.
+    the map's own solver goes on, or a part of the features that a camera's filter asks for. Start as many workers as
+    there are cores to spare, on any machine.
 
     \b
     factorbus work

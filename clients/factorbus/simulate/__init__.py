@@ -1,12 +1,14 @@
 """Simulated worlds with known truth: streams of steps, from the same seed always the same, of any length.
 
 Each world is a function of (poses, seed, ...) and gives a `Step` a pose.  A longer run begins with the shorter one.
+`monocular` is one for filters and cameras: it gives a `Frame` an image.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 
 from factorbus.simulate.city_trees import city_trees
 from factorbus.simulate.manhattan import manhattan
+from factorbus.simulate.monocular import Frame, MonocularWorld, monocular
 from factorbus.simulate.parameters import BadParameter
 from factorbus.simulate.sphere import sphere
 from factorbus.simulate.step import Step
@@ -17,4 +19,14 @@ WORLDS: Mapping[str, Callable[..., Iterator[Step]]] = {
     "sphere": sphere,
 }
 
-__all__ = ["WORLDS", "BadParameter", "Step", "city_trees", "manhattan", "sphere"]
+__all__ = [
+    "WORLDS",
+    "BadParameter",
+    "Frame",
+    "MonocularWorld",
+    "Step",
+    "city_trees",
+    "manhattan",
+    "monocular",
+    "sphere",
+]
