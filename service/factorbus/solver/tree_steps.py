@@ -160,7 +160,7 @@ class TreeSteps:
             changed=changed,
             relinearised=relinearised,
             eliminated=eliminated,
-            nnz_r=0,
+            nnz_r=int(state[tl.S_NONZEROS]),
             flops=float(flops),
             converged=course.converged if course else True,
             phases_ms={name: share * count for name, count in zip(tl.PHASES, cycles, strict=True)},

@@ -6,7 +6,7 @@ Until here a step has changed no link of the tree, so one that fails has only it
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64, I64, part
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.tree_fronts import free_clique
 from factorbus.solver.kernels.tree_hessian import hessian_size
 from factorbus.solver.kernels.tree_mark import dim_of_variable, has_free
@@ -22,6 +22,7 @@ def commit(
 ) -> None:  # fmt: skip
     """Split or free the marked cliques, hang the new ones and the orphans up, and give the factors their owners."""
     for k in range(marked.size):
+        state[tl.S_NONZEROS] -= nonzeros(clique[marked[k]])
         if clique[marked[k], tl.C_PARENT] < 0:
             account[tl.A_CHI2] -= numbers[clique[marked[k], tl.C_UPDATE]]
             state[tl.S_ROOTS] -= 1
@@ -34,12 +35,15 @@ def commit(
         c = marked[k]
         if clique[c, tl.C_FIRST] == 0:
             free_clique(c, clique, lists, numbers, state)
+        else:
+            state[tl.S_NONZEROS] += nonzeros(clique[c])
     for k in range(marked.size):
         clique[marked[k], tl.C_FIRST] = 0
     n, count = order.size, ids.size
     for f in range(count):
         c, row = ids[f], clique[ids[f]]
         row[tl.C_FIRST] = -1
+        state[tl.S_NONZEROS] += nonzeros(row)
         for q in range(row[tl.C_FRONTALS]):
             v = lists[row[tl.C_LIST] + q]
             node[v, tl.N_CLIQUE], node[v, tl.N_PLACE], node[v, tl.N_OWN] = c, q, -1
@@ -56,6 +60,12 @@ def commit(
         v = affected[order[first_end(factors[q], place, var, fac, node)]]
         link[factors[q], tl.L_OWN], node[v, tl.N_OWN] = node[v, tl.N_OWN], factors[q]
     state[tl.S_ELIMINATED] += n
+
+
+@inline_kernel
+def nonzeros(row: I64) -> int:
+    """Of R in the rows of a clique, zeros of joined columns among them."""
+    return row[tl.C_PIVOTS] * row[tl.C_BORDER] + row[tl.C_PIVOTS] * (row[tl.C_PIVOTS] + 1) // 2
 
 
 @part
