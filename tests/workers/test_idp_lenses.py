@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from naive import dense_idp
 from naive.random_sightings import CAMERAS, random_pixels
 
@@ -140,3 +142,28 @@ def test_a_camera_that_cannot_be_is_refused(model: str, numbers: tuple[float, ..
     with pytest.raises(BadCamera) as refused:
         Camera(model, numbers, *size)
     assert refused.value.code == "bad_camera"
+
+
+WILD = st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e-300, 1e300, -1e300, math.inf, -math.inf, math.nan])
+
+
+@settings(max_examples=400)
+@given(st.sampled_from(sorted(CAMERAS)), st.tuples(WILD, WILD, WILD), st.tuples(WILD, WILD))
+def test_whatever_comes_in_what_is_good_can_be_undone(name: str, ray: tuple, pixel: tuple) -> None:
+    camera = CAMERAS[name]
+    with np.errstate(all="ignore"):
+        seen = lenses.pixels(camera, np.array([ray]))
+        if seen.status[0] == at.GOOD:
+            assert np.isfinite(seen.values).all()
+            assert np.isfinite(seen.slope).all() or not 1e-60 < max(map(abs, ray)) < 1e60
+            back = lenses.rays(camera, seen.values)
+            assert back.status[0] == at.GOOD
+            direction_ = np.array(ray) / max(map(abs, ray))
+            off = np.cross(back.values[0] / np.linalg.norm(back.values[0]), direction_ / np.linalg.norm(direction_))
+            np.testing.assert_allclose(off, 0.0, atol=1e-9)
+        found = lenses.rays(camera, np.array([pixel]))
+        if found.status[0] == at.GOOD:
+            assert np.isfinite(found.values).all()
+            again = lenses.pixels(camera, found.values)
+            assert again.status[0] in (at.GOOD, at.OUTSIDE_IMAGE)
+            np.testing.assert_allclose(again.values[0], pixel, rtol=0, atol=1e-8 * (1 + max(map(abs, pixel))))

@@ -78,9 +78,14 @@ def project_radial(lens: F64, hx: float, hy: float, hz: float) -> tuple:
     if not hz > 0.0 or (limit < math.inf and not ru < limit * (1.0 + (k1 + k2 * limit * limit) * limit * limit)):
         status = OUTSIDE_LENS
     rd = min(ru, limit)
+    if k1 >= 0.0 and k2 > 0.0:  # far outside: not far above r_d, where the first steps take a fifth off at a time
+        rd = min(rd, (ru / k2) ** 0.2)
     for _ in range(_STEPS):
         r2 = rd * rd
-        step = (rd * (1.0 + (k1 + k2 * r2) * r2) - ru) / (1.0 + (3.0 * k1 + 5.0 * k2 * r2) * r2)
+        slope = 1.0 + (3.0 * k1 + 5.0 * k2 * r2) * r2
+        if not slope > 0.0:  # at the limit
+            break
+        step = (rd * (1.0 + (k1 + k2 * r2) * r2) - ru) / slope
         rd = min(max(rd - step, 0.0), limit)
         if abs(step) <= _CLOSE * rd:
             break
@@ -127,6 +132,8 @@ def ray_radtan(lens: F64, u: float, v: float) -> tuple:
     for _ in range(_STEPS):
         xd, yd, j00, j01, j10, j11 = distort_radtan(lens, x, y)
         det = j00 * j11 - j01 * j10
+        if not abs(det) > 0.0:
+            break
         sx, sy = (j11 * (xd - a) - j01 * (yd - b)) / det, (j00 * (yd - b) - j10 * (xd - a)) / det
         x, y = x - sx, y - sy
         if abs(sx) + abs(sy) <= 4.0 * _CLOSE * (1.0 + abs(x) + abs(y)):
@@ -135,7 +142,7 @@ def ray_radtan(lens: F64, u: float, v: float) -> tuple:
     _, _, j00, j01, j10, j11 = distort_radtan(lens, x, y)
     det = j00 * j11 - j01 * j10
     if not (det > 0.0 and math.sqrt(x * x + y * y) < limit):
-        status = OUTSIDE_LENS
+        status, det = OUTSIDE_LENS, 1.0
     return status, x, y, 1.0, j11 / (det * fu), -j01 / (det * fv), -j10 / (det * fu), j00 / (det * fv), 0.0, 0.0
 
 
@@ -176,14 +183,16 @@ def ray_fisheye(lens: F64, u: float, v: float) -> tuple:
     status = OUTSIDE_LENS
     for _ in range(_STEPS):
         seen, slope = distort_fisheye(lens, theta)
+        if not slope > 0.0:  # at the limit
+            break
         step = (seen - d) / slope
         theta = min(max(theta - step, 0.0), limit)
         if abs(step) <= 4.0 * _CLOSE * (1.0 + theta):
             status = GOOD
             break
     _, slope = distort_fisheye(lens, theta)
-    if not theta < limit:
-        status = OUTSIDE_LENS
+    if not (theta < limit and slope > 0.0):
+        status, slope = OUTSIDE_LENS, 1.0
     sine, cosine = math.sin(theta), math.cos(theta)
     s, t = 1.0, 0.0
     if d > 1e-8:
@@ -208,7 +217,7 @@ def project_fisheye(lens: F64, hx: float, hy: float, hz: float) -> tuple:
     n2 = r2 + hz * hz
     r = math.sqrt(r2)
     theta = math.atan2(r, hz)
-    status = GOOD if theta < limit and n2 > 0.0 else OUTSIDE_LENS
+    status = GOOD if theta < limit and 0.0 < n2 < math.inf else OUTSIDE_LENS
     d, slope = distort_fisheye(lens, theta)
     m, c = 1.0 / hz, 0.0
     if r > 1e-8 * abs(hz):

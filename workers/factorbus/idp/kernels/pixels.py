@@ -124,7 +124,7 @@ def judged(good: int, depth: float, u: float, v: float, width: float, height: fl
     """The status of a pixel that the lens gave: whether it is one, in front, and in the image."""
     if good != GOOD:
         return OUTSIDE_LENS if depth > 0.0 else BEHIND
-    if not (abs(u) < math.inf and abs(v) < math.inf):
+    if not (abs(u) < math.inf and abs(v) < math.inf and abs(depth) < math.inf):
         return NOT_FINITE
     if width > 0.0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
         return OUTSIDE_IMAGE

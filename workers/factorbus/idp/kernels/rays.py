@@ -46,7 +46,7 @@ def rays(
         n2 = s2 + hy * hy
         s = math.sqrt(s2)
         if not s2 > _VERTICAL * _VERTICAL * n2:
-            good = VERTICAL
+            good, s, n2 = VERTICAL, 1.0, 1.0
         if not (abs(u) < math.inf and abs(v) < math.inf):
             good = NOT_FINITE
         status[k] = good
