@@ -3,8 +3,8 @@
     python tests/bench/idp.py [--json] [--figures FOLDER] [--no-workers]
 
 Multiplications are counted by the code that runs.  Seconds are the best of several runs in this process, on one core.
-The last part starts a service and workers; on a machine with two cores leave it alone meanwhile.  The exit code is 1
-when a target is missed.
+The last parts start a service and workers, one of them on the real tracks of `idp_euroc.py` where these are here; on a
+machine with two cores leave it alone meanwhile.  The exit code is 1 when a target is missed.
 """
 
 import argparse
@@ -12,12 +12,13 @@ import json
 import os
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core for everybody
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench import idp_bus, idp_paper, idp_times
+from bench import idp_bus, idp_euroc, idp_paper, idp_times
 
 _SIZES = ((3, 0), (10, 0), (100, 0), (1000, 0), (10, 100))
 _MANY = 10_000
@@ -52,6 +53,9 @@ def run(workers: bool) -> dict[str, Any]:
                 "multiplications": None,
             }
             rows.append(row | {"seconds": seconds, "workers": count, "extrapolated": False})
+        if folder := idp_euroc.try_find_tracks():
+            with TemporaryDirectory() as scratch:
+                found["euroc"] = idp_euroc.run(folder, 1, Path(scratch))
     found["targets"] = targets(found)
     return found
 
@@ -103,6 +107,8 @@ def report(found: dict[str, Any]) -> str:
     lines += ["", "Seconds, one process", "", *_times(found["rows"])]
     if "bus" in found:
         lines += ["", *_bus(found["bus"])]
+    if "euroc" in found:
+        lines += ["", idp_euroc.report(found["euroc"])]
     lines += ["", "Targets", ""]
     for target in found["targets"]:
         verdict = "met" if target["met"] else "MISSED"

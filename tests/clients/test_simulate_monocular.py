@@ -73,10 +73,10 @@ class Near:
     """Features made in this process."""
 
     def __init__(self, camera: Camera, **prior: float) -> None:
-        self._camera, self._prior = camera, prior
+        self.camera, self._prior = camera, prior
 
     def grow(self, x: np.ndarray, P: np.ndarray, pixels: np.ndarray) -> Grown:
-        sighting = Sighting(self._camera, x[:13], P[:13], pixels, **self._prior)
+        sighting = Sighting(self.camera, x[:13], P[:13], pixels, **self._prior)
         seen = see(sighting)
         after = minimal.covariance(P, sighting, seen).P
         return Grown(np.concatenate([x, seen.y.reshape(-1)]), after, seen.y, ("here",), 0.0)

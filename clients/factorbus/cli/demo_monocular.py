@@ -84,7 +84,7 @@ def demo(
                 show(frame.number + 1, f"{len(frame.rays)} features, {frame.error_m * 100:.1f} cm from the truth")
     truth = [frame.pose[:3] for frame in world]
     result = {**verdict(seen, sightseer), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
-    shares = [feature.sigma for feature in sightseer.ended if feature.matched >= 10]
+    shares = [course.share for _, course in sightseer.ended]
     save_sights(
         plot, [(f.number, f.position, f.rays, f.spread) for f in seen], truth, world.points, shares, _said(result)
     )
