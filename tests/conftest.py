@@ -1,10 +1,15 @@
 """What all tests share: where the public data sets are, and how hypothesis behaves."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+# Started in the background of a script, a process ignores SIGINT, and so do all it starts: those tests that interrupt
+# processes would wait for ever.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile(
     "factorbus",
