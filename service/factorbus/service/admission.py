@@ -220,7 +220,15 @@ def _remembered(client: _Client, arrived: Arrived) -> object:
 
 
 def _waiting(arrived: Arrived) -> Waiting:
-    return Waiting(arrived.client, arrived.sequence, arrived.size, arrived.digest, arrived.content, [arrived.asker])
+    return Waiting(
+        arrived.client,
+        arrived.sequence,
+        arrived.size,
+        arrived.digest,
+        arrived.content,
+        [arrived.asker],
+        arrived.message,
+    )
 
 
 def _wanted(client: _Client) -> str:

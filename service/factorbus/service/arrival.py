@@ -3,6 +3,7 @@
 from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.problems import Problem
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Asker, Refuse
 
 
@@ -17,8 +18,8 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
         place = _place(payload)
         if place is None:
             return Refuse(asker, problem)
-        return Arrived(asker, client, *place, len(payload), hash(payload), problem, now)
-    return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), hash(payload), insert, now)
+        return Arrived(asker, client, *place, len(payload), digest_of(payload), problem, now, payload)
+    return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), digest_of(payload), insert, now, payload)
 
 
 def _place(payload: bytes) -> tuple[int, int] | None:

@@ -25,6 +25,7 @@ class Arrived(NamedTuple):
 
     content: the message, or the problem with it when only its sequence number could be read; such an insert takes
     its place in the sequence and is refused there.  digest tells a repetition from another message of that number.
+    message: the bytes as they came, for the journal.
     """
 
     asker: Asker
@@ -35,6 +36,7 @@ class Arrived(NamedTuple):
     digest: int
     content: Insert | Problem
     now: float
+    message: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +49,14 @@ class Asked:
 
 
 class Outcome(NamedTuple):
-    """What became of one insert: the bytes of its Accepted, or why it was refused."""
+    """What became of one insert: the bytes of its Accepted, or why it was refused.
+
+    first_factor: the id of its first factor; −1 where it was refused.
+    """
 
     insert: "Waiting"
     answer: bytes | Any
+    first_factor: int = -1
 
 
 class Judged(NamedTuple):
@@ -60,13 +66,17 @@ class Judged(NamedTuple):
 
 
 class Stepped(NamedTuple):
-    """The solver made a step; the delta tells of it."""
+    """The solver made a step; the delta tells of it.
+
+    rebuilt: it brought back what had been accepted, in a new solver, after a fault.
+    """
 
     revision: int
     delta: bytes
     strategy: str
     chi2: float
     solver_ms: float
+    rebuilt: bool = False
 
 
 class Folded(NamedTuple):
@@ -91,6 +101,7 @@ class Waiting:
     digest: int
     content: Insert | Problem
     askers: list[Asker] = field(default_factory=list)
+    message: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,6 +153,7 @@ class Folder:
                 codec.encode_accepted(
                     Accepted(s.insert.sequence, self._epoch, self._revision, s.first_factor, len(staged), account)
                 ),
+                s.first_factor,
             )
             for s in staged
         ]
@@ -187,7 +188,7 @@ class Folder:
             account = self._rebuild()
             if account is not None:
                 self._revision += 1
-                yield self._told(account)
+                yield self._told(account)._replace(rebuilt=True)
         except Exception:
             self._broken = reference
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
