@@ -1,6 +1,9 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +14,16 @@ from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import BatchLike, FactorGroup, Group
-from factorbus.solver.incremental import Incremental
+from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import I64
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
+from factorbus.solver.state import State, dump, load
 from factorbus.solver.strategy import Plan
+from factorbus.solver.symbolic import Symbolic
 from factorbus.solver.system import System
 from factorbus.solver.tree_steps import TreeSteps
 
@@ -46,8 +51,13 @@ class _Done:
     batch: int = 0
 
 
+_VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Where)})
+
+
 class Solver:
     """Variables, factors and their estimate.  Not thread-safe: one thread owns it."""
+
+    NOT_KEPT = ("_options", "_mode")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -132,6 +142,17 @@ class Solver:
     def graph(self) -> tuple[list[Group], list[FactorGroup]]:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids."""
         return self._graph.variables(), self._graph.factors()
+
+    def dump(self) -> State:
+        """All that later steps depend on, as of the last step: `load` it into a solver with the same options.
+
+        That one goes on with the same bits, if it has the same `fingerprint`.  Nothing may be staged.
+        """
+        return dump(self)
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Be where the solver that gave `state` was.  Raises ValueError, and is of no use then."""
+        load(self, state, _VALUES)
 
     def _place_new(self) -> None:
         """Good first values for the few variables that a step of a robot brings."""

@@ -21,6 +21,8 @@ _LINE = 8  # doubles in a cache line
 class Tree:
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
+    NOT_KEPT = ("_graph", "_settings")
+
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph = graph
         self._recent, self._rounds = options.recent_steps, options.rounds

@@ -29,6 +29,8 @@ _START: Mark = (0,) * at.COUNTS
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
+    NOT_KEPT = ("_graph", "_options")
+
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = Tree(graph, options)
