@@ -20,6 +20,8 @@ COMMANDS = {
     "convert": ("convert", "Turn one file format into another."),
     "datasets": ("datasets", "The public data sets: what there is, where it is, and fetching it."),
     "warm": ("warm", "Compile the kernels ahead."),
+    "access": ("access", "Write who may do what as a Zenoh configuration: TLS, users, access control."),
+    "stats": ("stats", "What services count and time, asked over the bus."),
     "doctor": ("doctor", "Look for what is wrong on this machine, and say how to mend it."),
     "bench": ("bench", "Measure, beside what it is held against."),
     "version": ("version", "The version, and those of the libraries."),

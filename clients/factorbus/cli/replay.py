@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option
+from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option, zenoh_option
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +29,8 @@ class Request:
     tum: Path | None
     out: Path | None
     plot: Path | None
+    client: str = "replay"
+    zenoh: str = ""
 
     @property
     def where(self) -> str:
@@ -42,6 +44,10 @@ class Request:
 @file_argument("file")
 @click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
 @click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
+@zenoh_option
+@click.option(
+    "--client", default="replay", show_default=True, metavar="NAME", help="Who we are, where access control asks."
+)
 @click.option(
     "--wait",
     "wait_s",
@@ -165,7 +171,7 @@ def _target(request: Request) -> Iterator[Any]:
             note(f"solver process {solver.pid} on {endpoint}")
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
-        bus = stack.enter_context(connect(endpoint, client="replay", timeout_s=request.wait_s))
+        bus = stack.enter_context(connect(endpoint, client=request.client, zenoh=request.zenoh, timeout_s=request.wait_s))
         if solver is not None:
             solver.when_ended(bus.close)
         joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))

@@ -26,6 +26,13 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
 @click.option(
     "--config", type=click.Path(path_type=Path), metavar="FILE.toml", help="Settings; what is given here wins."
 )
+@click.option("--zenoh", metavar="FILE.json5", help="Zenoh configuration: TLS, users, access control (deploy/zenoh).")
+@click.option(
+    "--insecure",
+    is_flag=True,
+    default=None,
+    help="Listen to other machines even where whoever reaches the port could read and write.",
+)
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
@@ -34,16 +41,17 @@ def command(config: Path | None, until_eof: bool, quiet: bool, **given: Any) -> 
     """Own maps, take inserts, answer questions. Runs until Ctrl-C or SIGTERM, and finishes all it has accepted.
 
     Prints `ready ENDPOINT ...` when clients can connect. The log goes to standard error. On a cold start the kernels
-    are compiled first, which takes a while and is said; `factorbus warm` does it ahead.
+    are compiled first, which takes a while and is said; `factorbus warm` does it ahead. It does not listen beyond this
+    machine without encryption, identities and access control; `factorbus access` writes them down.
 
     \b
     factorbus serve
-    factorbus serve --listen tcp/0.0.0.0:7447 --map warehouse
+    factorbus serve --listen tls/0.0.0.0:7447 --zenoh service.json5 --map warehouse
     factorbus serve --config /etc/factorbus/serve.toml
 
     \b
     A configuration file has the names of these options and more, for example:
-      listen = ["tcp/0.0.0.0:7447"]
+      listen = ["tls/0.0.0.0:7447"]
       create = ["warehouse"]
       zenoh = "/etc/factorbus/zenoh.json5"     # TLS, users, access control
       [limits]

@@ -12,6 +12,7 @@ are rare, and putting large covariances together borrow a thread of the loop's e
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from os import PathLike
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -36,9 +37,12 @@ async def connect(
     client: str = "client",
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
+    zenoh: str | PathLike[str] = "",
 ) -> AsyncIterator["Bus"]:
     """As `factorbus.client.connect`, in `async with`."""
-    bus = await asyncio.to_thread(sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings)
+    bus = await asyncio.to_thread(
+        sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings, zenoh=zenoh
+    )
     try:
         yield Bus(bus)
     finally:
@@ -74,8 +78,12 @@ class Bus:
             front.close()
 
     async def maps(self) -> list[MapRow]:
-        """The maps of the service.  Raises Refused, Unavailable."""
+        """The maps there are.  Raises Refused, Unavailable."""
         return await asyncio.to_thread(self._bus.maps)
+
+    async def stats(self) -> list[dict[str, Any]]:
+        """What each service counts and times.  Raises Refused, Unavailable."""
+        return await asyncio.to_thread(self._bus.stats)
 
     async def create(self, name: str, mode: str = "auto") -> MapRow:
         """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""

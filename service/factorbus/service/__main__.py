@@ -38,6 +38,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--mode", choices=("peer", "router", "client"))
     parser.add_argument("--name", help="of this service, in its liveliness tokens")
     parser.add_argument("--maps", metavar="PATTERN", help="the maps it answers for: a name or a beginning and *")
+    parser.add_argument("--zenoh", metavar="FILE", help="Zenoh configuration: TLS, users, access control")
+    parser.add_argument("--insecure", action="store_true", help="listen to other machines even without these")
     parser.add_argument("--create", action="append", metavar="MAP", help="a map to have from the start")
     parser.add_argument("--no-warm", action="store_true", help="compile kernels when they are first used")
     return parser
@@ -46,11 +48,13 @@ def _parser() -> argparse.ArgumentParser:
 def _config(options: argparse.Namespace) -> Config:
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
-        for name in ("listen", "connect", "mode", "name", "maps", "create")
+        for name in ("listen", "connect", "mode", "name", "maps", "create", "zenoh")
         if (value := getattr(options, name)) is not None
     }
     if options.no_warm:
         given["warm"] = False
+    if options.insecure:
+        given["insecure"] = True
     return load(options.config, **given) if options.config else checked(replace(Config(), **given))
 
 

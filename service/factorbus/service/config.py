@@ -55,6 +55,7 @@ class Config:
     "client" needs `connect` and meets its clients at a router.  maps: the names this service answers for, a name or
     a beginning and `*`; several services at one router need patterns that do not overlap.  create: maps there are
     from the start.  zenoh: path of a Zenoh configuration file for everything not said here (TLS, access control).
+    insecure: listen beyond this machine even without these.
     """
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -64,6 +65,7 @@ class Config:
     maps: str = "*"
     create: tuple[str, ...] = ()
     zenoh: str = ""
+    insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
     job_deadline_s: float = 120.0  # for one worker to answer one job
     limits: Limits = field(default_factory=Limits)
