@@ -16,8 +16,8 @@ from factorbus.cli.options import file_argument, out_option
 @click.option(
     "--certificates", default="/etc/factorbus/certificates", show_default=True, metavar="FOLDER", help="Of ca.pem etc."
 )
-@click.option("--name", default="solver", show_default=True, metavar="NAME", help="NAME.pem, NAME.key are the server's.")
-@click.option("--users", default="", metavar="FILE", help="Know clients by password, from FILE with lines NAME:PASSWORD.")
+@click.option("--name", default="solver", show_default=True, metavar="NAME", help="NAME.pem and NAME.key serve.")
+@click.option("--users", default="", metavar="FILE", help="Know clients by password; lines NAME:PASSWORD.")
 @click.option("--client", default="", metavar="NAME", help="Write the configuration of client NAME instead.")
 @out_option("--out", "out", "Write it here instead of to standard output.", "FILE.json5")
 def command(file: Path, certificates: str, name: str, users: str, client: str, out: Path | None) -> None:
@@ -102,7 +102,7 @@ def _write(text: str, out: Path | None, secret: bool) -> None:
     if out is None:
         click.echo(text, nl=False)
         return
-    with input_file(out), out.open("w", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+    with input_file(out), os.fdopen(os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         os.fchmod(file.fileno(), 0o600 if secret else 0o644)
         file.write(text)
     click.echo(f"{out} written", err=True)

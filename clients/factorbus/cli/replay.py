@@ -171,7 +171,9 @@ def _target(request: Request) -> Iterator[Any]:
             note(f"solver process {solver.pid} on {endpoint}")
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
-        bus = stack.enter_context(connect(endpoint, client=request.client, zenoh=request.zenoh, timeout_s=request.wait_s))
+        bus = stack.enter_context(
+            connect(endpoint, client=request.client, zenoh=request.zenoh, timeout_s=request.wait_s)
+        )
         if solver is not None:
             solver.when_ended(bus.close)
         joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))

@@ -56,7 +56,11 @@ class Link:
     def ask_all(self, key: str, payload: bytes, timeout_s: float, done: Callable[[list[Reply]], None]) -> None:
         """Query `key`; `done` is called once, when the query has ended, with what everybody who answered said."""
         replies: list[Reply] = []
-        handler = Callback(lambda r: replies.append(_read(r)), drop=lambda: done(replies), indirect=False)
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            replies.append(_read(reply))
+
+        handler = Callback(on_reply, drop=lambda: done(replies), indirect=False)
         try:
             self._session.get(
                 key, handler, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE

@@ -12,10 +12,17 @@ The rules, in the order they are tried (n is the number that the client has to s
     further                             bad_sequence
 
 Parked inserts have room of their own: were they to fill the inbox, the one that closes the gap would find it full.
+
+Nobody stands in another's way by sending much.  Who has nothing waiting finds room for one insert (not a huge one) in a
+full inbox, too.  The order is that of a fair queue (start-time fair queueing, Goyal and others, 1996): each client's
+inserts are laid end to end by their sizes on a time line of its own, which begins where the others are; the insert that
+begins first goes first.  So a small one overtakes large ones of others, and equal ones take turns.
 """
 
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count
 
 from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, TooLarge, WrongEpoch
 from factorbus.service.config import Limits
@@ -24,6 +31,11 @@ from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse, Wai
 # How many may wait for one and the same answer.
 _ASKERS = 8
 _RETRY_S = (0.02, 2.0)
+# What an insert counts for besides its bytes: a step has its price, however small.
+_INSERT_COST = 1024
+# One sender (all clients of one name before its suffix) has at most this share of the names that are remembered.
+_NAMES_OF_ONE = 4
+_NAME_IDLE_S = 10.0
 
 
 @dataclass(slots=True)
@@ -31,6 +43,7 @@ class _Client:
     """One client's place in its sequence."""
 
     next: int = 1
+    served: float = 0.0  # where its inserts on the time line of fairness end
     heard: float = 0.0  # when it last sent what it has to send next
     seen: float = 0.0  # when it last sent anything
     ready: deque[Waiting] = field(default_factory=deque)
@@ -45,7 +58,8 @@ class Admission:
     def __init__(self, epoch: int, limits: Limits) -> None:
         self._epoch, self._limits = epoch, limits
         self._clients: dict[str, _Client] = {}
-        self._turns: deque[str] = deque()  # clients with something ready, next in turn first
+        self._turns: list[tuple[float, int, str]] = []  # heap of (begin, order, client with something ready)
+        self._clock, self._order = 0.0, count()
         self._ready = self._parked = self._bytes = 0
         self._pace_s = 0.01  # seconds per insert, smoothed
         self._closing: Problem | None = None
@@ -73,14 +87,22 @@ class Admission:
             return [Refuse(arrived.asker, problem)]
 
     def take(self, most: int) -> tuple[Waiting, ...]:
-        """Up to `most` inserts for the next step: one of each client in turn, and again."""
+        """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first."""
         taken: list[Waiting] = []
+        room = self._limits.fold_bytes
         while self._turns and len(taken) < most:
-            name = self._turns.popleft()
-            queue = self._clients[name].ready
-            taken.append(queue.popleft())
-            if queue:
-                self._turns.append(name)
+            begin, _, name = self._turns[0]
+            client = self._clients[name]
+            insert = client.ready[0]
+            if taken and insert.size > room:
+                break
+            heappop(self._turns)
+            room -= insert.size
+            taken.append(client.ready.popleft())
+            self._clock = begin
+            client.served = begin + insert.size + _INSERT_COST
+            if client.ready:
+                heappush(self._turns, (client.served, next(self._order), name))
         self._ready -= len(taken)
         return tuple(taken)
 
@@ -110,8 +132,9 @@ class Admission:
         self._closing = problem or ShuttingDown()
         effects = [e for c in self._clients.values() for e in self._unpark(c, self._closing)]
         if problem is not None:
-            for insert in self.take(self._ready):
-                effects += self.answer(insert, problem)
+            while self._ready:
+                for insert in self.take(self._ready):
+                    effects += self.answer(insert, problem)
         return effects
 
     def took(self, inserts: int, seconds: float) -> None:
@@ -145,12 +168,26 @@ class Admission:
 
         Every run of a client has a name of its own, so the names of those long silent make room.
         """
+        self._check_share(arrived)
         if len(self._clients) >= self._limits.clients:
             name, idlest = min(self._clients.items(), key=lambda item: (bool(item[1].open), item[1].seen))
             if idlest.open or arrived.now - idlest.seen < self._limits.client_idle_s:
                 raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
             del self._clients[name]
         return _Client(heard=arrived.now)
+
+    def _check_share(self, arrived: Arrived) -> None:
+        """A sender that keeps coming under new names does not use up the names of all: it makes room among its own."""
+        sender, share = _sender(arrived.client), max(self._limits.clients // _NAMES_OF_ONE, 1)
+        if len(self._clients) < share:
+            return
+        own = {name: client for name, client in self._clients.items() if _sender(name) == sender}
+        if len(own) < share:
+            return
+        name, idlest = min(own.items(), key=lambda item: (bool(item[1].open), item[1].seen))
+        if idlest.open or arrived.now - idlest.seen < _NAME_IDLE_S:
+            raise TooLarge(f"{sender} in this map", len(own) + 1, share, "clients")
+        del self._clients[name]
 
     def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> list[Effect]:
         """One more waits for the answer; of too many, the first is told to come back: it has most likely given up."""
@@ -163,8 +200,10 @@ class Admission:
         """Into the inbox, and with it whatever waited for just this one."""
         client.heard = arrived.now
         # The smallest inbox still takes one insert, whatever its size.
-        crowded = self._ready and self._bytes + arrived.size > self._limits.waiting_bytes
-        if self._ready >= self._limits.waiting or crowded:
+        limits = self._limits
+        crowded = self._ready and self._bytes + arrived.size > limits.waiting_bytes
+        full = crowded or self._ready >= limits.waiting
+        if full and (client.ready or arrived.size > limits.waiting_bytes // limits.clients):
             raise self._busy()
         self._bytes += arrived.size
         self._make_ready(client, _waiting(arrived))
@@ -174,7 +213,7 @@ class Admission:
 
     def _make_ready(self, client: _Client, insert: Waiting) -> None:
         if not client.ready:
-            self._turns.append(insert.client)
+            heappush(self._turns, (max(self._clock, client.served), next(self._order), insert.client))
         client.ready.append(insert)
         client.open[insert.sequence] = insert
         client.next += 1
@@ -228,7 +267,13 @@ def _waiting(arrived: Arrived) -> Waiting:
         arrived.content,
         [arrived.asker],
         arrived.message,
+        arrived.now,
     )
+
+
+def _sender(client: str) -> str:
+    """robot1 of robot1-5f3a90c1: the library adds a suffix with every run."""
+    return client.rpartition("-")[0] or client
 
 
 def _wanted(client: _Client) -> str:

@@ -1,5 +1,6 @@
 """What an operator may set: endpoints, which maps, limits.  From code, or from a TOML file of the same names."""
 
+import re
 import tomllib
 import types
 from collections.abc import Mapping
@@ -9,6 +10,10 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.problems import Problem
+
+_HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
+# Limits for which 0 means: find it out.
+_MAY_BE_0 = ("memory_bytes",)
 
 
 class BadConfig(Problem):
@@ -31,7 +36,8 @@ class Limits:
     waiting_bytes: int = 256 << 20
     questions: int = 256  # waiting for the solver to come to a revision
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
-    fold: int = 64  # inserts that one step takes in
+    fold: int = 64  # inserts that one step takes in ...
+    fold_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
     parked_s: float = 5.0  # how long an insert waits for the one before it
     message_bytes: int = 64 << 20
     insert_variables: int = 1_000_000
@@ -41,6 +47,8 @@ class Limits:
     keyframe_steps: int = 1000  # a keyframe after so many steps ...
     keyframe_bytes: int = 64 << 20  # ... or so many bytes of deltas
     jobs: int = 64  # batch optima being computed or waiting, in this service
+    sessions: int = 1000  # connections to this service
+    memory_bytes: int = 0  # of this process, before what would make maps grow is refused; 0: 4/5 of what there is
 
     def message(self) -> MessageLimits:
         """The codec's part of the limits."""
@@ -68,6 +76,8 @@ class Config:
     insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
     job_deadline_s: float = 120.0  # for one worker to answer one job
+    stuck_s: float = 120.0  # a thread that does not come to its next work for so long is stuck, the service not alive
+    metrics: str = ""  # HOST:PORT where /metrics, /live and /ready are served over HTTP; empty: nowhere
     limits: Limits = field(default_factory=Limits)
 
 
@@ -90,10 +100,14 @@ def checked(config: Config) -> Config:
     if config.mode != "client" and not config.listen and not config.connect:
         raise BadConfig('there is nothing to listen on or connect to; give listen = ["tcp/127.0.0.1:7447"]')
     for name in (f.name for f in fields(Limits)):
-        if getattr(config.limits, name) <= 0:
+        least = 0 if name in _MAY_BE_0 else 1e-9
+        if getattr(config.limits, name) < least:
             raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
-    if config.job_deadline_s <= 0:
-        raise BadConfig(f"job_deadline_s is {config.job_deadline_s}; wanted more than 0")
+    for name in ("job_deadline_s", "stuck_s"):
+        if getattr(config, name) <= 0:
+            raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
+    if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
+        raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
     stem = config.maps.removesuffix("*")
     if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
         raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")

@@ -31,6 +31,7 @@ from factorbus.service.events import (
     Tell,
     Waiting,
 )
+from factorbus.service.histogram import Histogram
 from factorbus.service.questions import Question, parse
 
 _KEYFRAME = Read(Question("keyframe"))
@@ -59,6 +60,8 @@ class MapCore:
         self._strategies: Counter[str] = Counter()
         self._counts: Counter[str] = Counter()
         self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
+        self._refusals: Counter[str] = Counter()
+        self._step_s, self._insert_s = Histogram(), Histogram()
 
     def row(self) -> dict[str, Any]:
         """What admin/maps says of this map."""
@@ -79,9 +82,10 @@ class MapCore:
         """An insert came in."""
         effects = self._admission.expire(arrived.now)
         judged = self._admission.admit(arrived)
+        self._counts["received_bytes"] += arrived.size
         for effect in judged:
             if isinstance(effect, Refuse):
-                self._counts["busy" if effect.problem.code == "busy" else "refused"] += 1
+                self._refused(effect.problem)
         return self._go_on(effects + judged, arrived.now)
 
     def ask(self, asked: Asked, now: float) -> list[Effect]:
@@ -104,7 +108,11 @@ class MapCore:
         effects: list[Effect] = []
         for outcome in judged.outcomes:
             effects += self._admission.answer(outcome.insert, outcome.answer)
-            self._counts["accepted" if isinstance(outcome.answer, bytes) else "refused"] += 1
+            if isinstance(outcome.answer, bytes):
+                self._counts["accepted"] += 1
+                self._counts["answered_bytes"] += len(outcome.answer)
+            else:
+                self._refused(outcome.answer)
         return effects
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
@@ -113,6 +121,8 @@ class MapCore:
         self._chi2 = stepped.chi2
         self._solver_ms += stepped.solver_ms
         self._strategies[stepped.strategy] += 1
+        self._step_s.add(stepped.solver_ms / 1e3)
+        self._counts["published_bytes"] += len(stepped.delta)
         self._since_keyframe[0] += 1
         self._since_keyframe[1] += len(stepped.delta)
         steps, size = self._since_keyframe
@@ -128,6 +138,8 @@ class MapCore:
         self._ended = folded.now
         seconds = self._ended - self._started
         self._admission.took(len(taken), seconds)
+        for insert in taken:
+            self._insert_s.add(folded.now - insert.since)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
         return self._go_on([], folded.now)
@@ -172,6 +184,24 @@ class MapCore:
             "solver_ms": self._solver_ms,
             "solver_cpu_s": self._solver_cpu_s,
         }
+
+    def account(self, now: float) -> dict[str, Any]:
+        """What admin/stats says of this map: `stats`, with what only an operator asks for."""
+        return self.stats(now) | {
+            "clients": len(self._admission.next_sequences),
+            "refusals": dict(self._refusals),
+            "step_s": self._step_s.as_dict(),
+            "insert_s": self._insert_s.as_dict(),
+            "bytes": {name: self._counts[f"{name}_bytes"] for name in ("received", "answered", "published")},
+        }
+
+    def running_s(self, now: float) -> float:
+        """For how long the solver has been at what it has; 0 when it is free."""
+        return now - self._started if self._running is not None else 0.0
+
+    def _refused(self, problem: Any) -> None:
+        self._counts["busy" if problem.code == "busy" else "refused"] += 1
+        self._refusals[problem.code] += 1
 
     def _go_on(self, effects: list[Effect], now: float) -> list[Effect]:
         """Give the solver what waits, if it is free."""

@@ -102,6 +102,7 @@ class Waiting:
     content: Insert | Problem
     askers: list[Asker] = field(default_factory=list)
     message: bytes = b""
+    since: float = 0.0  # when it arrived
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,12 +16,13 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core import MapCore
 from factorbus.service.events import Arrived, Asked, Effect, Judged, Read, Refuse, Run, Stepped
 from factorbus.service.fold import Folder
+from factorbus.service.health import Pulse
 from factorbus.service.questions import Snapshot
 from factorbus.solver.errors import SolverError
 
@@ -51,7 +52,8 @@ class Host:
         self.core = core
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
         self._lock = threading.Lock()
-        self._runs: queue.SimpleQueue[Run | None] = queue.SimpleQueue()
+        self._runs: queue.SimpleQueue[Run | Callable[[], None] | None] = queue.SimpleQueue()
+        self._pulse = Pulse(self._runs.put)
         self._thread = threading.Thread(target=self._solve_all, name=f"solver {core.name}", daemon=True)
         self._thread.start()
 
@@ -84,6 +86,18 @@ class Host:
             effects = self.core.tick(time.monotonic())
         self._perform(effects)
 
+    def account(self) -> dict[str, Any]:
+        """What admin/stats says of the map."""
+        with self._lock:
+            return self.core.account(time.monotonic())
+
+    def silent_s(self) -> float:
+        """For how long the solver has not come to its next work, whichever thread it is on."""
+        now = time.monotonic()
+        with self._lock:
+            running_s = self.core.running_s(now)
+        return max(running_s, self._pulse.silent_s(now))
+
     def stop(self) -> None:
         """Take nothing new; Drained is performed when everything accepted is answered."""
         with self._lock:
@@ -110,7 +124,10 @@ class Host:
 
     def _solve_all(self) -> None:
         while (run := self._runs.get()) is not None:
-            self._solve(run, self._do)
+            if isinstance(run, Run):
+                self._solve(run, self._do)
+            else:
+                run()
 
     def _solve(self, run: Run, tell: Perform) -> None:
         try:
