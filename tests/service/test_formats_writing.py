@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.formats import FormatError, g2o_text, read, tum_text, write_g2o, write_tum
+from factorbus.formats import FormatError, g2o_text, kitti_text, read, tum_text, write_g2o, write_kitti, write_tum
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -166,3 +166,15 @@ def test_tum_of_two_robots_and_of_poses_without_value() -> None:
     assert [line.split()[:2] for line in tum_text(Batch((two, one))).splitlines()] == [["0", "0.0"], ["1", "1.0"]]
     with pytest.raises(FormatError, match="x1 has no value"):
         tum_text(Batch((Variables("se2", np.array([symbol("x", 1)])),)))
+
+
+def test_text_of_kitti(tmp_path: Path) -> None:
+    """The same poses as in TUM form, as matrices; a quarter turn about z takes x to y."""
+    space = Variables("se3", np.array([symbol("x", 12)]), np.array([[1, 2, 3, 0.5, 0.5, 0.5, -0.5]]))
+    batch = Batch((space, *small().variables))
+    rows = np.array([[float(word) for word in line.split()] for line in kitti_text(batch).splitlines()])
+    poses = rows.reshape(-1, 3, 4)
+    np.testing.assert_allclose(poses[1], [[0, -1, 0, 1], [1, 0, 0, 0.5], [0, 0, 1, 0]], atol=1e-15)
+    np.testing.assert_allclose(poses[2], [[0, 1, 0, 1], [0, 0, 1, 2], [1, 0, 0, 3]], atol=1e-15)
+    write_kitti(tmp_path / "a.kitti", batch)
+    assert (tmp_path / "a.kitti").read_text() == kitti_text(batch)

@@ -23,7 +23,11 @@ EXIT_CODES = {
 }
 
 # What the extras of pyproject.toml bring, by import name.
-EXTRAS = {"service": ("numba", "scipy", "sksparse"), "viz": ("matplotlib",)}
+EXTRAS = {
+    "service": ("numba", "scipy", "sksparse"),
+    "viz": ("matplotlib",),
+    "record": ("foxglove",),
+}
 
 _USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_setting", "exposed")
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down")

@@ -27,6 +27,7 @@ class Request:
     use_values: bool
     settle: bool
     tum: Path | None
+    kitti: Path | None
     out: Path | None
     plot: Path | None
     client: str = "replay"
@@ -70,6 +71,7 @@ class Request:
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
 @click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
+@out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @json_option
@@ -191,13 +193,15 @@ def _target(request: Request) -> Iterator[Any]:
 
 
 def _write(request: Request, target: Any) -> None:
-    from factorbus.formats import write_g2o, write_tum
+    from factorbus.formats import write_g2o, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
     if request.out:
         write_g2o(request.out, target.graph())
     if request.tum:
         write_tum(request.tum, Batch(target.estimate()))
+    if request.kitti:
+        write_kitti(request.kitti, Batch(target.estimate()))
 
 
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:

@@ -158,7 +158,7 @@ class Map:
         return self.ask.stats(timeout_s).result()
 
     def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
+        """The map as the text of a file: "g2o", "tum" or "kitti".  Raises Refused, Unavailable."""
         return self.ask.export(format, timeout_s).result()
 
     def close(self) -> None:

@@ -4,7 +4,6 @@ A snapshot is taken on the solver's thread between two steps and is a copy: maki
 somebody else's time, and no reader sees half a step or holds one up.
 """
 
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Vari
 from factorbus.proto.problems import BadMessage, Problem, UnknownQuestion
 from factorbus.proto.symbols import format_symbol
 
-_FORMATS = ("g2o", "tum")
+_FORMATS = ("g2o", "tum", "kitti")
 
 
 class NotInMap(Problem):
@@ -128,11 +127,9 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
 
 
 def _text(kind: str, batch: Batch) -> str:
-    from factorbus.formats import write_g2o, write_tum  # only who asks for an export pays for it
+    from factorbus.formats import g2o_text, kitti_text, tum_text  # only who asks for an export pays for it
 
-    text = io.StringIO()
-    (write_g2o if kind == "g2o" else write_tum)(text, batch)
-    return text.getvalue()
+    return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[kind](batch)
 
 
 def _flag(content: dict[str, Any], name: str) -> bool:
