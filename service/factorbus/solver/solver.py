@@ -17,6 +17,7 @@ from factorbus.solver.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
@@ -92,6 +93,19 @@ class Solver:
             raise
         return mark[at.FACTORS]
 
+    def try_stage(self, raw: bytes, groups: I64) -> int | None:
+        """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
+
+        groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
+        caller's word: they are not checked again.
+        """
+        graph = self._graph
+        first = admit_bytes(
+            raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
+            graph.counts,
+        )  # fmt: skip
+        return first if first >= 0 else None
+
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
 
@@ -129,7 +143,11 @@ class Solver:
 
     def changed(self) -> list[Group]:
         """The variables whose values have other bits than before the last step, new ones included, in the same form."""
-        return self._graph.variables(self._tree.changed() if self._tree else self._changed)
+        return self._graph.variables(self.pick_changed()[0])
+
+    def pick_changed(self) -> tuple[I64, Graph]:
+        """What `changed` tells of, as indices of variables, ascending, and the arenas to look them up in, to be read."""
+        return self._tree.changed() if self._tree else self._changed, self._graph
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""

@@ -67,6 +67,7 @@ BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 _EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _KEPT_FOLDERS = 6
 
@@ -76,10 +77,15 @@ class KernelFolder:
 
     family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
     is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
+    quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be given back.
+    also: files outside the folder whose constants its kernels use.
     """
 
-    def __init__(self, sources: Path, family: str, exact: bool = False) -> None:
-        self._sources, self._family, self._flags = sources, family, _EXACT_FLAGS if exact else _FLAGS
+    def __init__(
+        self, sources: Path, family: str, exact: bool = False, quick: bool = False, also: tuple[Path, ...] = ()
+    ) -> None:
+        self._sources, self._family, self._also = sources, family, also
+        self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
         self._cache = _cache_in(self)
         self._path: Path | None = None
 
@@ -119,7 +125,7 @@ class KernelFolder:
 
     def _make(self) -> Path:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
-        path = base / self._family / sources_hash(self._sources)
+        path = base / self._family / sources_hash(self._sources, *self._also)
         try:
             path.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=path).close()
@@ -156,10 +162,10 @@ def cache_folder() -> Path:
     return _FOLDER.path()
 
 
-def sources_hash(folder: Path) -> str:
-    """The name of the cache folder for kernels whose sources are the Python files in `folder`, and this one."""
+def sources_hash(folder: Path, *also: Path) -> str:
+    """The name of the cache folder for kernels whose sources are the Python files in `folder`, this one and `also`."""
     digest = hashlib.sha256()
-    for path in sorted({*folder.glob("*.py"), Path(__file__)}, key=lambda path: path.name):
+    for path in sorted({*folder.glob("*.py"), Path(__file__), *also}, key=lambda path: path.name):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
     features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)

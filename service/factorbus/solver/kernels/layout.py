@@ -65,3 +65,18 @@ WRONG_KIND_SECOND = 7
 SELF_LOOP = 8
 BAD_RANGE = 9
 NOT_POSITIVE_DEFINITE = 10
+
+# Columns of `groups`: groups of variables and factors whose numbers lie in the bytes of a message, little-endian, one
+# row each in any order, and after the last one a row of kind END.  An offset is that of the first byte.
+G_KIND = 0
+G_FACTORS = 1  # 0: variables, 1: factors
+G_COUNT = 2
+G_FIXED = 3  # 1: variables that are held where they are
+G_ARITY = 4  # keys of a factor; 1 for variables
+G_SIZE = 5  # numbers of a value or a measurement
+G_TRIANGLE = 6  # numbers of an information matrix; 0 for variables
+G_KEYS = 7  # offset of the keys
+G_NUMBERS = 8  # offset of the values, -1: they come without; or of the measurements
+G_INFORMATION = 9  # offset of the information matrices; -1 for variables
+G_WIDTH = 10
+END = -1
