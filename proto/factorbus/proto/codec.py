@@ -61,6 +61,11 @@ def encode_accepted(message: Accepted) -> bytes:
     )
 
 
+def encode_report(report: Mapping[str, Any]) -> bytes:
+    """The bytes of a report as it stands in the answer to an insert and in a delta."""
+    return _pack(report)
+
+
 def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:
     """The answer to an insert that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("accepted", data, limits)

@@ -86,6 +86,27 @@ class Admission:
         except Problem as problem:
             return [Refuse(arrived.asker, problem)]
 
+    def take_alone(self, arrived: Arrived) -> Waiting | None:
+        """The insert as taken, if it is next, and nothing else waits here or is parked; None: `admit` it."""
+        client = self._clients.get(arrived.client)
+        if (
+            client is None
+            or arrived.sequence != client.next
+            or arrived.epoch not in (0, self._epoch)
+            or self._ready
+            or self._parked
+            or self._closing is not None
+        ):
+            return None
+        insert = _waiting(arrived)
+        client.seen = client.heard = arrived.now
+        client.open[arrived.sequence] = insert
+        client.next += 1
+        self._bytes += arrived.size
+        self._clock = begin = max(self._clock, client.served)
+        client.served = begin + arrived.size + _INSERT_COST
+        return insert
+
     def take(self, most: int) -> tuple[Waiting, ...]:
         """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first."""
         taken: list[Waiting] = []

@@ -1,10 +1,19 @@
 """The bytes of an insert as the event that they are."""
 
+import numpy as np
+
 from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.problems import Problem
 from factorbus.service.digest import digest_of
-from factorbus.service.events import Arrived, Asker, Refuse
+from factorbus.service.events import Arrived, Asker, Located, Refuse
+from factorbus.service.kernels import read
+from factorbus.service.kernels.words import LETTERS, WORDS
+from factorbus.solver.kernels import layout
+
+# Of messages above this size, looking closely is a small part of the work; and so many groups are no usual message.
+_SHORT_BYTES = 16 << 10
+_GROUPS = 30
 
 
 def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
@@ -12,6 +21,9 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
 
     A message that is wrong inside still uses up its number, so that the ones after it need not wait for it.
     """
+    if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, limits)):
+        sequence, epoch, content = located
+        return Arrived(asker, client, sequence, epoch, len(payload), digest_of(payload), content, now, payload)
     try:
         insert = codec.decode_insert(payload, limits)
     except Problem as problem:
@@ -20,6 +32,17 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
             return Refuse(asker, problem)
         return Arrived(asker, client, *place, len(payload), digest_of(payload), problem, now, payload)
     return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), digest_of(payload), insert, now, payload)
+
+
+def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, Located] | None:
+    """(sequence, epoch, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
+    size = len(payload)
+    # A key is eight bytes: without counting, no more than this can be in it.
+    if size > limits.max_bytes or size > 8 * limits.max_variables or size > 8 * limits.max_factors:
+        return None
+    groups = np.empty((_GROUPS + 1, layout.G_WIDTH), np.int64)
+    sequence, epoch, settle = read.read_insert(payload, WORDS, LETTERS, groups)
+    return (sequence, epoch, Located(payload, groups, settle != 0)) if sequence else None
 
 
 def _place(payload: bytes) -> tuple[int, int] | None:

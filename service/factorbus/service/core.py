@@ -12,17 +12,20 @@ from collections import Counter, deque
 from typing import Any
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
 from factorbus.service.events import (
+    Alone,
+    Answer,
     Arrived,
     Asked,
+    Asker,
     Drained,
     Effect,
     Folded,
     Judged,
+    Located,
     Publish,
     Read,
     Refuse,
@@ -80,6 +83,9 @@ class MapCore:
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
+        if isinstance(arrived.content, Located) and (run := self._try_alone(arrived, arrived.content.settle)):
+            self._counts["received_bytes"] += arrived.size
+            return [run]
         effects = self._admission.expire(arrived.now)
         judged = self._admission.admit(arrived)
         self._counts["received_bytes"] += arrived.size
@@ -115,8 +121,25 @@ class MapCore:
                 self._refused(outcome.answer)
         return effects
 
+    def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
+        """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
+        outcome, stepped, folded = alone
+        others = [
+            effect
+            for effect in self._admission.answer(outcome.insert, outcome.answer)
+            if not (isinstance(effect, Answer) and effect.asker is answered)
+        ]
+        self._counts["accepted"] += 1
+        self._counts["answered_bytes"] += len(outcome.answer)
+        self._count(stepped)
+        return others + self.folded(folded)
+
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
+        self._count(stepped)
+        return [Publish("delta", stepped.delta)]
+
+    def _count(self, stepped: Stepped) -> None:
         self.revision = stepped.revision
         self._chi2 = stepped.chi2
         self._solver_ms += stepped.solver_ms
@@ -129,7 +152,6 @@ class MapCore:
         if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
             self._since_keyframe = [0, 0]
             self._reads.append(_KEYFRAME)
-        return [Publish("delta", stepped.delta)]
 
     def folded(self, folded: Folded) -> list[Effect]:
         """The solver is free again."""
@@ -218,11 +240,25 @@ class MapCore:
             effects.append(Drained())
         return effects
 
+    def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
+        """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
+        if self._running is not None or self._reads or settle or not self._is_quick(arrived.size, arrived.now):
+            return None
+        insert = self._admission.take_alone(arrived)
+        if insert is None:
+            return None
+        self._started = arrived.now
+        self._running = run = Run((), (insert,), True)
+        return run
+
     def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Waiting, ...], now: float) -> bool:
-        if reads or len(inserts) != 1 or self._slowest_s > _SHORT_S or now - self._ended < _ROUND_TRIP_S:
+        if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        return inserts[0].size <= _SHORT_BYTES and not (isinstance(content, Insert) and content.settle)
+        return isinstance(content, Problem) or not content.settle
+
+    def _is_quick(self, size: int, now: float) -> bool:
+        return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S
 
     def _event(self, what: str) -> Publish:
         return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
+from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem
 from factorbus.service.questions import Question
@@ -18,6 +19,14 @@ Asker: TypeAlias = Any
 
 
 # ---- events -----------------------------------------------------------------------------------------------------
+
+
+class Located(NamedTuple):
+    """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
+
+    message: bytes
+    groups: I64
+    settle: bool
 
 
 class Arrived(NamedTuple):
@@ -34,7 +43,7 @@ class Arrived(NamedTuple):
     epoch: int
     size: int
     digest: int
-    content: Insert | Problem
+    content: Insert | Located | Problem
     now: float
     message: bytes = b""
 
@@ -88,6 +97,14 @@ class Folded(NamedTuple):
     now: float
 
 
+class Alone(NamedTuple):
+    """One insert was taken in by a step of its own: Judged, Stepped and Folded in one."""
+
+    outcome: Outcome
+    stepped: Stepped
+    folded: Folded
+
+
 # ---- what waits -------------------------------------------------------------------------------------------------
 
 
@@ -99,7 +116,7 @@ class Waiting:
     sequence: int
     size: int
     digest: int
-    content: Insert | Problem
+    content: Insert | Located | Problem
     askers: list[Asker] = field(default_factory=list)
     message: bytes = b""
     since: float = 0.0  # when it arrived

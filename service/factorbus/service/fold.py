@@ -14,21 +14,22 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
+from factorbus.proto.messages import Accepted, Batch, Delta, Variables
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
-from factorbus.service.events import Folded, Judged, Outcome, Stepped, Waiting
+from factorbus.service.events import Alone, Folded, Judged, Located, Outcome, Stepped, Waiting
+from factorbus.service.kernels.words import LETTERS, WORDS
+from factorbus.service.kernels.write import write_messages
 from factorbus.service.questions import Question, Snapshot, as_factors, as_variables, snapshot
 from factorbus.solver.errors import SolverError
 
-# A kind of variables and whether they are fixed, or a kind of factors and None.
-Column: TypeAlias = tuple[str, bool | None]
+# The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
+_ALONE_BYTES = 48 << 10
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +46,10 @@ class Broken(Problem):
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Staged:
+class _Staged(NamedTuple):
     insert: Waiting
-    content: Insert
     first_factor: int
+    settle: bool
 
 
 class _TakenBack(Exception):
@@ -64,8 +64,11 @@ class Folder:
         self._solver = make_solver()
         self._revision = 0
         self._cpu_s = 0.0  # of every thread that folded
-        self._held: dict[Column, int] = {}  # accepted rows
+        self._held = (0, 0)  # variables and factors that were accepted
+        self._out = np.empty(_ALONE_BYTES, np.uint8)
+        self._out_bytes = self._out.data
         self._broken = ""
+        self._doubt: Exception | None = None  # a fault of the solver that is still to be dealt with
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
@@ -85,22 +88,82 @@ class Folder:
         except _TakenBack:
             for insert in inserts:
                 yield from self._together([insert])
+        yield self._folded(cpu_s)
+
+    def fold_alone(self, insert: Waiting) -> Alone | Iterator[Judged | Stepped | Folded]:
+        """What `fold` comes to for one insert: in one piece where all goes as usual, in a third of the time."""
+        content, solver = insert.content, self._solver
+        if not isinstance(content, Located) or self._broken or not self._has_room(insert.size):
+            return self.fold((insert,))
+        cpu_s, started = time.thread_time(), time.perf_counter()
+        try:
+            first_factor = solver.try_stage(content.message, content.groups)
+            if first_factor is None:
+                return self.fold((insert,))
+            report = solver.step(content.settle)
+        except SolverError:
+            return self.fold((insert,))  # it was taken back, and is now refused in the usual way
+        except Exception as fault:
+            self._doubt = fault
+            return self.fold((insert,))
+        alone = self._try_write(insert, first_factor, report, started, cpu_s)
+        if alone is None:
+            return self._in_pieces(_Staged(insert, first_factor, content.settle), report, started, cpu_s)
+        return alone
+
+    def _try_write(self, insert: Waiting, first_factor: int, report: Any, started: float, cpu_s: float) -> Alone | None:
+        """The messages of a step with one insert, written by one kernel; None: that is not how they can be had."""
+        try:
+            changed, graph = self._solver.pick_changed()
+            account = report.as_dict()
+            account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
+            revision = self._revision + 1
+            answer, delta = write_messages(
+                insert.sequence, self._epoch, revision, first_factor, codec.encode_report(account), changed,
+                graph.var, graph.keys, graph.values, WORDS, LETTERS, self._out,
+            )  # fmt: skip
+        except Exception:
+            log.exception("the messages of a step could not be written in one piece")
+            return None
+        if not answer:
+            return None
+        self._revision = revision
+        folded = self._folded(cpu_s)
+        self._held = folded.variables, folded.factors
+        out = self._out_bytes
+        return Alone(
+            Outcome(insert, out[:answer].tobytes(), first_factor),
+            Stepped(revision, out[answer : answer + delta].tobytes(), report.strategy, report.chi2, solver_ms),
+            folded,
+        )
+
+    def _in_pieces(
+        self, staged: _Staged, report: Any, started: float, cpu_s: float
+    ) -> Iterator[Judged | Stepped | Folded]:
+        """The rest of `fold`, after the step."""
+        yield from self._stepped([staged], [], report, started)
+        yield self._folded(cpu_s)
+
+    def _folded(self, cpu_s: float) -> Folded:
         solver = self._solver
         self._cpu_s += time.thread_time() - cpu_s
-        yield Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
+        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
 
     def _together(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
         started = time.perf_counter()
         staged: list[_Staged] = []
         outcomes: list[Outcome] = []
+        doubt, self._doubt = self._doubt, None
         try:
+            if doubt is not None:
+                raise doubt
             for insert in inserts:
                 try:
                     staged.append(self._stage(insert))
                 except (Problem, SolverError) as problem:
                     outcomes.append(Outcome(insert, problem))
-            report = self._solver.step(settle=any(s.content.settle for s in staged)) if staged else None
+            report = self._solver.step(settle=any(s.settle for s in staged)) if staged else None
         except SolverError as problem:
             if len(staged) > 1:
                 raise _TakenBack from problem
@@ -125,14 +188,25 @@ class Folder:
             raise Broken(self._broken)
         if isinstance(content, Problem):
             raise content
+        if isinstance(content, Located):
+            if self._has_room(insert.size):
+                first_factor = self._solver.try_stage(content.message, content.groups)
+                if first_factor is not None:
+                    return _Staged(insert, first_factor, content.settle)
+            content = codec.decode_insert(content.message)
         self._check_room(insert.size, content.batch)
-        return _Staged(insert, content, self._solver.stage(content.batch))
+        return _Staged(insert, self._solver.stage(content.batch), content.settle)
+
+    def _has_room(self, size: int) -> bool:
+        """Whether a message of `size` bytes surely keeps the map within its limits."""
+        solver, limits = self._solver, self._limits
+        most = size // 8  # a key is eight bytes: without counting, no more than this can be in it
+        return solver.variable_count + most <= limits.variables and solver.factor_count + most <= limits.factors
 
     def _check_room(self, size: int, batch: Batch) -> None:
         """Raises TooLarge when the map would grow over its limits."""
         solver, limits = self._solver, self._limits
-        most = size // 8  # a key is eight bytes: without counting, no more than this can be in it
-        if solver.variable_count + most > limits.variables or solver.factor_count + most > limits.factors:
+        if not self._has_room(size):
             for what, count, more, limit in (
                 ("variables", solver.variable_count, batch.variable_count, limits.variables),
                 ("factors", solver.factor_count, batch.factor_count, limits.factors),
@@ -157,8 +231,7 @@ class Folder:
             )
             for s in staged
         ]
-        for s in staged:
-            _count_rows(s.content.batch, self._held)
+        self._held = self._solver.variable_count, self._solver.factor_count
         yield Judged((*accepted, *refused))
         try:
             told = self._told(account)
@@ -194,19 +267,15 @@ class Folder:
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
 
     def _rebuild(self) -> dict[str, Any] | None:
-        """The accepted rows of every column are its first ones: whatever a failed insert left is behind them."""
-        variables, factors = self._solver.graph()
-        kept = Batch(
-            tuple(_first(group, self._held.get((group.kind, group.fixed), 0)) for group in as_variables(variables)),
-            tuple(_first_factors(group, self._held.get((group.kind, None), 0)) for group in as_factors(factors)),
-        )
-        found: dict[Column, int] = {}
-        _count_rows(kept, found)
-        if {column: n for column, n in found.items() if n} != self._held:
-            raise ValueError(f"the failed solver holds {found}; accepted were {self._held}")
+        """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""
+        variables, factors = self._solver.graph(*self._held)
+        kept = Batch(tuple(_checked(group) for group in as_variables(variables)), as_factors(factors))
+        found = kept.variable_count, kept.factor_count
+        if found != self._held:
+            raise ValueError(f"the failed solver holds {found} variables and factors; accepted were {self._held}")
         fresh, started = self._make(), time.perf_counter()
         account = None
-        if self._held:
+        if any(self._held):
             fresh.stage(kept)
             account = fresh.step().as_dict()
             account["solver_ms"] = (time.perf_counter() - started) * 1e3
@@ -214,22 +283,7 @@ class Folder:
         return account
 
 
-def _count_rows(batch: Batch, rows: dict[Column, int]) -> None:
-    """Count into `rows` what `batch` adds to each column of a graph."""
-    for group in batch.variables:
-        column = (group.kind, group.fixed)
-        rows[column] = rows.get(column, 0) + len(group.keys)
-    for group in batch.factors:
-        column = (group.kind, None)
-        rows[column] = rows.get(column, 0) + len(group.keys)
-
-
-def _first(group: Variables, count: int) -> Variables:
-    values = None if group.values is None else group.values[:count]
-    if values is None or not np.isfinite(values).all():
+def _checked(group: Variables) -> Variables:
+    if group.values is None or not np.isfinite(group.values).all():
         raise ValueError(f"the failed solver's values of {group.kind} are not finite")
-    return Variables(group.kind, group.keys[:count], values, group.fixed)
-
-
-def _first_factors(group: Factors, count: int) -> Factors:
-    return Factors(group.kind, group.keys[:count], group.measured[:count], group.information[:count])
+    return group

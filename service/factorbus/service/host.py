@@ -20,7 +20,20 @@ from typing import Any, TypeAlias
 
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core import MapCore
-from factorbus.service.events import Arrived, Asked, Effect, Judged, Read, Refuse, Run, Stepped
+from factorbus.service.events import (
+    Alone,
+    Answer,
+    Arrived,
+    Asked,
+    Effect,
+    Judged,
+    Publish,
+    Read,
+    Refuse,
+    Run,
+    Stepped,
+    Waiting,
+)
 from factorbus.service.fold import Folder
 from factorbus.service.health import Pulse
 from factorbus.service.questions import Snapshot
@@ -142,8 +155,16 @@ class Host:
     def _run(self, run: Run, tell: Perform) -> None:
         if run.reads:
             self._read(run.reads)
+        if len(run.inserts) == 1:
+            (insert,) = run.inserts
+            events = self._folder.fold_alone(insert)
+            if isinstance(events, Alone):
+                self._tell_alone(insert, events, tell)
+                return
+        else:
+            events = self._folder.fold(run.inserts)
         effects: list[Effect] = []
-        for event in self._folder.fold(run.inserts):
+        for event in events:
             with self._lock:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
@@ -154,6 +175,15 @@ class Host:
                 effects += self.core.stepped(event) if stepped else self.core.folded(event)
             (tell if stepped else self._perform)(effects)
             effects = []
+
+    def _tell_alone(self, insert: Waiting, alone: Alone, tell: Perform) -> None:
+        """Answer and delta of one insert, then the end of its Run."""
+        answered = insert.askers[0]
+        tell([Answer(answered, alone.outcome.answer), Publish("delta", alone.stepped.delta)])
+        with self._lock:
+            effects = self.core.alone(alone, answered)
+        if effects:
+            self._perform(effects)
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:

@@ -29,6 +29,10 @@ class Lane:
         self._open.append(None)
         self._calls.put((call, arguments))
 
+    def is_idle(self) -> bool:
+        """Whether all that was handed in is done."""
+        return not self._open
+
     def hand_or_do(self, call: Callable[..., None], *arguments: Any) -> None:
         """The same, but on this thread, before returning, if all that was handed in before is done."""
         if self._open:

@@ -10,11 +10,10 @@ log = logging.getLogger(__name__)
 def get_ready_to_compute(warm: bool) -> None:
     """Have every kernel at hand, if `warm`; afterwards the interpreter pauses as rarely and as shortly as can be."""
     if warm:
-        from factorbus.idp import warm as warm_idp
+        from factorbus.service.warm import warm as warm_all
         from factorbus.solver import compiled_seconds
-        from factorbus.solver import warm as warm_solver
 
-        seconds = sum(make(lambda name: _announce(name, compiled_seconds())) for make in (warm_solver, warm_idp))
+        seconds = warm_all(lambda name: _announce(name, compiled_seconds()))
         log.info("kernels ready after %.1f s", seconds)
     # The compiler leaves some hundred thousand objects that live on: not walking them again saves pauses of 0.1 s.
     gc.collect()

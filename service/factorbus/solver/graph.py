@@ -86,9 +86,9 @@ class Graph:
             groups.append(Group(kind.name, keys, values, fixed=bool(code % 2)))
         return groups
 
-    def factors(self) -> list[FactorGroup]:
-        """All factors, a copy."""
-        fac = self.fac[: self.counts[at.FACTORS]]
+    def factors(self, most: int | None = None) -> list[FactorGroup]:
+        """All factors, or the first `most`: a copy."""
+        fac = self.fac[: self.counts[at.FACTORS]][:most]
         groups = []
         for kind in FACTOR_KINDS.values():
             rows = fac[fac[:, at.F_KIND] == kind.code]

@@ -48,10 +48,28 @@ class StepReport:
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
-        # By hand: asdict copies deeply and costs 50 µs, a third of a small step.
-        told = {name: getattr(self, name) for name in self.__slots__} | {"phases_ms": dict(self.phases_ms)}
-        if self.compiled_ms is None:
-            del told["compiled_ms"]
+        # By hand: asdict copies deeply and costs 50 µs, a third of a small step; a loop over the fields, 7 µs.
+        told = {
+            "mode": self.mode,
+            "strategy": self.strategy,
+            "because": self.because,
+            "iterations": self.iterations,
+            "chi2": self.chi2,
+            "chi2_before": self.chi2_before,
+            "new_variables": self.new_variables,
+            "new_factors": self.new_factors,
+            "changed": self.changed,
+            "relinearised": self.relinearised,
+            "eliminated": self.eliminated,
+            "nnz_r": self.nnz_r,
+            "flops": self.flops,
+            "damping": self.damping,
+            "converged": self.converged,
+            "phases_ms": dict(self.phases_ms),
+            "step_ms": self.step_ms,
+        }
+        if self.compiled_ms is not None:
+            told["compiled_ms"] = self.compiled_ms
         return told
 
 

@@ -146,7 +146,7 @@ class Solver:
         return self._graph.variables(self.pick_changed()[0])
 
     def pick_changed(self) -> tuple[I64, Graph]:
-        """What `changed` tells of, as indices of variables, ascending, and the arenas to look them up in, to be read."""
+        """What `changed` tells of as indices of variables, ascending, and the arenas to look them up in, to be read."""
         return self._tree.changed() if self._tree else self._changed, self._graph
 
     def chi2(self) -> float:
@@ -157,9 +157,13 @@ class Solver:
         """Bytes in use for the graph and for what solves it."""
         return self._graph.memory_bytes() + (self._tree.tree if self._tree else self._system).memory_bytes()
 
-    def graph(self) -> tuple[list[Group], list[FactorGroup]]:
-        """A copy of everything: variables with their present values, and factors by kind in the order of their ids."""
-        return self._graph.variables(), self._graph.factors()
+    def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
+        """A copy of everything: variables with their present values, and factors by kind in the order of their ids.
+
+        variables, factors: no more than the first so many.
+        """
+        picked = None if variables is None else np.arange(min(variables, self.variable_count))
+        return self._graph.variables(picked), self._graph.factors(factors)
 
     def dump(self) -> State:
         """All that later steps depend on, as of the last step: `load` it into a solver with the same options.

@@ -1,1 +1,1 @@
-"""Compiled readers and writers of the messages that every insert is made of.  `factorbus.proto.codec` is the reference."""
+"""Compiled readers and writers of the messages around every insert.  `factorbus.proto.codec` is the reference."""

@@ -127,7 +127,7 @@ def read_flag(raw: bytes, here: int) -> tuple:
     """(0 or 1, where to read on) of a boolean."""
     if 0 <= here < len(raw):
         first = np.int64(raw[here])
-        if first == _FALSE or first == _TRUE:
+        if _FALSE <= first <= _TRUE:
             return first - _FALSE, here + 1
     return 0, _LOST
 

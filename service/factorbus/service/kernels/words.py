@@ -63,9 +63,7 @@ def _table() -> tuple[I64, bytes]:
     rows += [(name, IN_INSERT, code, 0, 0, 0) for code, name in enumerate(insert)]
     rows += [(name, IN_GROUP, code, 0, 0, 0) for code, name in enumerate(group)]
     rows += [(k.name.encode(), VARIABLE_KIND, k.code, 1, k.size, 0) for k in VARIABLE_KINDS.values()]
-    rows += [
-        (k.name.encode(), FACTOR_KIND, k.code, len(k.connects), k.size, k.triangle) for k in FACTOR_KINDS.values()
-    ]
+    rows += [(k.name.encode(), FACTOR_KIND, k.code, len(k.connects), k.size, k.triangle) for k in FACTOR_KINDS.values()]
     words, letters = np.zeros((len(rows), W_WIDTH), np.int64), b""
     for row, (name, role, code, *sizes) in zip(words, rows, strict=True):
         row[:] = role, code, len(letters), len(name), *sizes

@@ -18,8 +18,18 @@ _MOST_HEAD, _MOST_GROUP = 128, 80
     " int64[::1], float64[::1], int64[:,::1], Bytes(uint8, 1, 'C', readonly=True), uint8[::1])"
 )
 def write_messages(
-    sequence: int, epoch: int, revision: int, first_factor: int, report: bytes, changed: I64, var: I64, keys: I64,
-    values: F64, words: I64, letters: bytes, out: U8,
+    sequence: int,
+    epoch: int,
+    revision: int,
+    first_factor: int,
+    report: bytes,
+    changed: I64,
+    var: I64,
+    keys: I64,
+    values: F64,
+    words: I64,
+    letters: bytes,
+    out: U8,
 ) -> tuple:
     """Write the answer to the only insert of a step, and behind it the delta; gives their lengths, (0, 0): no room.
 

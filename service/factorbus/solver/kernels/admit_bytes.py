@@ -1,7 +1,7 @@
 """Admission of columns that lie in the bytes of a message: one call for all of a small batch.
 
-It takes what is in order and fits into the room there is.  Anything else it leaves as it was: the usual way of admission
-then says what is wrong, or makes room.
+It takes what is in order and fits into the room there is.  Anything else it leaves as it was: the usual way of
+admission then says what is wrong, or makes room.
 """
 
 import numpy as np
@@ -25,7 +25,15 @@ from factorbus.solver.kernels.reach import reach
     " int64[::1], int64[:,::1], float64[::1], int64[::1])"
 )
 def admit_bytes(
-    raw: bytes, groups: I64, table: I64, keys: I64, var: I64, values: F64, dims: I64, fac: I64, payload: F64,
+    raw: bytes,
+    groups: I64,
+    table: I64,
+    keys: I64,
+    var: I64,
+    values: F64,
+    dims: I64,
+    fac: I64,
+    payload: F64,
     counts: I64,
 ) -> int:
     """Append the groups of variables and factors in `raw`; gives the id of the first factor, or −1: nothing changed."""
@@ -41,7 +49,15 @@ def admit_bytes(
 
 @inline_kernel
 def take_groups(
-    raw: bytes, groups: I64, table: I64, keys: I64, var: I64, values: F64, dims: I64, fac: I64, payload: F64,
+    raw: bytes,
+    groups: I64,
+    table: I64,
+    keys: I64,
+    var: I64,
+    values: F64,
+    dims: I64,
+    fac: I64,
+    payload: F64,
     counts: I64,
 ) -> bool:
     """Append group after group; False: one of them is not in order, or there is no room."""
@@ -138,4 +154,4 @@ def word(raw: bytes, start: int) -> int:
     bits = np.int64(0)
     for k in range(8):
         bits |= np.int64(raw[start + k]) << np.int64(8 * k)
-    return bits
+    return bits  # type: ignore[return-value]
