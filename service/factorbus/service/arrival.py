@@ -42,7 +42,7 @@ def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, Located] | Non
         return None
     groups = np.empty((_GROUPS + 1, layout.G_WIDTH), np.int64)
     sequence, epoch, settle = read.read_insert(payload, WORDS, LETTERS, groups)
-    return (sequence, epoch, Located(payload, groups, settle != 0)) if sequence else None
+    return (int(sequence), int(epoch), Located(payload, groups, bool(settle))) if sequence else None
 
 
 def _place(payload: bytes) -> tuple[int, int] | None:

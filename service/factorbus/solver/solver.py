@@ -104,7 +104,7 @@ class Solver:
             raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
             graph.counts,
         )  # fmt: skip
-        return first if first >= 0 else None
+        return int(first) if first >= 0 else None  # an int without the compiler, too
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
