@@ -39,7 +39,8 @@ class Options:
                     that factors of the map have on average (MATH §9.6); bent_now: and solved for again at once, in up
                     to `rounds` rounds, when it is by more than that; trust: above that χ² is looked at, and a step that
                     raised it is replaced
-    look_every      tree: it is looked for what is bent every so many steps, and where something turned far
+    look_every, look_turned   tree: it is looked for what is bent every so many steps, and when something turned so far
+                    that this may be bent by this much
     ripple          tree: δ follows where it is off by more than this many, as above (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
@@ -65,10 +66,11 @@ class Options:
     bent_now: float = 1.0
     trust: float = 3.0
     rounds: int = 3
-    look_every: int = 4
+    look_every: int = 16
+    look_turned: float = 0.3
     ripple: float = 0.05
     recent_steps: int = 3
-    split_pivots: int = 48
+    split_pivots: int = 24
     split_share: float = 0.5
     backend: Literal["blocks", "cholmod"] = "blocks"
 

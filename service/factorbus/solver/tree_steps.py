@@ -6,7 +6,6 @@ compared with what it was, and a step that would raise it is replaced by a batch
 
 import numpy as np
 
-from factorbus.solver import errors
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, minimise
@@ -16,13 +15,11 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64
 from factorbus.solver.kernels.chi2 import sum_chi2
-from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
-_FEW = 8  # new variables for which good first values are looked for
 _START: Mark = (0,) * at.COUNTS
 
 
@@ -44,24 +41,26 @@ class TreeSteps:
 
     def step(self, settle: bool) -> StepReport:
         """As `Solver.step`."""
-        watch = Stopwatch(self._options.clock)
+        clock = self._options.clock or _no_clock
+        started = clock()
+        tree, because = self._tree, ""
         try:
-            self._place_new()
-            because = self._check_held()
-            watch.lap("check")
-            failed = self._tree.step()
-            watch.lap("compiled")
-            if failed >= 0:
-                raise self._loose(failed)
+            status = tree.step()
+            if status == tl.UNSURE:
+                because = self._check_held()
+                status = tree.step(sure=True)
+            if status == tl.FAILED:
+                raise self._system().underconstrained(tree.failed)
         except BaseException:
             self._graph.forget(self._mark)
             raise
+        compiled = clock()
         course = None
         if settle:
             course, because = self._batch(settle=True), "asked to settle"
-        elif self._is_worse():
+        elif tree.account[tl.A_BEND] > self._options.trust and self._is_worse():
             course, because = self._batch(settle=False), "χ² would have risen: a batch from where the estimate stood"
-        return self._account(watch, course, because)
+        return self._account(started, compiled, clock(), course, because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -73,33 +72,20 @@ class TreeSteps:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._sum_chi2(self._mark[at.FACTORS])
 
-    def _place_new(self) -> None:
-        mark, counts = self._mark, self._graph.counts.tolist()
-        if counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and self._options.place_new:
-            settle_new(
-                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS],
-                self._options.negligible, self._graph.var, self._graph.fac, self._graph.values, self._graph.payload,
-            )  # fmt: skip
-
     def _check_held(self) -> str:
-        """Refuse new variables that nothing holds; gives what the step is done for.  Raises Underconstrained."""
+        """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
         suspects = find_unheld(self._graph, self._mark)
-        if suspects.size:
-            free = find_unanchored(self._graph, self._mark)
-            system = self._system()
-            if free >= 0:
-                raise system.underconstrained(
-                    free,
-                    "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to "
-                    "the rest of the map",
-                )
-            system.begin(suspects, Stopwatch(None))
-            system.factorize(0.0)
-            return f"{suspects.size} new variables are held only by several factors together"
-        return ""
-
-    def _loose(self, variable: int) -> errors.Underconstrained:
-        return self._system().underconstrained(variable)
+        free = find_unanchored(self._graph, self._mark)
+        system = self._system()
+        if free >= 0:
+            raise system.underconstrained(
+                free,
+                "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to the "
+                "rest of the map",
+            )
+        system.begin(suspects, Stopwatch(None))
+        system.factorize(0.0)
+        return f"{suspects.size} new variables are held only by several factors together"
 
     def _system(self) -> System:
         """All normal equations at the estimate, apart from the tree."""
@@ -110,9 +96,7 @@ class TreeSteps:
         return system
 
     def _is_worse(self) -> bool:
-        """Whether a step that bent something far raised χ²; the estimate is then what it was before."""
-        if not self._tree.account[tl.A_BEND] > self._options.trust:
-            return False
+        """Whether the step raised χ²; the estimate is then what it was before."""
         factors = int(self._graph.counts[at.FACTORS])
         after = self._sum_chi2(factors)
         self._tree.exchange()
@@ -140,32 +124,35 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, watch: Stopwatch, course: Course | None, because: str) -> StepReport:
-        state, tree = self._tree.state, self._tree
-        counts = self._graph.mark()
-        before, self._mark = self._mark, counts
+    def _account(self, started: float, compiled: float, done: float, course: Course | None, because: str) -> StepReport:
+        before, self._mark = self._mark, self._graph.mark()
+        now = self._mark
         self._first_new, self._batched = before[at.VARIABLES], course is not None
-        eliminated, relinearised, _, changed, flops = state[tl.S_ELIMINATED : tl.S_FLOPS + 1].tolist()
-        chi2 = self.chi2() if course else float(tree.account[tl.A_CHI2])
-        total = watch.total_ms()
-        cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)].tolist()
-        share = watch.phases_ms.get("compiled", 0.0) / max(sum(cycles), 1)
+        state = self._tree.state[: tl.S_FREE].tolist()
+        relinearised, changed = state[tl.S_RELINEARISED], state[tl.S_CHANGED]
+        chi2 = self.chi2() if course else float(self._tree.account[tl.A_CHI2])
+        cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
+        share = 1e3 * (compiled - started) / max(sum(cycles), 1)
         return StepReport(
             mode="tree",
             strategy="batch" if course else ("tree" if changed or relinearised else "extend"),
             because=because or f"{relinearised} variables bent too far",
-            iterations=course.iterations if course else int(state[tl.S_ROUNDS]),
+            iterations=course.iterations if course else state[tl.S_ROUNDS],
             chi2=chi2,
             chi2_before=chi2,
-            new_variables=counts[at.VARIABLES] - before[at.VARIABLES],
-            new_factors=counts[at.FACTORS] - before[at.FACTORS],
+            new_variables=now[at.VARIABLES] - before[at.VARIABLES],
+            new_factors=now[at.FACTORS] - before[at.FACTORS],
             changed=changed,
             relinearised=relinearised,
-            eliminated=eliminated,
-            nnz_r=int(state[tl.S_NONZEROS]),
-            flops=float(flops),
+            eliminated=state[tl.S_ELIMINATED],
+            nnz_r=state[tl.S_NONZEROS],
+            flops=float(state[tl.S_FLOPS]),
             converged=course.converged if course else True,
             phases_ms={name: share * count for name, count in zip(tl.PHASES, cycles, strict=True)},
-            step_ms=total,
-            compiled_ms=watch.phases_ms.get("compiled"),
+            step_ms=1e3 * (done - started),
+            compiled_ms=1e3 * (compiled - started),
         )
+
+
+def _no_clock() -> float:
+    return 0.0

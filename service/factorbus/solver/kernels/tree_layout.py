@@ -9,7 +9,7 @@ S, with a last column for the right-hand side and a corner for χ²,
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
 The arenas of a tree are:
-    node    (n, 10) int64     one row per variable, by its index in the graph
+    node    (n, 11) int64     one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 20) int64    records of cliques
     lists   int64            variables of cliques
@@ -38,7 +38,8 @@ N_SEEN = 6  # the last step that brought a factor of it
 N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
 N_MOVED = 8  # the last step that changed its estimate
 N_LISTED = 9  # 1: it is in `moved`
-N_WIDTH = 10
+N_COLUMN = 10  # scratch: its column in the clique at hand
+N_WIDTH = 11
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable
@@ -103,13 +104,15 @@ S_SWEEP = 24  # counts relinearisations
 S_FIRST_NEW = 25  # variables that are in the tree: S_VARIABLES but for those of a step under way
 S_MOVED = 27  # variables in `moved`
 S_WAIT = 26  # 1: the step under way relinearises nothing, because that failed
+S_BEGUN = 29  # 1: a step is under way; the arenas lacked room
+S_CHECKED = 30  # 1: that everything is held has been made sure of otherwise
 S_CYCLES = 32  # of the phases of the last step, PHASES of them
 S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
-DONE, NO_ROOM, FAILED = 0, 1, 2
+DONE, NO_ROOM, FAILED, UNSURE = 0, 1, 2, 3
 
 # Settings of a step.
 P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again
@@ -118,7 +121,12 @@ P_BENT_NOW = 2  # or at once
 P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
 P_EVERY = 5  # so many steps apart it is looked for what is bent
-P_SIZE = 6
+P_NEGLIGIBLE = 6  # a χ² that is nothing
+P_RECENT = 7  # variables with a factor in the last so many steps go last
+P_ROUNDS = 8  # eliminations in a step, at most
+P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
+P_LOOK = 10  # and where something turned so far that it may be bent by this
+P_SIZE = 11
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")
