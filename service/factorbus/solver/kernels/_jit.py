@@ -32,7 +32,7 @@ import numba
 import numba.extending
 import numpy as np
 from llvmlite import ir
-from numba import _dynfunc
+from numba import _dynfunc  # pyright: ignore[reportAttributeAccessIssue]  (a C extension)
 from numba.core import caching, cgutils, config, event, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
