@@ -278,8 +278,9 @@ def fold_alone(folder: Folder, insert: Waiting) -> tuple[Result, bool]:
     """What came of it, and whether it was had in one piece."""
     events = folder.fold_alone(insert)
     if isinstance(events, Alone):
-        outcome, stepped, end = events
-        return Result((outcome,), (stepped,), end.variables, end.factors), True
+        outcome = Outcome(events.insert, events.answer, events.first_factor)
+        stepped = Stepped(events.revision, events.delta, events.strategy, events.chi2, events.solver_ms)
+        return Result((outcome,), (stepped,), events.variables, events.factors), True
     *rest, end = events
     assert isinstance(end, Folded)
     outcomes = tuple(o for e in rest if isinstance(e, Judged) for o in e.outcomes)

@@ -320,7 +320,7 @@ def test_answer_and_delta_are_the_bytes_of_the_codec(
         account = solver.step().as_dict() | {"solver_ms": 0.25}
         changed, graph = solver.pick_changed()
         answer, delta = write_messages(
-            sequence, epoch, revision, first_factor, codec.encode_report(account), changed, graph.var, graph.keys,
+            sequence, epoch, revision, first_factor, codec.report_encoder()(account), changed, graph.var, graph.keys,
             graph.values, WORDS, LETTERS, out,
         )  # fmt: skip
         told = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in solver.changed())
@@ -345,7 +345,7 @@ def test_columns_of_any_length(count: int) -> None:
     for room in (1 << 20, len(wanted) + 512, len(wanted) - 1, 0):
         out = np.full(room + 64, 0xAA, np.uint8)
         sizes = write_messages(
-            1, 2, 3, 4, codec.encode_report({}), changed, graph.var, graph.keys, graph.values, WORDS, LETTERS,
+            1, 2, 3, 4, codec.report_encoder()({}), changed, graph.var, graph.keys, graph.values, WORDS, LETTERS,
             out[:room],
         )  # fmt: skip
         assert sum(sizes) == (len(wanted) if room > len(wanted) else 0)

@@ -127,7 +127,7 @@ class Admission:
         self._ready -= len(taken)
         return tuple(taken)
 
-    def answer(self, insert: Waiting, answer: object) -> list[Effect]:
+    def answer(self, insert: Waiting, answer: object) -> list[Answer | Refuse]:
         """`insert` has its answer: give it to all who wait for it, and remember it."""
         client = self._clients[insert.client]
         del client.open[insert.sequence]
@@ -301,5 +301,5 @@ def _wanted(client: _Client) -> str:
     return f"{client.next} first"
 
 
-def _reply(asker: Asker, answer: object) -> Effect:
+def _reply(asker: Asker, answer: object) -> Answer | Refuse:
     return Answer(asker, answer) if isinstance(answer, bytes) else Refuse(asker, answer)

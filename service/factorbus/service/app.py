@@ -26,7 +26,7 @@ from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown, TooL
 from factorbus.proto.version import __version__
 from factorbus.service.admin import NotHere, OtherMode, ours, read_create, read_drop, settled_mode
 from factorbus.service.arrival import read_insert
-from factorbus.service.bus import Bus, Place, ignore, key_of, open_bus, payload_of, refuse, reply
+from factorbus.service.bus import Bus, Place, ignore, key_of, open_bus, payload_of, received, refuse, reply
 from factorbus.service.config import BadConfig, Config, checked
 from factorbus.service.core import MapCore
 from factorbus.service.events import Answer, Asked, Asker, Drained, Effect, Publish, Read, Refuse, Tell
@@ -48,6 +48,7 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.25
 _SENDERS = 4096
 _AT_ONCE_BYTES = 64 << 10
+_MESSAGES = (Answer, Publish)
 _ANSWERERS = 4
 _ADMIN_WAITING = 1024
 
@@ -190,7 +191,7 @@ class Shell:
     # ---- callbacks: on Zenoh's threads; they must not raise, nor ask Zenoh for anything but to send ----------------
 
     def _on_insert(self, query: Asker) -> None:
-        key = key_of(query)
+        key, payload = received(query)
         place = self._senders.get(key)
         try:
             name, client = place or self._sender(key)
@@ -201,7 +202,7 @@ class Shell:
         if found is None:
             self._outbox.hand(self._no_map, query, name)
             return
-        read = read_insert(query, client, payload_of(query), self._decoding, time.monotonic())
+        read = read_insert(query, client, payload, self._decoding, time.monotonic())
         if isinstance(read, Refuse):
             self._outbox.hand(refuse, query, read.problem)
             return
@@ -289,7 +290,10 @@ class Shell:
 
         The queue might wait in vain to be emptied: this thread may be the one that does it.
         """
-        size = sum([len(effect.message) for effect in effects if isinstance(effect, Answer | Publish)])
+        size = 0
+        for effect in effects:
+            if isinstance(effect, _MESSAGES):
+                size += len(effect.message)
         hand = self._outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._outbox.hand
         hand(self._send, place, effects)
 

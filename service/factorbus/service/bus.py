@@ -172,6 +172,12 @@ def payload_of(query: zenoh.Query) -> bytes:
     return payload.to_bytes() if payload is not None else b""
 
 
+def received(query: zenoh.Query) -> tuple[str, bytes]:
+    """Both."""
+    payload = query.payload
+    return str(query.key_expr), payload.to_bytes() if payload is not None else b""
+
+
 def reply(query: zenoh.Query, message: bytes) -> None:
     """Answer, and end the query: who asked waits for that too."""
     with query:

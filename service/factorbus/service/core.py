@@ -17,7 +17,6 @@ from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
 from factorbus.service.events import (
     Alone,
-    Answer,
     Arrived,
     Asked,
     Asker,
@@ -123,23 +122,22 @@ class MapCore:
 
     def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
         """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
-        outcome, stepped, folded = alone
-        others = [
-            effect
-            for effect in self._admission.answer(outcome.insert, outcome.answer)
-            if not (isinstance(effect, Answer) and effect.asker is answered)
-        ]
-        self._counts["accepted"] += 1
-        self._counts["answered_bytes"] += len(outcome.answer)
-        self._count(stepped)
-        return others + self.folded(folded)
+        counts, insert = self._counts, alone.insert
+        others = self._admission.answer(insert, alone.answer)
+        if len(others) == 1:
+            others.clear()
+        counts["accepted"] += 1
+        counts["answered_bytes"] += len(alone.answer)
+        self._count(alone)
+        self._free(alone, (insert,))
+        return self._go_on([effect for effect in others if effect.asker is not answered], alone.now)
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
         self._count(stepped)
         return [Publish("delta", stepped.delta)]
 
-    def _count(self, stepped: Stepped) -> None:
+    def _count(self, stepped: Stepped | Alone) -> None:
         self.revision = stepped.revision
         self._chi2 = stepped.chi2
         self._solver_ms += stepped.solver_ms
@@ -155,7 +153,10 @@ class MapCore:
 
     def folded(self, folded: Folded) -> list[Effect]:
         """The solver is free again."""
-        taken = self._running.inserts if self._running else ()
+        self._free(folded, self._running.inserts if self._running else ())
+        return self._go_on([], folded.now)
+
+    def _free(self, folded: Folded | Alone, taken: tuple[Waiting, ...]) -> None:
         self._running = None
         self._ended = folded.now
         seconds = self._ended - self._started
@@ -164,7 +165,6 @@ class MapCore:
             self._insert_s.add(folded.now - insert.since)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
-        return self._go_on([], folded.now)
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
         """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""

@@ -98,11 +98,20 @@ class Folded(NamedTuple):
 
 
 class Alone(NamedTuple):
-    """One insert was taken in by a step of its own: Judged, Stepped and Folded in one."""
+    """One insert was taken in by a step of its own: what Judged, Stepped and Folded say of it, in one."""
 
-    outcome: Outcome
-    stepped: Stepped
-    folded: Folded
+    insert: "Waiting"
+    answer: bytes
+    delta: bytes
+    first_factor: int
+    revision: int
+    strategy: str
+    chi2: float
+    solver_ms: float
+    variables: int
+    factors: int
+    solver_cpu_s: float
+    now: float
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------

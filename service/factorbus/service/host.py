@@ -15,7 +15,7 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
 from factorbus.proto.problems import Internal, Problem
@@ -26,13 +26,13 @@ from factorbus.service.events import (
     Arrived,
     Asked,
     Effect,
+    Folded,
     Judged,
     Publish,
     Read,
     Refuse,
     Run,
     Stepped,
-    Waiting,
 )
 from factorbus.service.fold import Folder
 from factorbus.service.health import Pulse
@@ -80,7 +80,8 @@ class Host:
             effects = self.core.insert(arrived)
         if effects and isinstance(run := effects[-1], Run) and run.short and self._seat.acquire(blocking=False):
             try:
-                self._perform(effects[:-1])
+                if len(effects) > 1:
+                    self._perform(effects[:-1])
                 self._solve(run, self._send)
             finally:
                 self._seat.release()
@@ -144,7 +145,20 @@ class Host:
 
     def _solve(self, run: Run, tell: Perform) -> None:
         try:
-            self._run(run, tell)
+            if run.reads:
+                self._read(run.reads)
+            events = (
+                self._folder.fold_alone(run.inserts[0]) if len(run.inserts) == 1 else self._folder.fold(run.inserts)
+            )
+            if not isinstance(events, Alone):
+                self._tell(events, tell)
+                return
+            answered = events.insert.askers[0]
+            tell([Answer(answered, events.answer), Publish("delta", events.delta)])
+            with self._lock:
+                effects = self.core.alone(events, answered)
+            if effects:
+                self._perform(effects)
         except Exception:
             reference = secrets.token_hex(4)
             log.exception("fault %s: map %s has stopped", reference, self.core.name)
@@ -152,17 +166,8 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _run(self, run: Run, tell: Perform) -> None:
-        if run.reads:
-            self._read(run.reads)
-        if len(run.inserts) == 1:
-            (insert,) = run.inserts
-            events = self._folder.fold_alone(insert)
-            if isinstance(events, Alone):
-                self._tell_alone(insert, events, tell)
-                return
-        else:
-            events = self._folder.fold(run.inserts)
+    def _tell(self, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
+        """What comes of a Run, step by step."""
         effects: list[Effect] = []
         for event in events:
             with self._lock:
@@ -175,15 +180,6 @@ class Host:
                 effects += self.core.stepped(event) if stepped else self.core.folded(event)
             (tell if stepped else self._perform)(effects)
             effects = []
-
-    def _tell_alone(self, insert: Waiting, alone: Alone, tell: Perform) -> None:
-        """Answer and delta of one insert, then the end of its Run."""
-        answered = insert.askers[0]
-        tell([Answer(answered, alone.outcome.answer), Publish("delta", alone.stepped.delta)])
-        with self._lock:
-            effects = self.core.alone(alone, answered)
-        if effects:
-            self._perform(effects)
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:

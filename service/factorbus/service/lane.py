@@ -29,16 +29,15 @@ class Lane:
         self._open.append(None)
         self._calls.put((call, arguments))
 
-    def is_idle(self) -> bool:
-        """Whether all that was handed in is done."""
-        return not self._open
-
     def hand_or_do(self, call: Callable[..., None], *arguments: Any) -> None:
         """The same, but on this thread, before returning, if all that was handed in before is done."""
         if self._open:
             self.hand(call, *arguments)
         else:
-            self._do(call, arguments)
+            try:
+                call(*arguments)
+            except Exception:
+                self._log(call)
 
     def close(self) -> None:
         """Return when all that was handed in is done and the thread has ended."""
@@ -56,7 +55,10 @@ class Lane:
             call(*arguments)
         except Exception:
             # One answer that cannot be given must not silence the lane for all others.
-            log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
+            self._log(call)
+
+    def _log(self, call: Callable[..., None]) -> None:
+        log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
 
 
 class Lanes:

@@ -8,7 +8,7 @@ accepts, with the same content.
 import numpy as np
 
 from factorbus.service.kernels import words as w
-from factorbus.service.kernels.compile import I64, inline_kernel, kernel, part
+from factorbus.service.kernels.compile import I64, U8, inline_kernel, kernel, part
 from factorbus.service.kernels.words import look_up
 from factorbus.solver.kernels import layout as at
 
@@ -18,11 +18,8 @@ _MAP, _ARRAY, _STR = 0x80, 0x90, 0xA0
 _NIL, _FALSE, _TRUE, _BIN, _UINT = 0xC0, 0xC2, 0xC3, 0xC4, 0xCC
 
 
-@kernel(
-    "UniTuple(int64, 3)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], Bytes(uint8, 1, 'C', readonly=True),"
-    " int64[:,::1])"
-)
-def read_insert(raw: bytes, words: I64, letters: bytes, groups: I64) -> tuple:
+@kernel("UniTuple(int64, 3)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], uint8[::1], int64[:,::1])")
+def read_insert(raw: bytes, words: I64, letters: U8, groups: I64) -> tuple:
     """(sequence, epoch, settle) of an insert; where its groups lie goes to `groups`.  Sequence 0: not read."""
     sequence, epoch, settle, seen, count = 0, 0, 0, 0, 0
     fields, here = read_head(raw, 0, _MAP)
@@ -56,7 +53,7 @@ def read_insert(raw: bytes, words: I64, letters: bytes, groups: I64) -> tuple:
 
 
 @part
-def read_group(raw: bytes, here: int, factors: int, words: I64, letters: bytes, group: I64) -> int:
+def read_group(raw: bytes, here: int, factors: int, words: I64, letters: U8, group: I64) -> int:
     """Read one group of variables or factors into its row; gives where to read on."""
     kind, seen, fixed = -1, 0, 0
     keys, keys_size, numbers, numbers_size, information, information_size = -1, 0, -1, 0, -1, 0
@@ -111,7 +108,7 @@ def read_head(raw: bytes, here: int, what: int) -> tuple:
 
 
 @inline_kernel
-def read_word(raw: bytes, here: int, role: int, words: I64, letters: bytes) -> tuple:
+def read_word(raw: bytes, here: int, role: int, words: I64, letters: U8) -> tuple:
     """(row in the table, where to read on) of a short string that is one of the words of a role."""
     if 0 <= here < len(raw):
         length = np.int64(raw[here]) - _STR

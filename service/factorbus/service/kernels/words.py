@@ -6,7 +6,7 @@ tables, so a new kind needs nothing here.
 
 import numpy as np
 
-from factorbus.service.kernels.compile import I64, inline_kernel
+from factorbus.service.kernels.compile import I64, U8, inline_kernel
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.variables import VARIABLE_KINDS
 
@@ -56,7 +56,7 @@ _PIECES = (
 LONGEST = 31
 
 
-def _table() -> tuple[I64, bytes]:
+def _table() -> tuple[I64, U8]:
     insert = (b"sequence", b"epoch", b"settle", b"variables", b"factors")
     group = (b"kind", b"keys", b"values", b"fixed", b"measured", b"information")
     rows = [(piece, PIECE, code, 0, 0, 0) for code, piece in enumerate(_PIECES)]
@@ -68,14 +68,14 @@ def _table() -> tuple[I64, bytes]:
     for row, (name, role, code, *sizes) in zip(words, rows, strict=True):
         row[:] = role, code, len(letters), len(name), *sizes
         letters += name
-    return words, letters
+    return words, np.frombuffer(letters, np.uint8).copy()
 
 
 WORDS, LETTERS = _table()
 
 
 @inline_kernel
-def look_up(raw: bytes, start: int, length: int, role: int, words: I64, letters: bytes) -> int:
+def look_up(raw: bytes, start: int, length: int, role: int, words: I64, letters: U8) -> int:
     """The row of the word raw[start : start + length] among those of a role, or −1."""
     for row in range(words.shape[0]):
         if words[row, W_ROLE] == role and words[row, W_LENGTH] == length:

@@ -1,13 +1,10 @@
 """The answer to an insert and the delta of its step, as bytes: those of `codec.encode_accepted` and `encode_delta`."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorbus.service.kernels import words as w
-from factorbus.service.kernels.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.service.kernels.compile import F64, I64, U8, inline_kernel, kernel, part
 from factorbus.solver.kernels import layout as at
-
-U8 = NDArray[np.uint8]
 
 # No message is longer than this but for its columns and its report; nor is what a group adds to its columns.
 _MOST_HEAD, _MOST_GROUP = 128, 80
@@ -15,7 +12,7 @@ _MOST_HEAD, _MOST_GROUP = 128, 80
 
 @kernel(
     "UniTuple(int64, 2)(int64, int64, int64, int64, Bytes(uint8, 1, 'C', readonly=True), int64[::1], int64[:,::1],"
-    " int64[::1], float64[::1], int64[:,::1], Bytes(uint8, 1, 'C', readonly=True), uint8[::1])"
+    " int64[::1], float64[::1], int64[:,::1], uint8[::1], uint8[::1])"
 )
 def write_messages(
     sequence: int,
@@ -28,7 +25,7 @@ def write_messages(
     keys: I64,
     values: F64,
     words: I64,
-    letters: bytes,
+    letters: U8,
     out: U8,
 ) -> tuple:
     """Write the answer to the only insert of a step, and behind it the delta; gives their lengths, (0, 0): no room.
@@ -75,7 +72,7 @@ def count_groups(changed: I64, var: I64, words: I64) -> tuple:
 
 @part
 def write_variables(
-    out: U8, here: int, groups: I64, changed: I64, var: I64, keys: I64, values: F64, words: I64, letters: bytes
+    out: U8, here: int, groups: I64, changed: I64, var: I64, keys: I64, values: F64, words: I64, letters: U8
 ) -> int:
     """The field `variables` of a delta; gives where to write on."""
     here = write_count(out, here, 0x90, np.count_nonzero(groups))
@@ -110,13 +107,13 @@ def label_of(variable: int, var: I64) -> int:
 
 
 @inline_kernel
-def write_piece(out: U8, here: int, row: int, words: I64, letters: bytes) -> int:
+def write_piece(out: U8, here: int, row: int, words: I64, letters: U8) -> int:
     """What is in a row of the table."""
     return write_bytes(out, here, letters, words[row, w.W_START], words[row, w.W_LENGTH])
 
 
 @inline_kernel
-def write_bytes(out: U8, here: int, source: bytes, start: int, length: int) -> int:
+def write_bytes(out: U8, here: int, source: bytes | U8, start: int, length: int) -> int:
     """source[start : start + length]."""
     for k in range(length):
         out[here + k] = source[start + k]
