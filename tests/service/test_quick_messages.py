@@ -16,6 +16,7 @@ from factorbus.proto.limits import REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service.arrival import read_insert, try_locate
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Located
 from factorbus.service.kernels.words import LETTERS, LONGEST, WORDS
 from factorbus.service.kernels.write import write_messages
@@ -66,8 +67,9 @@ def check_agrees(message: bytes) -> bool:
         return False
     insert = codec.decode_insert(message)
     assert located[:2] == (insert.sequence, insert.epoch)
-    assert located[2].settle == insert.settle
-    assert content_of(located[2]) == content(insert.batch)
+    assert located[2] == digest_of(message)
+    assert located[3].settle == insert.settle
+    assert content_of(located[3]) == content(insert.batch)
     return True
 
 
@@ -216,6 +218,23 @@ def test_an_arrival_is_the_same_either_way() -> None:
     assert quick._replace(content=usual.content) == usual
 
 
+@MANY
+@given(st.binary(max_size=40), seeds)
+def test_a_digest_tells_messages_apart(message: bytes, seed: int) -> None:
+    others = {message + b"\0", message[:-1], b"\0" + message, message[::-1]} - {message}
+    for k in range(8 * len(message)):
+        changed = bytearray(message)
+        changed[k // 8] ^= 1 << k % 8
+        others.add(bytes(changed))
+    assert len({digest_of(other) for other in (message, *others)}) == len(others) + 1
+    assert 0 <= digest_of(message) < 2**63
+
+
+def test_the_digest_of_a_message_never_changes() -> None:
+    wanted = [7775671951334427883, 6423431365456653165, 9160638965743508112]
+    assert [digest_of(message) for message in (b"", b"factorbus", bytes(range(256)))] == wanted
+
+
 # ---- into the solver -------------------------------------------------------------------------------------------
 
 
@@ -240,7 +259,7 @@ def stage_both(quick: Solver, usual: Solver, batch: Batch) -> bool:
         assert max(len(batch.variables), len(batch.factors)) > 15
         return quick.stage(batch) != usual.stage(batch)
     before = arenas(quick)
-    first = quick.try_stage(message, located[2].groups)
+    first = quick.try_stage(message, located[3].groups)
     if first is None:
         assert arenas(quick) == before, "nothing was done"
     try:

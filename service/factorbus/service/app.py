@@ -262,7 +262,14 @@ class Shell:
             self._perform(made, effects)
 
         def send(effects: list[Effect]) -> None:
-            self._send_now(made.place, effects)
+            # On this thread, unless something else has to go before, or it is more than surely fits into Zenoh's
+            # queue.  That might wait in vain to be emptied: this thread may be the one that does it.
+            size = 0
+            for effect in effects:
+                if isinstance(effect, _MESSAGES):
+                    size += len(effect.message)
+            hand = self._outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._outbox.hand
+            hand(self._send, made.place, effects)
 
         def answer_reads(reads: Sequence[Read], taken: Snapshot) -> None:
             for read in reads:
@@ -284,18 +291,6 @@ class Shell:
                 sending.append(effect)
         if sending:
             self._outbox.hand(self._send, found.place, sending)
-
-    def _send_now(self, place: Place, effects: list[Effect]) -> None:
-        """On this thread, unless something else has to go before, or it is more than surely fits into Zenoh's queue.
-
-        The queue might wait in vain to be emptied: this thread may be the one that does it.
-        """
-        size = 0
-        for effect in effects:
-            if isinstance(effect, _MESSAGES):
-                size += len(effect.message)
-        hand = self._outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._outbox.hand
-        hand(self._send, place, effects)
 
     def _send(self, place: Place, effects: list[Effect]) -> None:
         """On the outbox, or on the thread that made the step."""

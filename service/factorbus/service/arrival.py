@@ -7,7 +7,7 @@ from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.problems import Problem
 from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Asker, Located, Refuse
-from factorbus.service.kernels import read
+from factorbus.service.kernels.read import read_insert as read_usual
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.solver.kernels import layout
 
@@ -21,9 +21,10 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
 
     A message that is wrong inside still uses up its number, so that the ones after it need not wait for it.
     """
-    if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, limits)):
-        sequence, epoch, content = located
-        return Arrived(asker, client, sequence, epoch, len(payload), digest_of(payload), content, now, payload)
+    size = len(payload)
+    if size <= _SHORT_BYTES and (located := try_locate(payload, limits)):
+        sequence, epoch, digest, content = located
+        return Arrived(asker, client, sequence, epoch, size, digest, content, now, payload)
     try:
         insert = codec.decode_insert(payload, limits)
     except Problem as problem:
@@ -34,15 +35,17 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
     return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), digest_of(payload), insert, now, payload)
 
 
-def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, Located] | None:
-    """(sequence, epoch, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
+def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] | None:
+    """(sequence, epoch, digest, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
     size = len(payload)
     # A key is eight bytes: without counting, no more than this can be in it.
     if size > limits.max_bytes or size > 8 * limits.max_variables or size > 8 * limits.max_factors:
         return None
     groups = np.empty((_GROUPS + 1, layout.G_WIDTH), np.int64)
-    sequence, epoch, settle = read.read_insert(payload, WORDS, LETTERS, groups)
-    return (int(sequence), int(epoch), Located(payload, groups, bool(settle))) if sequence else None
+    sequence, epoch, settle, digest = read_usual(payload, WORDS, LETTERS, groups)
+    if not sequence:
+        return None
+    return int(sequence), int(epoch), int(digest), Located(payload, groups, bool(settle))
 
 
 def _place(payload: bytes) -> tuple[int, int] | None:

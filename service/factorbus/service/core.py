@@ -42,6 +42,7 @@ _KEYFRAME = Read(Question("keyframe"))
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
+_COUNTED = ("accepted", "refused", "busy", "received_bytes", "answered_bytes", "published_bytes")
 
 
 class MapCore:
@@ -59,8 +60,8 @@ class MapCore:
         self._closing: Problem | None = None
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
-        self._strategies: Counter[str] = Counter()
-        self._counts: Counter[str] = Counter()
+        self._strategies: dict[str, int] = {}
+        self._counts = dict.fromkeys(_COUNTED, 0)
         self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
         self._refusals: Counter[str] = Counter()
         self._step_s, self._insert_s = Histogram(), Histogram()
@@ -141,7 +142,7 @@ class MapCore:
         self.revision = stepped.revision
         self._chi2 = stepped.chi2
         self._solver_ms += stepped.solver_ms
-        self._strategies[stepped.strategy] += 1
+        self._strategies[stepped.strategy] = self._strategies.get(stepped.strategy, 0) + 1
         self._step_s.add(stepped.solver_ms / 1e3)
         self._counts["published_bytes"] += len(stepped.delta)
         self._since_keyframe[0] += 1
@@ -242,7 +243,8 @@ class MapCore:
 
     def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
         """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
-        if self._running is not None or self._reads or settle or not self._is_quick(arrived.size, arrived.now):
+        free = self._running is None and not self._reads
+        if settle or not free or not self._is_quick(arrived.size, arrived.now):
             return None
         insert = self._admission.take_alone(arrived)
         if insert is None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from factorbus.service.kernels import words as w
 from factorbus.service.kernels.compile import I64, U8, inline_kernel, kernel, part
+from factorbus.service.kernels.digest import digest_bytes
 from factorbus.service.kernels.words import look_up
 from factorbus.solver.kernels import layout as at
 
@@ -18,15 +19,15 @@ _MAP, _ARRAY, _STR = 0x80, 0x90, 0xA0
 _NIL, _FALSE, _TRUE, _BIN, _UINT = 0xC0, 0xC2, 0xC3, 0xC4, 0xCC
 
 
-@kernel("UniTuple(int64, 3)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], uint8[::1], int64[:,::1])")
+@kernel("UniTuple(int64, 4)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], uint8[::1], int64[:,::1])")
 def read_insert(raw: bytes, words: I64, letters: U8, groups: I64) -> tuple:
-    """(sequence, epoch, settle) of an insert; where its groups lie goes to `groups`.  Sequence 0: not read."""
+    """(sequence, epoch, settle, digest) of an insert; where its groups lie goes to `groups`.  Sequence 0: not read."""
     sequence, epoch, settle, seen, count = 0, 0, 0, 0, 0
     fields, here = read_head(raw, 0, _MAP)
     for _ in range(fields):
         row, here = read_word(raw, here, w.IN_INSERT, words, letters)
         if here < 0 or seen >> row & 1:
-            return 0, 0, 0
+            return 0, 0, 0, 0
         seen |= 1 << row
         field = words[row, w.W_CODE]
         if field == w.SEQUENCE:
@@ -45,11 +46,11 @@ def read_insert(raw: bytes, words: I64, letters: U8, groups: I64) -> tuple:
                 else:
                     here = _LOST
         if here < 0:
-            return 0, 0, 0
+            return 0, 0, 0, 0
     groups[count, at.G_KIND] = at.END
     if here != len(raw):
-        return 0, 0, 0
-    return sequence, epoch, settle
+        return 0, 0, 0, 0
+    return sequence, epoch, settle, digest_bytes(raw)
 
 
 @part
