@@ -26,6 +26,7 @@ EXIT_CODES = {
 EXTRAS = {
     "service": ("numba", "scipy", "sksparse"),
     "viz": ("matplotlib",),
+    "watch": ("rerun",),
     "record": ("foxglove",),
 }
 

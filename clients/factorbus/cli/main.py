@@ -16,6 +16,7 @@ COMMANDS = {
     "work": ("work", "Join the bus as a worker and take jobs."),
     "replay": ("replay", "Drive a g2o, TORO or iSAM file through a map, pose by pose."),
     "simulate": ("simulate", "Write a simulated world to a file."),
+    "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
     "record": ("record", "Record a map into an MCAP file, which Foxglove opens."),
     "plot": ("plot", "Pictures: a map, a drive, the sparsity of its system, where things may be."),
     "convert": ("convert", "Turn one file format into another."),
