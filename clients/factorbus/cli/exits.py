@@ -28,6 +28,7 @@ EXTRAS = {
     "viz": ("matplotlib",),
     "watch": ("rerun",),
     "record": ("foxglove",),
+    "gateway": ("starlette", "uvicorn", "websockets"),
 }
 
 _USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_setting", "exposed")

@@ -17,6 +17,8 @@ COMMANDS = {
     "replay": ("replay", "Drive a g2o, TORO or iSAM file through a map, pose by pose."),
     "simulate": ("simulate", "Write a simulated world to a file."),
     "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
+    "gateway": ("gateway", "Maps for browsers: a live page, HTTP and WebSocket."),
+    "top": ("top", "Maps, clients and workers of a service, in the terminal."),
     "record": ("record", "Record a map into an MCAP file, which Foxglove opens."),
     "plot": ("plot", "Pictures: a map, a drive, the sparsity of its system, where things may be."),
     "convert": ("convert", "Turn one file format into another."),
