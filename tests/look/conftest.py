@@ -11,7 +11,7 @@ from processes import Process, processes
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Where a service answers that all tests of this folder share; each test has maps of its own."""
     with processes(tmp_path_factory.mktemp("service")) as start:
-        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0").ready()[0]
+        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()[0]
 
 
 @pytest.fixture

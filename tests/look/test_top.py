@@ -69,7 +69,7 @@ def row_of(lines: list[str], name: str) -> list[str]:
 
 
 def test_the_screen_follows_the_service(endpoint: str, spawn: Callable[..., Process]) -> None:
-    worker = spawn("-m", "factorbus.cli", "work", "--connect", endpoint, "--name", "worker7")
+    worker = spawn("-m", "factorbus.cli", "work", "--connect", endpoint, "--name", "worker7", "--no-warm")
     worker.ready()
     with connect(endpoint, client="robot") as bus, bus.map("topped") as joined:
         steps = list(manhattan(poses=60, seed=3))
@@ -93,14 +93,14 @@ def test_the_screen_follows_the_service(endpoint: str, spawn: Callable[..., Proc
 
 def test_a_service_that_goes_is_said_and_found_again(tmp_path) -> None:
     with processes(tmp_path) as start:
-        service = start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--map", "here")
+        service = start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm", "--map", "here")
         (endpoint,) = service.ready()
         with terminal("--connect", endpoint, "--every", "0.2") as screen:
             screen.wait_for(lambda seen: bool(row_of(seen, "here")))
             service.signal(signal.SIGTERM)
             service.wait()
             screen.wait_for(lambda seen: "nobody answers" in seen[0])
-            start("-m", "factorbus.cli", "serve", "--listen", endpoint, "--map", "again").ready()
+            start("-m", "factorbus.cli", "serve", "--listen", endpoint, "--no-warm", "--map", "again").ready()
             screen.wait_for(lambda seen: bool(row_of(seen, "again")))
 
 

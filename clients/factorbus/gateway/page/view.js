@@ -59,12 +59,13 @@ export class View {
     this.canvas.height = h * ratio;
     const pen = this.canvas.getContext("2d");
     pen.scale(ratio, ratio);
+    // Below everything else, so that it hides nothing.
+    for (const key of map.touched) this.dot(pen, map.placeOf(key), 4, colour("touched"));
     this.drawClosures(pen, map, closures);
     for (const keys of map.tracks().values()) this.drawTrack(pen, map, keys);
     for (const [key, { kind }] of map.variables) {
       if (kind.startsWith("point")) this.dot(pen, map.placeOf(key), 3.5, colour("landmark"));
     }
-    if (map.touched.size <= 500) for (const key of map.touched) this.dot(pen, map.placeOf(key), 3, colour("touched"));
     if (this.chosen) this.ring(pen, map.placeOf(this.chosen));
   }
 
