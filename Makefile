@@ -39,7 +39,7 @@ test-data: $(READY_DEV) ## the long tests on the public data sets (FACTORBUS_DAT
 
 # Compiled code neither checks an index nor counts as covered.  Each way has kernels of its own in the cache.
 KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_kernels.py \
-	tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py tests/workers/test_idp_factors.py
+	tests/solver/test_sights.py tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py
 test-kernels: $(READY_DEV) ## the kernels again: as plain Python, and with every index checked
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(ARGS)
 	@NUMBA_BOUNDSCHECK=1 $(BIN)/factorbus warm

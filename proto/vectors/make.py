@@ -34,7 +34,7 @@ from factorbus.proto.messages import (
 from factorbus.proto.problems import Busy
 from factorbus.proto.symbols import symbol
 
-_COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64"}
+_COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
 
 
 def main() -> None:
@@ -55,6 +55,8 @@ def vectors() -> dict[str, bytes]:
         "insert": codec.encode_insert(Insert(1, Batch(pair, (_odometry(0),)), epoch=7)),
         "insert_without_values": codec.encode_insert(Insert(2, Batch((_poses(first=2),), (_odometry(1),)), epoch=7)),
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
+        "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
+        "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
         "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
@@ -111,6 +113,27 @@ def _every_kind() -> Batch:
         Factors("landmark_se2", np.array([[x, l]]), np.array([[2.0, 1.0]]), unit2),
         Factors("landmark_se3", np.array([[y, p]]), np.array([[4.0, 4.0, 4.0]]), unit3),
         Factors("bearing_range_se2", np.array([[x, l]]), np.array([[0.25, 2.5]]), unit2),
+    )
+    return Batch(variables, factors)
+
+
+def _sights() -> Batch:
+    """What cameras see, with and without losses."""
+    x, f, p = (symbol(letter, 1) for letter in "xfp")
+    unit2, unit6 = (np.array([np.eye(r)[np.triu_indices(r)]]) for r in (2, 6))
+    radtan = [1.0, 400.0, 401.0, 320.0, 240.0, 0.0, -0.25, 0.125, 0.001, -0.002, 0.0]
+    radial = [0.0, 195.5, 196.0, 162.0, 125.0, 0.0, 0.0112, 0.0112, 0.0633, 0.0139, 0.0]
+    variables = (
+        Variables("se3", np.array([x, x + 1]), np.array([[0.0, 0, 0, 0, 0, 0, 1], [0.5, 0, 0, 0, 0, 0, 1]])),
+        Variables("idp", np.array([f])),
+        Variables("point3", np.array([p]), np.array([[0.25, 0.5, 4.0]])),
+    )
+    factors = (
+        Factors("idp_first", np.array([[x, f]]), np.array([[330.0, 250.0, 0.25, *radtan]]), unit6),
+        Factors(
+            "idp_seen", np.array([[x + 1, f]]), np.array([[280.0, 250.0, *radtan]]), unit2, "huber", np.array([1.5])
+        ),
+        Factors("point_seen", np.array([[x, p]]), np.array([[175.0, 150.0, *radial]]), unit2, "dcs", np.array([2.0])),
     )
     return Batch(variables, factors)
 

@@ -323,7 +323,9 @@ def test_no_bytes_do_harm(decoder: str, data: bytes) -> None:
     decodes_or_refuses(DECODERS[decoder], data)
 
 
-@pytest.mark.parametrize("name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds"])
+@pytest.mark.parametrize(
+    "name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds", "insert_sights", "insert_points"]
+)
 @settings(max_examples=150)
 @given(data=st.data())
 def test_no_mutation_of_a_valid_message_does_harm(name: str, data: st.DataObject) -> None:

@@ -33,6 +33,14 @@ def nan_info() -> np.ndarray:
     return info
 
 
+def sight(z: float = 5.0, model: float = 1.0) -> Batch:
+    lens = [model, 400, 400, 320, 240, 0, 0, 0, 0, 0, 0]
+    return Batch(
+        (Variables("point3", np.array([300]), np.array([[0, 0, z]])),),
+        (Factors("point_seen", np.array([[200, 300]]), np.array([[320.0, 240, *lens]]), I2),),
+    )
+
+
 # What every map of these tests holds: pose 0 (fixed), pose 1, landmark 100, and a pose in space 200.
 REFUSED = {
     "unknown variable kind": ("unknown_kind", Batch((Variables("se4", np.array([2])),))),
@@ -69,6 +77,10 @@ REFUSED = {
     "range of zero": (
         "bad_range", Batch((), (Factors("bearing_range_se2", np.array([[0, 100]]), np.zeros((1, 2)), I2),)),
     ),
+    "point behind the camera": ("bad_sight", sight(z=-5.0)),
+    "lens of no model": ("bad_lens", sight(model=9.0)),
+    "loss of no kind": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="welsch", scale=np.ones(1)),))),
+    "loss with a scale of zero": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="huber", scale=np.zeros(1)),))),
     "variable without value that nothing reaches": (
         "uninitialised", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
     ),

@@ -50,7 +50,10 @@ class LocalMap:
     def graph(self) -> Batch:
         """A copy of all variables and factors."""
         variables, factors = self._solver.graph()
-        return Batch(_variables(variables), tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in factors))
+        return Batch(
+            _variables(variables),
+            tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in factors),
+        )
 
     def account(self) -> dict[str, Any]:
         """CPU seconds of this thread in the solver, seconds of compiling."""

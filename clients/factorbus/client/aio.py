@@ -133,19 +133,26 @@ class Map:
         """The live estimate; reading it never waits.  Raises Unavailable for a map opened with mirror=False."""
         return self._map.estimate
 
-    async def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+    async def insert(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Accepted:
         """Add `batch` to the map and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
-        return await self.result(await self.send(batch, settle=settle), timeout_s)
+        return await self.result(await self.send(batch, settle=settle, points_below=points_below), timeout_s)
 
     async def settle(self, timeout_s: float | None = None) -> Accepted:
         """Have the map iterate until it has converged.  Raises Refused, NoAnswerYet."""
         return await self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
-    async def send(self, batch: Batch | Draft, *, settle: bool = False) -> Ticket:
+    async def send(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> Ticket:
         """Send `batch`; waits only while the window is full."""
         await self._room.acquire()
         try:
-            ticket = self._map.send(batch, settle=settle)
+            ticket = self._map.send(batch, settle=settle, points_below=points_below)
         except BaseException:
             self._room.release()
             raise

@@ -82,13 +82,23 @@ class Map:
             raise Unavailable(f"the mirror of map {self.name!r}", 0.0, "open the map with mirror=True")
         return self._mirror
 
-    def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+    def insert(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Accepted:
         """Add `batch` to the map and wait until it is in the estimate, the mirror included.
+
+        points_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
 
         Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
         """
         end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
-        ticket = self.send(batch, settle=settle, timeout_s=end - time.monotonic())
+        left = end - time.monotonic()
+        ticket = self.send(batch, settle=settle, points_below=points_below, timeout_s=left)
         accepted = ticket.result(max(end - time.monotonic(), 0.0))
         self._catch_up(max(end - time.monotonic(), 0.0))
         return accepted
@@ -97,7 +107,14 @@ class Map:
         """Have the map iterate until it has converged.  Raises Refused, Unavailable."""
         return self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
-    def send(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Ticket:
+    def send(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge: `batch` is then not sent.
@@ -107,7 +124,7 @@ class Map:
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._changed:
                 self._wait_for_room(timeout_s)
-            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch), timeout_s)
+            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch, points_below), timeout_s)
             with self._changed:
                 self._window.sent(ticket)
             self._courier.carry(ticket.errand)

@@ -33,6 +33,8 @@ def encode_insert(message: Insert) -> bytes:
     }
     if message.settle:
         content["settle"] = True
+    if message.points_below:
+        content["points_below"] = message.points_below
     return _pack(content)
 
 
@@ -44,6 +46,7 @@ def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
         batch=read_batch(content, limits),
         settle=fields.flag("", content, "settle"),
         epoch=fields.integer("", content, "epoch", default=0),
+        points_below=fields.number("", content, "points_below") if "points_below" in content else 0.0,
     )
 
 

@@ -77,6 +77,10 @@ def _refuse_unwritable(batch: Batch) -> None:
             raise FormatError(
                 "g2o", None, f"{len(group.keys)} factor(s) of kind {group.kind}", f"only {', '.join(_EDGE_NAMES)}"
             )
+        if group.loss:
+            raise FormatError(
+                "g2o", None, f"{len(group.keys)} factor(s) {group.kind} with the loss {group.loss}", "none with a loss"
+            )
     named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
     for group in batch.variables:
         if group.values is None and not np.isin(group.keys, named).all():

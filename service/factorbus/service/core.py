@@ -257,7 +257,7 @@ class MapCore:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        return isinstance(content, Problem) or not content.settle
+        return isinstance(content, Problem) or not (content.settle or content.points_below)
 
     def _is_quick(self, size: int, now: float) -> bool:
         return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S

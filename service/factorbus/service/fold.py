@@ -178,6 +178,8 @@ class Folder:
             yield Judged(tuple(outcomes))
         else:
             yield from self._stepped(staged, outcomes, report, started)
+            if below := max((s.content.points_below for s in staged), default=0.0):
+                yield from self._ripen(below)
 
     def _stage(self, insert: Waiting) -> _Staged:
         """Hand one insert to the solver.  Raises Problem, SolverError: then nothing changed."""
@@ -239,12 +241,33 @@ class Folder:
         else:
             yield told
 
-    def _told(self, account: dict[str, Any]) -> Stepped:
+    def _ripen(self, below: float) -> Iterator[Stepped]:
+        """Features whose linearity index is below this become points, in a step of its own whose delta has everything.
+
+        Where that step fails they stay what they are.
+        """
+        started = time.perf_counter()
+        keys = self._solver.ripe(below)
+        if not keys.size:
+            return
+        try:
+            solver, report = self._solver.with_points(keys)
+        except SolverError as problem:
+            log.warning("%d features stay features: as points %s", keys.size, problem)
+            return
+        self._solver = solver
+        account = report.as_dict() | {"points": int(keys.size)}
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._revision += 1
+        yield self._told(account, previous=0)
+
+    def _told(self, account: dict[str, Any], previous: int | None = None) -> Stepped:
         """The solver's last step, with its delta; what it takes to find out what changed is the solver's time, too."""
+        previous = self._revision - 1 if previous is None else previous
         started = time.perf_counter()
         changed = self._solver.changed()
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
-        delta = codec.encode_delta(Delta(self._epoch, self._revision, self._revision - 1, tuple(changed), account))
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
         return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
     def _fault(self) -> str:

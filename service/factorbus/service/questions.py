@@ -91,7 +91,7 @@ def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
 
 def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
     """The solver's factor groups as what the codec takes."""
-    return tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in groups)
+    return tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in groups)
 
 
 def answer(question: Question, taken: Snapshot) -> bytes:

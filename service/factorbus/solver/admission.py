@@ -6,8 +6,8 @@ behind the rows in use.  The caller goes back to its mark when this raises, so a
 
 import numpy as np
 
-from factorbus.solver import errors
-from factorbus.solver.factors import FACTOR_KINDS, FactorKind
+from factorbus.solver import errors, sights
+from factorbus.solver.factors import FACTOR_KINDS, LENS_AT, LOSSES, FactorKind
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import BatchLike, FactorsLike, VariablesLike
 from factorbus.solver.kernels import layout as at
@@ -18,13 +18,15 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
 _I64 = np.dtype(np.int64)
 _F64 = np.dtype(np.float64)
+_NO_SCALE = np.empty(0)
 
 
 def admit(graph: Graph, batch: BatchLike) -> None:
     """Append `batch` to `graph` and give values to the variables that come without.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
-    BadRange, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and must go back to its mark.
+    BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and
+    must go back to its mark.
     """
     first = int(graph.counts[at.VARIABLES])
     first_factor = int(graph.counts[at.FACTORS])
@@ -34,6 +36,8 @@ def admit(graph: Graph, batch: BatchLike) -> None:
     if not all(has_values for _, has_values in given):
         reached = np.repeat(np.array([flag for _, flag in given], np.int64), [count for count, _ in given])
         _compose(graph, first, first_factor, reached)
+    if any(group.kind in LENS_AT for group in batch.factors):
+        sights.check(graph, first_factor)
 
 
 def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
@@ -63,13 +67,30 @@ def _admit_factors(graph: Graph, group: FactorsLike) -> None:
     ends = _column(group.keys, _I64, (-1, len(kind.connects)), group.kind, "keys")
     measured = _column(group.measured, _F64, (len(ends), kind.size), group.kind, "measured")
     information = _column(group.information, _F64, (len(ends), kind.triangle), group.kind, "information")
-    graph.reserve_factors(len(ends), kind.size + kind.triangle)
+    if kind.name in LENS_AT:
+        measured = sights.with_limits(kind, measured)
+    loss, scale = at.NO_LOSS, _NO_SCALE
+    if group.loss:
+        loss, scale = _loss(group, len(ends))
+    graph.reserve_factors(len(ends), kind.size + kind.triangle + 1)
     row, wrong = admit_factors(
-        kind.code, ends, measured, information, graph.table, graph.keys, graph.var, graph.fac, graph.payload,
-        graph.counts,
+        kind.code, loss, ends, measured, information, scale, graph.table, graph.keys, graph.var, graph.fac,
+        graph.payload, graph.counts,
     )  # fmt: skip
+    if wrong == at.BAD_SCALE:
+        raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", "more than 0, standard deviations")
     if wrong != at.GOOD:
         raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
+
+
+def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
+    """(code, scales) of the loss of a group."""
+    code = LOSSES.get(group.loss)
+    if code is None:
+        raise errors.BadLoss(group.kind, f"the loss {group.loss!r}", f"none, or one of {', '.join(LOSSES)}")
+    if group.scale is None:
+        raise errors.BadLoss(f"{group.kind} {group.loss}", "no scale", "one for each factor, standard deviations")
+    return code, _column(group.scale, _F64, (count,), group.kind, "scale")
 
 
 def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:

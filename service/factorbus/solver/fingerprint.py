@@ -11,7 +11,7 @@ from factorbus.solver.kernels._jit import sources_hash
 def fingerprint() -> str:
     """A hash of the solver's sources and of all that its kernels depend on: processor, versions, flags."""
     folder = Path(__file__).parent
-    digest = hashlib.sha256(sources_hash(folder / "kernels").encode())
+    digest = hashlib.sha256(sources_hash(folder / "kernels", *(folder / "lenses").glob("*.py")).encode())
     for path in sorted(folder.glob("*.py")):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)

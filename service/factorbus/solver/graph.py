@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from factorbus.solver.errors import printed
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, FactorKind
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.groups import FactorGroup, Group
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
@@ -34,6 +34,11 @@ class Graph:
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(64, np.int64)
 
+    @property
+    def sights(self) -> bool:
+        """Whether any camera has seen anything."""
+        return bool((self.fac[: self.counts[at.FACTORS], at.F_KIND] >= at.IDP_FIRST).any())
+
     def mark(self) -> Mark:
         """How much is in use now."""
         return tuple(self.counts.tolist())
@@ -55,12 +60,17 @@ class Graph:
             enter_keys(counts[at.VARIABLES], self.table, self.keys)
 
     def reserve_factors(self, more: int, size: int) -> None:
-        """Make room for `more` factors of `size` numbers each (measurement and information)."""
+        """Make room for `more` factors of `size` numbers each (measurement, information, scale of a loss)."""
         counts = self.counts.tolist()
         if (need := counts[at.FACTORS] + more) > len(self.fac):
             self.fac = grown(self.fac, need)
         if (need := counts[at.PAYLOAD] + more * size) > self.payload.size:
             self.payload = grown(self.payload, need)
+
+    def take(self, other: "Graph") -> None:
+        """Become `other`."""
+        for name, array in vars(other).items():
+            setattr(self, name, array)
 
     def memory_bytes(self) -> int:
         """Bytes in use of all arenas."""
@@ -87,16 +97,20 @@ class Graph:
         return groups
 
     def factors(self, most: int | None = None) -> list[FactorGroup]:
-        """All factors, or the first `most`: a copy."""
+        """All factors, or the first `most`: a copy, a group for each kind and loss."""
         fac = self.fac[: self.counts[at.FACTORS]][:most]
+        label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + (fac[:, at.F_FLAGS] >> at.LOSS_SHIFT)
         groups = []
-        for kind in FACTOR_KINDS.values():
-            rows = fac[fac[:, at.F_KIND] == kind.code]
-            if rows.size:
-                ends = self.keys[rows[:, at.F_I : at.F_I + len(kind.connects)]]
-                numbers = self.payload[rows[:, at.F_AT, None] + np.arange(kind.size + kind.triangle)]
-                measured, information = np.hsplit(numbers, [kind.size])
-                groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy()))
+        for code in np.flatnonzero(np.bincount(label)).tolist():
+            kind = FACTOR_KIND_OF_CODE[code >> at.LOSS_SHIFT]
+            loss = LOSS_OF_CODE.get(code & ((1 << at.LOSS_SHIFT) - 1), "")
+            rows = fac[label == code]
+            ends = self.keys[rows[:, at.F_I : at.F_I + len(kind.connects)]]
+            width = kind.size + kind.triangle + (1 if loss else 0)
+            numbers = self.payload[rows[:, at.F_AT, None] + np.arange(width)]
+            measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
+            own = scale[:, 0].copy() if loss else None
+            groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own))
         return groups
 
     def factors_of(self, variable: int) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.solver import errors
+from factorbus.solver import errors, sights
 from factorbus.solver.admission import admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.elimination import Elimination
@@ -22,11 +22,13 @@ from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
+from factorbus.solver.ripening import find_ripe, with_points
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.strategy import Plan
 from factorbus.solver.symbolic import Symbolic
 from factorbus.solver.system import System
 from factorbus.solver.tree_steps import TreeSteps
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
@@ -152,6 +154,29 @@ class Solver:
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._tree.chi2() if self._tree else self._done.chi2
+
+    def ripe(self, below: float) -> I64:
+        """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
+        return self._graph.keys[find_ripe(self._graph, below)]
+
+    def with_points(self, keys: I64) -> tuple["Solver", StepReport]:
+        """A solver in which these features are points, under their keys, and its first step; this one stays as it is.
+
+        Later sights of them may still be sent as `idp_seen`.  Raises UnknownVariable, KindMismatch, and as `step` does.
+        """
+        picked = np.array([self._graph.find(key) for key in keys.tolist()], np.int64)
+        for key, v in zip(keys.tolist(), picked.tolist(), strict=True):
+            if v < 0:
+                raise errors.UnknownVariable(key, "turning features into points")
+            if (kind := int(self._graph.var[v, at.V_KIND])) != at.IDP:
+                raise errors.KindMismatch(key, "turning features into points", VARIABLE_KIND_OF_CODE[kind].name, "idp")
+        made = Solver(self._options)
+        made._graph.take(with_points(self._graph, picked))
+        return made, made.step()
+
+    def asleep(self) -> list[tuple[int, str, str]]:
+        """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
+        return sights.asleep(self._graph)
 
     def memory_bytes(self) -> int:
         """Bytes in use for the graph and for what solves it."""
@@ -317,6 +342,7 @@ class Solver:
             changed=int(self._changed.size),
             relinearised=course.iterations * columns,
             eliminated=plan.rows + course.factorisations * columns,
+            asleep=len(sights.asleep(self._graph)) if self._graph.sights else 0,
             nnz_r=nonzeros,
             flops=flops,
             damping=course.damping,

@@ -145,6 +145,7 @@ class TreeSteps:
             changed=changed,
             relinearised=relinearised,
             eliminated=state[tl.S_ELIMINATED],
+            asleep=state[tl.S_ASLEEP],
             nnz_r=state[tl.S_NONZEROS],
             flops=float(state[tl.S_FLOPS]),
             converged=course.converged if course else True,

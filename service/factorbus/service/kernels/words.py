@@ -1,13 +1,13 @@
 """The words of the wire as a table for kernels: what readers look up and writers copy.
 
 `WORDS` has a row for each, `LETTERS` their bytes one after the other.  The rows of kinds are made from the solver's
-tables, so a new kind needs nothing here.
+tables, so a new kind needs nothing here; sights are left out, whose lenses are looked at on the usual way.
 """
 
 import numpy as np
 
 from factorbus.service.kernels.compile import I64, U8, inline_kernel
-from factorbus.solver.factors import FACTOR_KINDS
+from factorbus.solver.factors import FACTOR_KINDS, LENS_AT
 from factorbus.solver.variables import VARIABLE_KINDS
 
 # Columns of `WORDS`.
@@ -63,7 +63,8 @@ def _table() -> tuple[I64, U8]:
     rows += [(name, IN_INSERT, code, 0, 0, 0) for code, name in enumerate(insert)]
     rows += [(name, IN_GROUP, code, 0, 0, 0) for code, name in enumerate(group)]
     rows += [(k.name.encode(), VARIABLE_KIND, k.code, 1, k.size, 0) for k in VARIABLE_KINDS.values()]
-    rows += [(k.name.encode(), FACTOR_KIND, k.code, len(k.connects), k.size, k.triangle) for k in FACTOR_KINDS.values()]
+    quick = [kind for kind in FACTOR_KINDS.values() if kind.name not in LENS_AT]
+    rows += [(k.name.encode(), FACTOR_KIND, k.code, len(k.connects), k.size, k.triangle) for k in quick]
     words, letters = np.zeros((len(rows), W_WIDTH), np.int64), b""
     for row, (name, role, code, *sizes) in zip(words, rows, strict=True):
         row[:] = role, code, len(letters), len(name), *sizes

@@ -12,6 +12,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.se2 import wrap
+from factorbus.solver.kernels.sizes import dim_of, residual_dim
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -79,13 +80,15 @@ def admit_variables(
 
 
 @kernel(
-    "UniTuple(int64, 2)(int64, int64[:,::1], float64[:,::1], float64[:,::1], int64[::1], int64[::1], int64[:,::1],"
-    " int64[:,::1], float64[::1], int64[::1])"
+    "UniTuple(int64, 2)(int64, int64, int64[:,::1], float64[:,::1], float64[:,::1], float64[::1], int64[::1],"
+    " int64[::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1])"
 )
 def admit_factors(
-    kind: int, ends: I64, z: F64, info: F64, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64
-) -> tuple:
-    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle).  Gives (row, fault)."""
+    kind: int, loss: int, ends: I64, z: F64, info: F64, scale: F64, table: I64, keys: I64, var: I64, fac: I64,
+    payload: F64, counts: I64,
+) -> tuple:  # fmt: skip
+    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle), and with a loss its scale
+    (m,), else (0,).  Gives (row, fault)."""
     size, triangle = z.shape[1], info.shape[1]
     scratch = np.empty((6, 6))
     for m in range(ends.shape[0]):
@@ -100,7 +103,13 @@ def admit_factors(
         wrong = check_numbers(kind, p, size, triangle, payload, scratch)
         if wrong != at.GOOD:
             return m, wrong
-        append_factor(kind, i, j, size + triangle, fac, counts)
+        numbers = size + triangle
+        if loss != at.NO_LOSS:
+            if not (scale[m] > 0.0 and scale[m] < math.inf):
+                return m, at.BAD_SCALE
+            payload[p + numbers] = scale[m]
+            numbers += 1
+        append_factor(kind, loss, i, j, numbers, var, fac, counts)
     return -1, at.GOOD
 
 
@@ -112,6 +121,8 @@ def check_value(kind: int, x: int, size: int, values: F64) -> int:
             return at.NOT_FINITE
     if kind == at.SE2:
         values[x + 2] = wrap(values[x + 2])
+    if kind == at.IDP:
+        values[x + 3] = wrap(values[x + 3])
     if kind == at.SE3 and not make_unit(values, x + 3):
         return at.BAD_QUATERNION
     return at.GOOD
@@ -123,7 +134,7 @@ def append_variable(
 ) -> None:
     """One more variable, whose value is behind those in use already, if it has one; `slot` is where its key goes."""
     v = counts[at.VARIABLES]
-    dim = 6 if kind == at.SE3 else size
+    dim = dim_of(kind)
     table[slot] = v + 1
     keys[v] = key
     var[v, at.V_KIND], var[v, at.V_AT] = kind, counts[at.VALUES]
@@ -153,7 +164,8 @@ def find_ends(kind: int, a: int, b: int, table: I64, keys: I64, var: I64) -> tup
         return i, j, at.UNKNOWN_SECOND
     if i == j:
         return i, j, at.SELF_LOOP
-    if var[j, at.V_KIND] != second:
+    has_become_a_point = kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3
+    if var[j, at.V_KIND] != second and not has_become_a_point:
         return i, j, at.WRONG_KIND_SECOND
     return i, j, at.GOOD
 
@@ -168,17 +180,19 @@ def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scr
         return at.BAD_QUATERNION
     if kind == at.BEARING_RANGE_SE2 and not payload[p + 1] > 0.0:
         return at.BAD_RANGE
-    if not is_positive_definite(6 if size == 7 else size, payload, p + size, scratch):
+    if not is_positive_definite(residual_dim(kind), payload, p + size, scratch):
         return at.NOT_POSITIVE_DEFINITE
     return at.GOOD
 
 
 @inline_kernel
-def append_factor(kind: int, i: int, j: int, numbers: int, fac: I64, counts: I64) -> None:
-    """One more factor, whose numbers are behind those in use already."""
+def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, var: I64, fac: I64, counts: I64) -> None:
+    """One more factor, whose numbers are behind those in use already; of a feature that is a point by now, of that."""
     f = counts[at.FACTORS]
+    if kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3:
+        kind = at.POINT_SEEN
     fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = kind, i, j, counts[at.PAYLOAD]
-    fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_SWAPPED] = -1, -1, -1, 0
+    fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_FLAGS] = -1, -1, -1, loss << at.LOSS_SHIFT
     counts[at.PAYLOAD] += numbers
     counts[at.FACTORS] += 1
 
@@ -192,8 +206,10 @@ def kinds_of_ends(kind: int) -> tuple:
         return at.SE2, at.SE2
     if kind == at.BETWEEN_SE3:
         return at.SE3, at.SE3
-    if kind == at.LANDMARK_SE3:
+    if kind == at.LANDMARK_SE3 or kind == at.POINT_SEEN:
         return at.SE3, at.POINT3
+    if kind == at.IDP_FIRST or kind == at.IDP_SEEN:
+        return at.SE3, at.IDP
     return at.SE2, at.POINT2
 
 

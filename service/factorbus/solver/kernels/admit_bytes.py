@@ -118,7 +118,7 @@ def take_factor(
     copy_numbers(raw, group[at.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
     if check_numbers(kind, p, size, triangle, payload, scratch) != at.GOOD:
         return False
-    append_factor(kind, i, j, size + triangle, fac, counts)
+    append_factor(kind, at.NO_LOSS, i, j, size + triangle, var, fac, counts)
     return True
 
 

@@ -47,10 +47,13 @@ L_I = 1  # next incidence of the first variable
 L_J = 2  # next incidence of the second one
 L_AT = 3  # where its Hessian starts
 L_STAMP = 4  # the last sweep that linearised it
-L_KIND = 5  # as in the graph, so that one cache line has all
+L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
 L_FAR = 6  # the second variable's place in the graph's values; -1: none
 L_SECOND = 7  # the second variable; -1: none
 L_WIDTH = 8
+
+# In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
+EXACT, ASLEEP = 1000, 1001
 
 # Columns of `clique`.
 C_LIST = 0
@@ -103,6 +106,8 @@ S_TAKEN = 23  # factors that are in the tree: S_FACTORS but for those of a step 
 S_SWEEP = 24  # counts relinearisations
 S_FIRST_NEW = 25  # variables that are in the tree: S_VARIABLES but for those of a step under way
 S_MOVED = 27  # variables in `moved`
+S_EXACT = 29  # factors whose bend is computed exactly
+S_ASLEEP = 30  # sights that had no pixel where they were linearised
 S_WAIT = 26  # 1: the step under way relinearises nothing, because that failed
 S_BEGUN = 29  # 1: a step is under way; the arenas lacked room
 S_CHECKED = 30  # 1: that everything is held has been made sure of otherwise

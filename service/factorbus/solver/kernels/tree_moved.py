@@ -2,7 +2,7 @@
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, kernel
-from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.sizes import size_of
 
 
 @kernel("int64(int64, int64, int64[::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1])")

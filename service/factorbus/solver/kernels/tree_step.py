@@ -79,8 +79,8 @@ def tree_step(
             relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
         lap(began, tl.LINEARISE, state)
         bow, status = eliminate_again(
-            v0, v1, f1, wait, scaled, var, fac, values, node, link, clique, lists, numbers, hessian, lin, scalars,
-            stiff, lever, pending, changed, moved, state, account,
+            v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
+            scalars, stiff, lever, pending, changed, moved, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
@@ -119,9 +119,9 @@ def residual_unit(factors: int, account: F64) -> float:
 
 @part
 def eliminate_again(
-    v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, node: I64, link: I64,
-    clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64, pending: I64,
-    changed: I64, moved: I64, state: I64, account: F64,
+    v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
+    link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
+    pending: I64, changed: I64, moved: I64, state: I64, account: F64,
 ) -> tuple[float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, and the status."""
     # 3
@@ -211,8 +211,12 @@ def eliminate_again(
         state, account,
     )  # fmt: skip
     bow = 0.0
-    if state[tl.S_STEP] % settings[tl.P_EVERY] == 0 or account[tl.A_TURN] > settings[tl.P_LOOK]:
-        bow = find_bent(settings[tl.P_BENT], var, node, link, stiff, lin[0], scalars, values, pending, moved, state)
+    # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
+    due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
+    if due or account[tl.A_TURN] > settings[tl.P_LOOK]:
+        bow = find_bent(
+            settings[tl.P_BENT], var, fac, payload, node, link, stiff, lin[0], scalars, values, pending, moved, state
+        )
     lap(now, tl.SUBSTITUTE, state)
     return bow, tl.DONE
 

@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import hessian_size, linearise_factor, weigh_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 
@@ -40,15 +40,18 @@ def take_in_factors(
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
     f0 = state[tl.S_FACTORS]
-    r, H, W = np.zeros(6), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
         link[f, tl.L_KIND], link[f, tl.L_SECOND] = fac[f, at.F_KIND], j
+        if fac[f, at.F_KIND] >= at.IDP_FIRST or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+            link[f, tl.L_KIND] = tl.EXACT
+            state[tl.S_EXACT] += 1
         link[f, tl.L_FAR] = var[j, at.V_AT] if j >= 0 else -1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
         _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
@@ -68,6 +71,9 @@ def take_out(
     """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
     for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
+        if link[f, tl.L_KIND] >= tl.EXACT:
+            state[tl.S_EXACT] -= 1
+            state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
         if j >= 0:
             node[j, tl.N_ADJ] = link[f, tl.L_J]
             _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
