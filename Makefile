@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-data test-kernels lint check bench wheel clean
+.PHONY: help setup demo test test-data test-kernels test-faults lint check bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,6 +44,10 @@ test-kernels: $(READY_DEV) ## the kernels again: as plain Python, and with every
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(ARGS)
 	@NUMBA_BOUNDSCHECK=1 $(BIN)/factorbus warm
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) tests/solver/test_solver_steps.py $(ARGS)
+
+test-faults: $(READY_DEV) ## workers killed and frozen in mid-job, 400 times
+	@$(BIN)/factorbus warm
+	FACTORBUS_FAULTS=400 $(BIN)/python -m pytest -s --timeout 3600 tests/system/test_features_faults.py $(ARGS)
 
 lint: $(READY_DEV) ## ruff, pyright, import contracts
 	$(BIN)/ruff check .
