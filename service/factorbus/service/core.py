@@ -12,6 +12,7 @@ from collections import Counter, deque
 from typing import Any
 
 from factorbus.proto import codec
+from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
@@ -257,7 +258,9 @@ class MapCore:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        return isinstance(content, Problem) or not (content.settle or content.points_below)
+        if isinstance(content, Insert) and content.points_below:
+            return False
+        return isinstance(content, Problem) or not content.settle
 
     def _is_quick(self, size: int, now: float) -> bool:
         return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S

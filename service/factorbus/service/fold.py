@@ -50,6 +50,7 @@ class _Staged(NamedTuple):
     insert: Waiting
     first_factor: int
     settle: bool
+    points_below: float = 0.0
 
 
 class _TakenBack(Exception):
@@ -178,7 +179,7 @@ class Folder:
             yield Judged(tuple(outcomes))
         else:
             yield from self._stepped(staged, outcomes, report, started)
-            if below := max((s.content.points_below for s in staged), default=0.0):
+            if below := max((s.points_below for s in staged), default=0.0):
                 yield from self._ripen(below)
 
     def _stage(self, insert: Waiting) -> _Staged:
@@ -195,7 +196,7 @@ class Folder:
                     return _Staged(insert, first_factor, content.settle)
             content = codec.decode_insert(content.message)
         self._check_room(insert.size, content.batch)
-        return _Staged(insert, self._solver.stage(content.batch), content.settle)
+        return _Staged(insert, self._solver.stage(content.batch), content.settle, content.points_below)
 
     def _has_room(self, size: int) -> bool:
         """Whether a message of `size` bytes surely keeps the map within its limits."""
