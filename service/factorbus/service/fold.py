@@ -256,6 +256,9 @@ class Folder:
         except SolverError as problem:
             log.warning("%d features stay features: as points %s", keys.size, problem)
             return
+        except Exception:
+            log.exception("%d features stay features: the solver failed with them as points", keys.size)
+            return
         self._solver = solver
         account = report.as_dict() | {"points": int(keys.size)}
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
