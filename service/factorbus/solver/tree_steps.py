@@ -75,6 +75,8 @@ class TreeSteps:
     def _check_held(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
         suspects = find_unheld(self._graph, self._mark)
+        if not suspects.size:
+            return ""
         free = find_unanchored(self._graph, self._mark)
         system = self._system()
         if free >= 0:
