@@ -38,6 +38,9 @@ class Told:
             self.effects += [(effect, threading.current_thread().name) for effect in effects]
             self._more.notify_all()
 
+    def take_both(self, asker: Any, answer: bytes, delta: bytes) -> None:
+        self.take([Answer(asker, answer), Publish("delta", delta)])
+
     def wait_for(self, happened: Callable[[], bool]) -> None:
         with self._more:
             assert self._more.wait_for(happened, PATIENCE_S)
@@ -79,7 +82,9 @@ class Setup:
         self.sequence = 0
         core = MapCore("m", "auto", EPOCH, Limits(), 0.0)
         folder = Folder(lambda: self.solver, EPOCH, Limits())
-        self.host = Host(core, folder, self.told.take, self.told.take, lambda reads, taken: None, self.seat)
+        self.host = Host(
+            core, folder, self.told.take, self.told.take, lambda reads, taken: None, self.seat, self.told.take_both
+        )
 
     def arrived(self, content: Batch, settle: bool = False, client: str = "a", size: int = 100) -> Arrived:
         self.sequence += 1

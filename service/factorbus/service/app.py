@@ -271,11 +271,14 @@ class Shell:
             hand = self._outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._outbox.hand
             hand(self._send, made.place, effects)
 
+        def send_both(asker: Asker, answer: bytes, delta: bytes) -> None:
+            self._outbox.hand_or_do(_send_both, made.place, asker, answer, delta)
+
         def answer_reads(reads: Sequence[Read], taken: Snapshot) -> None:
             for read in reads:
                 self._answers.hand(self._answer_read, made, read, taken)
 
-        host = Host(core, folder, perform, send, answer_reads, self._seat)
+        host = Host(core, folder, perform, send, answer_reads, self._seat, send_both)
         made = _Map(host, self._bus.place(name, self._service), options.as_dict())
         return made
 
@@ -426,6 +429,12 @@ class Shell:
                 f"{others[0]} is alive: another service keeps maps named {self._config.maps}; "
                 "give each service a pattern of its own with maps ="
             )
+
+
+def _send_both(place: Place, asker: Asker, answer: bytes, delta: bytes) -> None:
+    """What was written in one piece is small enough to be sent at once."""
+    reply(asker, answer)
+    place.publish("delta", delta)
 
 
 def _chunks(query: Asker) -> tuple[str, str]:

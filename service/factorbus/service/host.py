@@ -25,6 +25,7 @@ from factorbus.service.events import (
     Answer,
     Arrived,
     Asked,
+    Asker,
     Effect,
     Folded,
     Judged,
@@ -43,6 +44,7 @@ log = logging.getLogger(__name__)
 
 # What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
 Perform: TypeAlias = Callable[[list[Effect]], None]
+SendBoth: TypeAlias = Callable[[Asker, bytes, bytes], None]
 AnswerReads: TypeAlias = Callable[[Sequence[Read], Snapshot], None]
 
 
@@ -50,7 +52,7 @@ class Host:
     """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short Run.
 
     perform: has done what the core wants done, in order, elsewhere; send: the same, at once if the order allows.
-    seat: shared by all maps; who has it may do short Runs.
+    seat: shared by all maps; who has it may do short Runs.  send_both: `send` for an answer and a delta.
     """
 
     def __init__(
@@ -61,9 +63,11 @@ class Host:
         send: Perform,
         answer: AnswerReads,
         seat: threading.Lock,
+        send_both: SendBoth,
     ) -> None:
         self.core = core
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
+        self._send_both = send_both
         self._lock = threading.Lock()
         self._runs: queue.SimpleQueue[Run | Callable[[], None] | None] = queue.SimpleQueue()
         self._pulse = Pulse(self._runs.put)
@@ -154,7 +158,10 @@ class Host:
                 self._tell(events, tell)
                 return
             answered = events.insert.askers[0]
-            tell([Answer(answered, events.answer), Publish("delta", events.delta)])
+            if tell is self._send:
+                self._send_both(answered, events.answer, events.delta)
+            else:
+                tell([Answer(answered, events.answer), Publish("delta", events.delta)])
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:
