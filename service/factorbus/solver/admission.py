@@ -19,6 +19,7 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 _I64 = np.dtype(np.int64)
 _F64 = np.dtype(np.float64)
 _NO_SCALE = np.empty(0)
+_NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIABLE_KINDS.values()}}
 
 
 def admit(graph: Graph, batch: BatchLike) -> None:
@@ -28,13 +29,20 @@ def admit(graph: Graph, batch: BatchLike) -> None:
     BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and
     must go back to its mark.
     """
-    first = int(graph.counts[at.VARIABLES])
-    first_factor = int(graph.counts[at.FACTORS])
-    given = [_admit_variables(graph, group) for group in batch.variables]
+    counts = graph.counts.tolist()
+    first, first_factor = counts[at.VARIABLES], counts[at.FACTORS]
+    new, given = 0, []
+    for group in batch.variables:
+        count, has_values = _admit_variables(graph, group)
+        if has_values:
+            given.append((new, new + count))
+        new += count
     for group in batch.factors:
         _admit_factors(graph, group)
-    if not all(has_values for _, has_values in given):
-        reached = np.repeat(np.array([flag for _, flag in given], np.int64), [count for count, _ in given])
+    if len(given) < len(batch.variables):
+        reached = np.zeros(new, np.int64)
+        for begin, behind in given:
+            reached[begin:behind] = 1
         _compose(graph, first, first_factor, reached)
     if any(group.kind in LENS_AT for group in batch.factors):
         sights.check(graph, first_factor)
@@ -47,7 +55,7 @@ def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
         raise errors.UnknownKind("variable", group.kind, tuple(VARIABLE_KINDS))
     keys = _column(group.keys, _I64, (-1,), group.kind, "keys")
     if group.values is None:
-        values = np.empty((0, kind.size))
+        values = _NO_VALUES[kind.size]
     else:
         values = _column(group.values, _F64, (keys.size, kind.size), group.kind, "values")
     graph.reserve_variables(keys.size, kind.size)
