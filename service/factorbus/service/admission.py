@@ -127,15 +127,17 @@ class Admission:
         self._ready -= len(taken)
         return tuple(taken)
 
-    def answer(self, insert: Waiting, answer: object) -> list[Answer | Refuse]:
-        """`insert` has its answer: give it to all who wait for it, and remember it."""
+    def answer(self, insert: Waiting, answer: object, answered: Asker = None) -> list[Effect]:
+        """`insert` has its answer: give it to all who wait for it, but who is `answered` already, and remember it."""
         client = self._clients[insert.client]
         del client.open[insert.sequence]
         self._bytes -= insert.size
         client.answered[insert.sequence] = (insert.digest, answer)
         if len(client.answered) > self._limits.remembered:
             client.answered.popitem(last=False)
-        return [_reply(asker, answer) for asker in insert.askers]
+        if answered is not None and len(insert.askers) == 1:
+            return []
+        return [_reply(asker, answer) for asker in insert.askers if asker is not answered]
 
     def is_open(self, insert: Waiting) -> bool:
         """Has `insert` no answer yet?"""
@@ -301,5 +303,5 @@ def _wanted(client: _Client) -> str:
     return f"{client.next} first"
 
 
-def _reply(asker: Asker, answer: object) -> Answer | Refuse:
+def _reply(asker: Asker, answer: object) -> Effect:
     return Answer(asker, answer) if isinstance(answer, bytes) else Refuse(asker, answer)

@@ -14,6 +14,7 @@ from factorbus.solver.kernels import layout
 # Of messages above this size, looking closely is a small part of the work; and so many groups are no usual message.
 _SHORT_BYTES = 16 << 10
 _GROUPS = 30
+_SHAPE = (_GROUPS + 1, layout.G_WIDTH)
 
 
 def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
@@ -41,7 +42,7 @@ def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] 
     # A key is eight bytes: without counting, no more than this can be in it.
     if size > limits.max_bytes or size > 8 * limits.max_variables or size > 8 * limits.max_factors:
         return None
-    groups = np.empty((_GROUPS + 1, layout.G_WIDTH), np.int64)
+    groups = np.empty(_SHAPE, np.int64)
     sequence, epoch, settle, digest = read_usual(payload, WORDS, LETTERS, groups)
     if not sequence:
         return None

@@ -125,14 +125,12 @@ class MapCore:
     def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
         """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
         counts, insert = self._counts, alone.insert
-        others = self._admission.answer(insert, alone.answer)
-        if len(others) == 1:
-            others.clear()
+        others = self._admission.answer(insert, alone.answer, answered)
         counts["accepted"] += 1
         counts["answered_bytes"] += len(alone.answer)
         self._count(alone)
         self._free(alone, (insert,))
-        return self._go_on([effect for effect in others if effect.asker is not answered], alone.now)
+        return self._go_on(others, alone.now)
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
@@ -244,8 +242,7 @@ class MapCore:
 
     def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
         """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
-        free = self._running is None and not self._reads
-        if settle or not free or not self._is_quick(arrived.size, arrived.now):
+        if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
             return None
         insert = self._admission.take_alone(arrived)
         if insert is None:

@@ -13,6 +13,7 @@ from factorbus.solver.groups import BatchLike, FactorsLike, VariablesLike
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
+from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.reach import reach
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
@@ -46,6 +47,33 @@ def admit(graph: Graph, batch: BatchLike) -> None:
         _compose(graph, first, first_factor, reached)
     if any(group.kind in LENS_AT for group in batch.factors):
         sights.check(graph, first_factor)
+
+
+def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
+    """As `admit` for a small batch whose columns lie in `raw` where `groups` says; gives the id of its first factor.
+
+    None where anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
+    """
+    mark = graph.mark()
+    missing = admit_bytes(
+        raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
+        graph.counts,
+    )  # fmt: skip
+    if missing < 0:
+        return None
+    if missing:
+        first, new = mark[at.VARIABLES], [row for row in _rows(groups) if not row[at.G_FACTORS]]
+        reached = np.array([row[at.G_NUMBERS] >= 0 for row in new for _ in range(row[at.G_COUNT])], np.int64)
+        if _find_missing(graph, first, mark[at.FACTORS], reached) >= 0:
+            graph.forget(mark)
+            return None
+    return mark[at.FACTORS]
+
+
+def _rows(groups: I64) -> list[list[int]]:
+    rows = groups.tolist()
+    kinds = [row[at.G_KIND] for row in rows]
+    return rows[: kinds.index(at.END)]
 
 
 def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
@@ -102,12 +130,17 @@ def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
 
 
 def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
-    missing = reach(
+    missing = _find_missing(graph, first, first_factor, reached)
+    if missing >= 0:
+        raise errors.Uninitialised(int(graph.keys[missing]))
+
+
+def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> int:
+    """Compose values for those that are not `reached` yet; gives one that nothing leads to, or −1."""
+    return reach(
         True, first, first_factor, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload,
         reached,
     )  # fmt: skip
-    if missing >= 0:
-        raise errors.Uninitialised(int(graph.keys[missing]))
 
 
 def _column(array: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.solver import errors, sights
-from factorbus.solver.admission import admit
+from factorbus.solver.admission import admit, try_admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
@@ -17,7 +17,6 @@ from factorbus.solver.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import I64
-from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
@@ -101,12 +100,7 @@ class Solver:
         groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
         caller's word: they are not checked again.
         """
-        graph = self._graph
-        first = admit_bytes(
-            raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
-            graph.counts,
-        )  # fmt: skip
-        return int(first) if first >= 0 else None  # an int without the compiler, too
+        return try_admit(self._graph, raw, groups)
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.

@@ -54,7 +54,7 @@ def write_messages(
     return answer, here - answer
 
 
-@inline_kernel
+@part
 def count_groups(changed: I64, var: I64, words: I64) -> tuple:
     """(how many there are of each kind, those that are not fixed before those that are; bytes of their columns)."""
     kinds = 0
@@ -106,13 +106,13 @@ def label_of(variable: int, var: I64) -> int:
     return 2 * var[variable, at.V_KIND] + (1 if var[variable, at.V_COLUMN] < 0 else 0)
 
 
-@inline_kernel
+@part
 def write_piece(out: U8, here: int, row: int, words: I64, letters: U8) -> int:
     """What is in a row of the table."""
     return write_bytes(out, here, letters, words[row, w.W_START], words[row, w.W_LENGTH])
 
 
-@inline_kernel
+@part
 def write_bytes(out: U8, here: int, source: bytes | U8, start: int, length: int) -> int:
     """source[start : start + length]."""
     for k in range(length):
@@ -120,7 +120,7 @@ def write_bytes(out: U8, here: int, source: bytes | U8, start: int, length: int)
     return here + length
 
 
-@inline_kernel
+@part
 def write_word(out: U8, here: int, bits: int) -> int:
     """A little-endian int64."""
     for k in range(8):
@@ -137,7 +137,7 @@ def write_big_endian(out: U8, here: int, head: int, value: int, size: int) -> in
     return here + 1 + size
 
 
-@inline_kernel
+@part
 def write_integer(out: U8, here: int, value: int) -> int:
     """An integer from 0 on, in the shortest form."""
     if value < 0x80:
@@ -161,7 +161,7 @@ def write_count(out: U8, here: int, head: int, count: int) -> int:
     return write_big_endian(out, here, 0xDC, count, 2)
 
 
-@inline_kernel
+@part
 def write_bin_head(out: U8, here: int, size: int) -> int:
     """The head of a bin of `size` bytes."""
     if size <= 0xFF:

@@ -7,7 +7,7 @@ admission then says what is wrong, or makes room.
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.admit import (
     append_factor,
     append_variable,
@@ -17,7 +17,6 @@ from factorbus.solver.kernels.admit import (
     remove_keys,
     slot_of,
 )
-from factorbus.solver.kernels.reach import reach
 
 
 @kernel(
@@ -36,12 +35,13 @@ def admit_bytes(
     payload: F64,
     counts: I64,
 ) -> int:
-    """Append the groups of variables and factors in `raw`; gives the id of the first factor, or −1: nothing changed."""
+    """Append the groups of variables and factors in `raw`.
+
+    Gives how many of the variables still need a value, or −1: nothing changed.
+    """
     before = counts.copy()
-    if take_groups(raw, groups, table, keys, var, values, dims, fac, payload, counts) and compose_missing(
-        before, groups, var, fac, values, payload, counts
-    ):
-        return before[at.FACTORS]
+    if take_groups(raw, groups, table, keys, var, values, dims, fac, payload, counts):
+        return count_missing(groups)
     remove_keys(before[at.VARIABLES], counts[at.VARIABLES], table, keys)
     counts[:] = before
     return -1
@@ -86,7 +86,7 @@ def take_groups(
     return True
 
 
-@inline_kernel
+@part
 def take_variable(
     raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
 ) -> bool:
@@ -104,7 +104,7 @@ def take_variable(
     return True
 
 
-@inline_kernel
+@part
 def take_factor(
     raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64, scratch: F64
 ) -> bool:
@@ -123,32 +123,24 @@ def take_factor(
 
 
 @inline_kernel
-def compose_missing(before: I64, groups: I64, var: I64, fac: I64, values: F64, payload: F64, counts: I64) -> bool:
-    """Values for the new variables that came without; False: nothing leads to one of them."""
-    first = before[at.VARIABLES]
-    reached = np.ones(counts[at.VARIABLES] - first, np.int64)
-    g, v, missing = 0, 0, 0
+def count_missing(groups: I64) -> int:
+    """New variables that came without values."""
+    g, missing = 0, 0
     while groups[g, at.G_KIND] != at.END:
-        if groups[g, at.G_FACTORS] == 0:
-            for _ in range(groups[g, at.G_COUNT]):
-                if groups[g, at.G_NUMBERS] < 0:
-                    reached[v] = 0
-                    missing += 1
-                v += 1
+        if groups[g, at.G_FACTORS] == 0 and groups[g, at.G_NUMBERS] < 0:
+            missing += groups[g, at.G_COUNT]
         g += 1
-    return missing == 0 or (
-        reach(True, first, before[at.FACTORS], counts[at.FACTORS], var, fac, values, payload, reached) < 0
-    )
+    return missing
 
 
-@inline_kernel
+@part
 def copy_numbers(raw: bytes, start: int, count: int, out: F64, to: int) -> None:
     """The doubles in raw[start:] to out[to:]."""
     for c in range(count):
         out[to + c] = np.int64(word(raw, start + 8 * c)).view(np.float64)
 
 
-@inline_kernel
+@part
 def word(raw: bytes, start: int) -> int:
     """The little-endian int64 in raw[start : start + 8]."""
     bits = np.int64(0)
