@@ -43,7 +43,7 @@ _KEYFRAME = Read(Question("keyframe"))
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
-_COUNTED = ("accepted", "refused", "busy", "received_bytes", "answered_bytes", "published_bytes")
+_COUNTED: tuple[str, ...] = ("accepted", "refused", "busy", "received_bytes", "answered_bytes", "published_bytes")
 
 
 class MapCore:

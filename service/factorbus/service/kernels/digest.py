@@ -32,4 +32,4 @@ def digest_bytes(raw: bytes) -> int:
         first ^= first >> 16
         second = ((second ^ bits) * _SECOND) & _HALF
         second ^= second >> 15
-    return ((first & 0x7FFFFFFF) << 32) | second
+    return ((first & 0x7FFFFFFF) << 32) | second  # type: ignore[return-value]
