@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-data test-kernels test-faults lint check bench wheel clean
+.PHONY: help pictures setup demo test test-data test-kernels test-faults lint check bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -59,6 +59,10 @@ check: lint test ## lint and test: what CI runs
 
 bench: $(READY_DEV) ## the measurements, each with what it is held against
 	@$(BIN)/factorbus bench all $(ARGS)
+
+pictures: $(READY_DEV) ## draw the picture of the README again
+	@$(BIN)/factorbus simulate manhattan --poses 1500 --seed 7 --out $(BIN)/../town.g2o
+	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --out docs/town.png
 
 wheel: $(READY_DEV) ## build the wheel and try it in a clean virtual environment
 	@bash deploy/setup/try-wheel.sh $(BIN)/python

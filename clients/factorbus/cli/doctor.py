@@ -14,7 +14,7 @@ _SIGNS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[red]FAIL[/]
 @click.command()
 @json_option
 def command(as_json: bool) -> int:
-    """Look at versions, SuiteSparse and its BLAS, caches, ports, the bus, shared memory and the clock.
+    """Look at versions, extras, SuiteSparse and its BLAS, caches, clocks, shared memory, permissions, ports, bus.
 
     A warning is something that works but could be better; with a failure the exit code is 1.
 
