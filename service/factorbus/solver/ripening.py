@@ -19,13 +19,24 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 # Of a first sight's payload: where the lens is, and the pixel's block in the upper triangle of a 6 × 6 matrix.
 _LENS = np.arange(3, 4 + LENS_SIZE)
 _PIXEL_BLOCK = np.array([15, 16, 18])
+# Where the information of its guess of ρ is, and how much surer than the guess (σ) one has to be to do without.
+_GUESS, _SURER = 14 + 20, 10.0
 
 
 def find_ripe(graph: Graph, below: float) -> I64:
-    """The variables, ascending, that are features whose linearity index (3.19) is below this."""
+    """The variables, ascending, that are features whose linearity index (3.19) is below this.
+
+    One whose first guess of the depth still says something is left: as a point it would lose that, and a map its scale.
+    """
     count = int(graph.counts[at.VARIABLES])
     found = np.empty(count)
     linearity(count, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload, found)
+    firsts = graph.fac[: graph.counts[at.FACTORS]]
+    firsts = firsts[firsts[:, at.F_KIND] == at.IDP_FIRST]
+    features = firsts[:, at.F_J]
+    guessed = 1.0 / np.sqrt(graph.payload[firsts[:, at.F_AT] + _GUESS])
+    known = found[features] * np.abs(graph.values[graph.var[features, at.V_AT] + 5]) / 4.0
+    found[features[guessed < _SURER * known]] = np.inf
     return np.flatnonzero(found < below)
 
 
