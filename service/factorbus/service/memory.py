@@ -11,9 +11,9 @@ from factorbus.proto.problems import Problem
 
 # Of what the machine or the container has; the rest is for steps under way, answers, and other processes.
 _SHARE = 0.8
-# What an insert comes to in memory, by its bytes on the wire: as a message, in the graph, in Λ and in R.  Measured: 3.4
-# for relative poses along a trajectory; loops fill R further.
-_GROWTH = 8
+# What an insert comes to in memory, by its bytes on the wire: as a message, in the graph, in Λ and in R.  Measured:
+# 6 to 9 for poses along a trajectory, with arrays that double as they grow; loops fill R further.
+_GROWTH = 10
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
