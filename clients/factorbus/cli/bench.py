@@ -12,7 +12,7 @@ from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
 BENCHES = ("cholesky", "bus", "idp")  # what `all` runs, a minute or two
-LONG = ("paper", "peers")  # hours; on request
+LONG = ("paper", "peers", "fuzz")  # hours (fuzz: half an hour); on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
