@@ -36,6 +36,7 @@ from factorbus.service.health import Health
 from factorbus.service.host import Host
 from factorbus.service.jobs import Jobs
 from factorbus.service.lane import Lane, Lanes
+from factorbus.service.memory import give_back
 from factorbus.service.metrics import open_metrics
 from factorbus.service.optima import Optima
 from factorbus.service.questions import Snapshot, answer
@@ -394,7 +395,9 @@ class Shell:
         self._leaving.remove(found)
         found.host.end()
         self._outbox.hand(found.place.close)  # behind the map's last publications
-        self._reply(query, codec.encode_map({}))
+        self.vitals.forget(found.host.core.name)
+        self._desk.hand(give_back)
+        self._desk.hand(self._reply, query, codec.encode_map({}))
         log.info("map %s dropped", found.host.core.name, extra={"map": found.host.core.name})
 
     def _look_for_workers(self) -> None:

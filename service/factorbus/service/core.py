@@ -214,7 +214,11 @@ class MapCore:
             "refusals": dict(self._refusals),
             "step_s": self._step_s.as_dict(),
             "insert_s": self._insert_s.as_dict(),
-            "bytes": {name: self._counts[f"{name}_bytes"] for name in ("received", "answered", "published")},
+            "bytes": {
+                "received": self._counts["received_bytes"],
+                "answered": self._counts["answered_bytes"],
+                "published": self._counts["published_bytes"],
+            },
         }
 
     def running_s(self, now: float) -> float:

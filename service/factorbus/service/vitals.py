@@ -37,6 +37,10 @@ class Vitals:
         self.health.seen(Signs(now, lanes | {f"solver {name}": seconds for name, seconds in solvers.items()}))
         return {name for name, seconds in solvers.items() if seconds > self.health.stuck_s}
 
+    def forget(self, name: str) -> None:
+        """The map is gone, and with it, now and not at the next look, its memory."""
+        self._hosts = {each: host for each, host in self._hosts.items() if each != name}
+
     def account(self) -> dict[str, Any]:
         """What admin/stats says, and what the metrics are made of."""
         from factorbus.solver import compiled_seconds
