@@ -15,22 +15,12 @@ from factorbus.service.metrics import families
 DEPLOY = Path(__file__).parent.parent / "deploy"
 NAME = re.compile(r"factorbus_[a-z0-9_]+")
 _NUMBERS = ["variables", "factors", "revision", "chi2", "clients", "waiting", "parked", "in_solver"]
-    "variables",
-    "factors",
-    "revision",
-    "chi2",
-    "clients",
-    "waiting",
-    "parked",
-    "in_solver",
-    "steps",
-    "solver_cpu_s",
-]
 
 
 def known() -> set[str]:
     """Every metric that a service with one map and one worker has, as Prometheus names it."""
-    row = dict.fromkeys([*_NUMBERS, "steps", "solver_cpu_s"], 1) | {"name": "m", "step_s": Histogram().as_dict(), "insert_s": Histogram().as_dict()}
+    row = dict.fromkeys([*_NUMBERS, "steps", "solver_cpu_s"], 1)
+    row |= {"name": "m", "step_s": Histogram().as_dict(), "insert_s": Histogram().as_dict()}
     row |= {name: {"x": 1} for name in ("strategies", "inserts", "refusals", "bytes")}
     account = {
         "service": "s", "version": "1", "uptime_s": 1.0, "alive": True, "ready": True, "silent_s": {"watch": 0.0},
