@@ -48,6 +48,16 @@ class Graph:
         remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.counts[:] = mark
 
+    def copied(self) -> "Graph":
+        """The same graph with arrays of its own, as large as what is in use."""
+        variables, factors, values, payload, columns, _ = self.counts.tolist()
+        other = Graph()
+        other.keys, other.var = self.keys[:variables].copy(), self.var[:variables].copy()
+        other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
+        other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
+        other.fac = self.fac[:factors].copy()
+        return other
+
     def reserve_variables(self, more: int, size: int) -> None:
         """Make room for `more` variables of `size` numbers each."""
         counts = self.counts.tolist()
