@@ -110,6 +110,8 @@ def from_description(content: Any) -> Any:
                 return np.array(numbers, "<i8").tobytes()
             case {"f64": numbers}:
                 return np.array(numbers, "<f8").tobytes()
+            case {"u8": numbers}:
+                return bytes(numbers)
             case {"msgpack": inner}:
                 return msgpack.packb(from_description(inner))
         return {key: from_description(value) for key, value in content.items()}

@@ -18,6 +18,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
+from factorbus.client.aio_uncertainty import Doubt
 from factorbus.client.draft import Draft, Key
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
@@ -117,6 +118,7 @@ class Map:
         self._map = joined
         self._room = asyncio.Semaphore(window)
         self._loop = asyncio.get_running_loop()
+        self.doubt = Doubt(joined.doubt.ask)
 
     @property
     def name(self) -> str:

@@ -14,6 +14,7 @@ from factorbus.client.link import Link
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions
 from factorbus.client.ticket import Ticket
+from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -39,6 +40,8 @@ class Map:
     Inserts are numbered and sent until they are answered, each exactly once, in order, across restarts of the
     link.  They belong to the epoch that was joined: if the map is created anew (service restarted, map dropped),
     they are refused with wrong_epoch until `rejoin`; the mirror follows the new map by itself.
+
+    doubt: what the map can be asked about its uncertainty.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class Map:
         self._closed = False
         self._enter(join())
         self.ask = Questions(courier, self.name, timeout_s)
+        self.doubt = Doubt(DoubtQuestions(courier, self.name, timeout_s))
 
     def __enter__(self) -> "Map":
         return self

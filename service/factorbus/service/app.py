@@ -43,6 +43,7 @@ from factorbus.service.questions import Snapshot, answer
 from factorbus.service.start import get_ready_to_compute
 from factorbus.service.trips import Trips
 from factorbus.service.vitals import Vitals
+from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
 
@@ -323,7 +324,7 @@ class Shell:
                 self._desk.hand(self._optima.batch, read.asker, read.question, taken)
             else:
                 reply(read.asker, answer(read.question, taken))
-        except Problem as problem:
+        except (Problem, SolverError) as problem:
             refuse(read.asker, problem)
         except Exception:
             reference = secrets.token_hex(4)

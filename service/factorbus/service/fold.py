@@ -26,6 +26,7 @@ from factorbus.service.events import Alone, Folded, Judged, Located, Outcome, St
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
 from factorbus.service.questions import Question, Snapshot, as_factors, as_variables, snapshot
+from factorbus.service.uncertain import Uncertain
 from factorbus.solver.errors import SolverError
 
 # The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
@@ -64,6 +65,8 @@ class Folder:
         self._make, self._epoch, self._limits = make_solver, epoch, limits
         self._solver = make_solver()
         self._revision = 0
+        self._account: dict[str, Any] = {}  # of the last step
+        self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._cpu_s = 0.0  # of every thread that folded
         self._held = (0, 0)  # variables and factors that were accepted
         self._out = np.empty(_ALONE_BYTES, np.uint8)
@@ -76,7 +79,9 @@ class Folder:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
-        return snapshot(self._solver, self._epoch, self._revision, questions)
+        taken = snapshot(self._solver, self._epoch, self._revision, questions, self._account, self._uncertain)
+        self._uncertain = taken.uncertain
+        return taken
 
     def fold(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
@@ -221,7 +226,7 @@ class Folder:
         """The step went well: the answers, then the delta."""
         account = report.as_dict()
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._revision += 1
+        self._next(account)
         accepted = [
             Outcome(
                 s.insert,
@@ -274,6 +279,11 @@ class Folder:
         delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
         return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
+    def _next(self, account: dict[str, Any]) -> None:
+        """The solver has made a step."""
+        self._revision += 1
+        self._account, self._uncertain = account, None
+
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""
         reference = secrets.token_hex(4)
@@ -285,7 +295,7 @@ class Folder:
         try:
             account = self._rebuild()
             if account is not None:
-                self._revision += 1
+                self._next(account)
                 yield self._told(account)._replace(rebuilt=True)
         except Exception:
             self._broken = reference

@@ -10,13 +10,15 @@ import numpy as np
 from factorbus.solver import errors, sights
 from factorbus.solver.admission import admit, try_admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
+from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
+from factorbus.solver.covariance.live import Live
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
@@ -59,7 +61,7 @@ _VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Wh
 class Solver:
     """Variables, factors and their estimate.  Not thread-safe: one thread owns it."""
 
-    NOT_KEPT = ("_options", "_mode")
+    NOT_KEPT = ("_options", "_mode", "_live")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -67,6 +69,7 @@ class Solver:
         self._mode = mode_named(self._options.mode)
         self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
         self._tree = TreeSteps(self._graph, self._options) if self._mode.tree else None
+        self._live = Live(self._graph, self._tree.tree) if self._tree else None
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
@@ -194,6 +197,27 @@ class Solver:
     def load(self, state: Mapping[str, Any]) -> None:
         """Be where the solver that gave `state` was.  Raises ValueError, and is of no use then."""
         load(self, state, _VALUES)
+
+    def factored(self) -> Factored:
+        """A copy of R and of all that it is of, as of the last step: what covariances are computed from, elsewhere.
+
+        In the mode "tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        """
+        return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
+
+    def try_view(self) -> Factored | None:
+        """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
+
+        None: this mode keeps no R that could be read in place; `factored` makes one.
+        """
+        return viewed(self._graph, self._tree.tree) if self._tree else None
+
+    def try_joint(self, variables: I64) -> F64 | None:
+        """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
+
+        None: as for `try_view`.
+        """
+        return self._live.joint(variables) if self._live else None
 
     def _place_new(self) -> None:
         """Good first values for the few variables that a step of a robot brings."""

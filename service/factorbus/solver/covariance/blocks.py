@@ -6,7 +6,7 @@ Fixed variables have covariance zero.
 
 import numpy as np
 
-from factorbus.solver.covariance.factored import LARGEST, Factored
+from factorbus.solver.covariance.factored import DIMS, LARGEST, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks
@@ -14,6 +14,7 @@ from factorbus.solver.kernels._jit import F64, I64
 
 # For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
 _FEW = 1 / 64
+_FEW_PAIRS = 4
 
 
 class Blocks:
@@ -33,7 +34,8 @@ class Blocks:
 
     def of(self, variables: I64) -> F64:
         """(k, 6, 6): of some variables, each by itself."""
-        if self._diagonal is not None or variables.size > _FEW * self.factored.count:
+        whole = self.factored.order.size > 0
+        if self._diagonal is not None or (whole and variables.size > _FEW * self.factored.count):
             return self.diagonal()[variables]
         out = np.zeros((variables.size, LARGEST, LARGEST))
         for k, v in enumerate(variables.tolist()):
@@ -47,7 +49,7 @@ class Blocks:
         different, which = np.unique(variables, return_inverse=True)
         free = different[f.scalar[different] >= 0]
         inner = np.zeros((int(f.dims[free].sum()),) * 2)
-        joint_block(free, f.node, f.clique, f.lists, f.numbers, f.dims, inner)
+        joint_block(free, f.graph.var, DIMS, f.node, f.clique, f.lists, f.numbers, inner)
         # Where the scalars of `variables` are in `inner`; the last row and column of zeros serve the fixed ones.
         starts = np.full(different.size, -1)
         starts[f.scalar[different] >= 0] = np.cumsum(f.dims[free]) - f.dims[free]
@@ -65,6 +67,8 @@ class Blocks:
     def pairs(self, first: I64, second: I64) -> F64:
         """(k, 6, 6): between first[k] (rows) and second[k] (columns), each in the upper left corner."""
         f = self.factored
+        if first.size <= _FEW_PAIRS or f.order.size == 0:
+            return self._single_pairs(first, second)
         free_first, free_second = (np.where(f.scalar[ends] >= 0, ends, -1) for ends in (first, second))
         turned = np.unique(free_second).size < np.unique(free_first).size
         hubs, partners = (free_second, free_first) if turned else (free_first, free_second)
@@ -77,3 +81,11 @@ class Blocks:
         blocks = np.empty_like(sorted_blocks)
         blocks[order] = sorted_blocks
         return blocks.transpose(0, 2, 1) if turned else blocks
+
+    def _single_pairs(self, first: I64, second: I64) -> F64:
+        """The same, each from the paths of its two ends."""
+        out = np.zeros((first.size, LARGEST, LARGEST))
+        for k, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+            d, e = int(self.factored.dims[i]), int(self.factored.dims[j])
+            out[k, :d, :e] = self.joint(np.array([i, j]))[:d, d:]
+        return out

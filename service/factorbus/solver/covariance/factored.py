@@ -15,18 +15,18 @@ from factorbus.solver.options import Options
 from factorbus.solver.tree import Tree
 from factorbus.solver.variables import VARIABLE_KINDS
 
-_DIMS = np.zeros(1 + max(kind.code for kind in VARIABLE_KINDS.values()), np.int64)
+DIMS = np.zeros(1 + max(kind.code for kind in VARIABLE_KINDS.values()), np.int64)
 for _kind in VARIABLE_KINDS.values():
-    _DIMS[_kind.code] = _kind.dim
-LARGEST = int(_DIMS.max())
+    DIMS[_kind.code] = _kind.dim
+LARGEST = int(DIMS.max())
 
 
 @dataclass(frozen=True, slots=True)
 class Factored:
-    """R by cliques and the graph it is of; arrays as in `kernels/tree_layout.py`.  Nothing here is shared.
+    """R by cliques and the graph it is of; arrays as in `kernels/tree_layout.py`.
 
     dims (n,): of every variable   scalar (n,): where it starts in a column of Σ; −1: fixed
-    order (c,): the cliques, depth first from the roots   stamp: of the last elimination
+    order (c,): the cliques, depth first from the roots; none in a view   stamp: of the last elimination
     """
 
     graph: Graph
@@ -50,6 +50,15 @@ def factored(graph: Graph, tree: Tree) -> Factored:
     return _copied(graph.copied(), tree)
 
 
+def viewed(graph: Graph, tree: Tree) -> Factored:
+    """The same in place, until the next step: for what goes up from a few variables."""
+    count = int(graph.counts[at.VARIABLES])
+    return Factored(
+        graph, tree.node[:count], tree.clique, tree.lists, tree.numbers, dims_of(graph.var[:count]),
+        np.ascontiguousarray(graph.var[:count, at.V_SCALAR]), np.empty(0, np.int64), int(tree.state[tl.S_STAMP]),
+    )  # fmt: skip
+
+
 def factored_anew(graph: Graph) -> Factored:
     """The same for a graph that is solved in another way: factorised here at its values.  Raises Underconstrained."""
     copy = graph.copied()
@@ -66,7 +75,7 @@ def factored_anew(graph: Graph) -> Factored:
 
 def dims_of(var: I64) -> I64:
     """The dimension of the tangent space of every variable in `var`."""
-    return _DIMS[var[:, at.V_KIND]]
+    return DIMS[var[:, at.V_KIND]]
 
 
 def _copied(graph: Graph, tree: Tree) -> Factored:

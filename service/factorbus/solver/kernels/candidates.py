@@ -1,4 +1,4 @@
-"""Residuals, Jacobians and information of factors as plain arrays: for questions about them, not for solving.  MATH §3."""
+"""Residuals, Jacobians and information of factors as plain arrays: for questions about them.  MATH §3, §10.3."""
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, kernel

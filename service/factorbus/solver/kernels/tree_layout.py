@@ -9,7 +9,7 @@ S, with a last column for the right-hand side and a corner for χ²,
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
 The arenas of a tree are:
-    node    (n, 11) int64     one row per variable, by its index in the graph
+    node    (n, 12) int64     one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 20) int64    records of cliques
     lists   int64            variables of cliques
@@ -39,7 +39,8 @@ N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
 N_MOVED = 8  # the last step that changed its estimate
 N_LISTED = 9  # 1: it is in `moved`
 N_COLUMN = 10  # scratch: its column in the clique at hand
-N_WIDTH = 11
+N_LINEARISED = 11  # the last step that gave it a linearisation point
+N_WIDTH = 12
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable

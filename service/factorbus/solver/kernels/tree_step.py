@@ -202,6 +202,7 @@ def eliminate_again(
     if not wait:
         for k in range(state[tl.S_PENDING]):
             node[pending[k], tl.N_FLAGS] = FREE
+            node[pending[k], tl.N_LINEARISED] = state[tl.S_STEP]
         state[tl.S_PENDING] = 0
     now = lap(now, tl.COMMIT, state)
     # 8

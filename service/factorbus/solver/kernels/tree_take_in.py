@@ -19,6 +19,7 @@ def take_in_variables(
         node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
         node[v, tl.N_PLACE] = node[v, tl.N_LOCAL] = node[v, tl.N_FLAGS] = node[v, tl.N_LISTED] = 0
         node[v, tl.N_STAMP], node[v, tl.N_SEEN], node[v, tl.N_MOVED] = -1, state[tl.S_STEP], -1
+        node[v, tl.N_LINEARISED] = state[tl.S_STEP]
         x = var[v, at.V_AT]
         for a in range(size_of(var[v, at.V_KIND])):
             lin[0, x + a] = values[x + a]

@@ -37,7 +37,7 @@ def cross_blocks(
     stamp = np.zeros(order.size, np.int64)
     first = 0
     while first < hubs.size:
-        last, hub = first + 1, hubs[first]
+        last, hub = first + 1, int(hubs[first])
         while last < hubs.size and hubs[last] == hub:
             last += 1
         if hub >= 0:
@@ -66,12 +66,12 @@ def cross_blocks(
 @inline_kernel
 def mark(v: int, stamp: int, node: I64, clique: I64, rank: I64, stamps: I64, lowest: int) -> int:
     """Mark the path of v; gives the last place in the order that is marked."""
-    c = node[v, tl.N_CLIQUE]
+    c, last = node[v, tl.N_CLIQUE], lowest
     while c >= 0 and stamps[rank[c]] != stamp:
         stamps[rank[c]] = stamp
-        lowest = max(lowest, rank[c])
+        last = max(last, int(rank[c]))
         c = clique[c, tl.C_PARENT]
-    return int(lowest)
+    return last
 
 
 @inline_kernel

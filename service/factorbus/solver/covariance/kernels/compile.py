@@ -11,7 +11,7 @@ from factorbus.solver.kernels._jit import DISABLED, F64, I64, KernelFolder
 
 __all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
 
-_BORROWED = ("tree_layout", "simd", "simd_llvm", "simd_checked", "simd_plain")
+_BORROWED = ("layout", "tree_layout", "simd", "simd_llvm", "simd_checked", "simd_plain")
 _FOLDER = KernelFolder(
     Path(__file__).parent,
     "kernels-covariance",

@@ -1,6 +1,6 @@
 """What a map expects of a factor that it has not taken in.  MATH §10.3.
 
-    T = H Σ Hᵀ,   S = T + Ω⁻¹,   d² = rᵀ S⁻¹ r,   gain = ½ ln det S + ½ ln det Ω               (10.5)
+T = H Σ Hᵀ,   S = T + Ω⁻¹,   d² = rᵀ S⁻¹ r,   gain = ½ ln det S + ½ ln det Ω               (10.5)
 """
 
 import math

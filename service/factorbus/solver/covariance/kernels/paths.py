@@ -9,21 +9,27 @@ import numpy as np
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel, part
 from factorbus.solver.covariance.kernels.substitute import COLUMNS, forward
+from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 
 
-@kernel("void(int64[::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,::1])")
-def joint_block(variables: I64, node: I64, clique: I64, lists: I64, numbers: F64, dims: I64, out: F64) -> None:
+@kernel(
+    "void(int64[::1], int64[:,::1], int64[::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], float64[:,::1])"
+)
+def joint_block(
+    variables: I64, var: I64, sizes: I64, node: I64, clique: I64, lists: I64, numbers: F64, out: F64
+) -> None:
     """The joint covariance of different free `variables`, in their order.
 
+    in   sizes: the dimension of each kind of variable
     out  (d, d)
     """
     order = list_paths(variables, node, clique)
-    row_of = np.empty(len(node), np.int64)
+    row_of, dims = np.empty(len(node), np.int64), np.empty(len(node), np.int64)
     rows, widest = 0, 0
     for c in order:
         for s in range(clique[c, tl.C_LIST], clique[c, tl.C_LIST] + clique[c, tl.C_FRONTALS]):
-            row_of[lists[s]] = rows
+            row_of[lists[s]], dims[lists[s]] = rows, sizes[var[lists[s], at.V_KIND]]
             rows += dims[lists[s]]
         widest = max(widest, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
     d = len(out)

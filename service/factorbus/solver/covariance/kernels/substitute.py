@@ -1,4 +1,4 @@
-"""Substitution with the rows of one clique, three right-hand sides at a time, and the nonzeros of R read once for all."""
+"""Substitution with the rows of one clique, three right-hand sides at a time: R is read once for all of them."""
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels import tree_layout as tl
