@@ -91,7 +91,7 @@ def _about_uncertainty() -> dict[str, bytes]:
     block = np.array([[0.25, 0.0, 0.125], [0.0, 0.5, 0.0], [0.125, 0.0, 0.0625]])
     group = asking.CovarianceGroup("se2", np.array(x[1:2]), block[None])
     relative = asking.CovarianceGroup("se2", pairs, block[None], np.array([[1.5, 0.25, 0.125]]))
-    dims, matrix = np.array([3, 3]), np.kron(np.array([[2.0, 1.0], [1.0, 2.0]]), block)
+    dims, matrix = np.array([3, 3]), np.vstack([np.hstack([2 * block, block]), np.hstack([block, 2 * block])])
     sights = np.array([[2.0, 1.0], [3.0, 0.0]])
     account = {"factor": 0, "kind": "between_se2", "keys": x[:2], "chi2": 0.25, "without": None, "dims": 3}
     return {

@@ -26,7 +26,7 @@ class Candidates:
     """Factors k, in the order they were given.
 
     ends (n, 2): variables, −1: none   dims (n,): of the residuals   distance (n,): d²   gain (n,): nats
-    predicted (n, 6, 6): T = H Σ Hᵀ, upper left corners
+    predicted (n, d, d): T = H Σ Hᵀ, upper left corners
     """
 
     ends: I64
@@ -78,23 +78,17 @@ def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
     graph, n = blocks.factored.graph, last - first
     ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
     both = np.flatnonzero(ends[:, 1] >= 0)
-    cross = np.zeros((n, LARGEST, LARGEST))
+    cross = np.zeros((n, blocks.width, blocks.width))
     if both.size:
         cross[both] = blocks.pairs(ends[both, 0], ends[both, 1])
-    different, which = np.unique(ends, return_inverse=True)
-    known = different >= 0
-    # The corners of those that occur; a missing end reads the first row and uses nothing of it.
-    diagonal = np.zeros((different.size, LARGEST, LARGEST))
-    diagonal[known] = blocks.of(different[known])
-    places = which.reshape(ends.shape)
-    places[ends < 0] = -1
-    distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, LARGEST, LARGEST))
-    dims = np.empty(n, np.int64)
+    diagonal, places = _diagonal(blocks, ends)
+    dims = _SIZES[graph.fac[first:last, at.F_KIND], 0]
+    widest = int(dims.max(initial=1))
+    distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, widest, widest))
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
         linear = linearised(graph, first + start, first + stop)
         rows = slice(start, stop)
-        dims[rows] = linear.sizes[:, 0]
         judge(
             places[rows], linear.sizes, linear.r, linear.A, linear.B, linear.W, diagonal, cross[rows],
             predicted[rows], distance[rows], gain[rows],
@@ -102,6 +96,17 @@ def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
     if not np.isfinite(distance).all():
         raise errors.NotFinite("the distance of a candidate")
     return Candidates(ends, dims, distance, gain, predicted)
+
+
+def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
+    """Covariances of the variables that occur, and where those of `ends` are among them; −1 stays."""
+    if blocks.prefers_all(ends.size):
+        return blocks.diagonal(), ends
+    different, which = np.unique(ends, return_inverse=True)
+    known = different >= 0
+    diagonal = np.zeros((different.size, blocks.width, blocks.width))
+    diagonal[known] = blocks.of(different[known])
+    return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
 
 
 def linearised(graph: Graph, first: int, last: int) -> Linear:

@@ -22,8 +22,8 @@ def judge(
     """Factors between ends[k, 0] and ends[k, 1] (−1: none).
 
     in   sizes (n, 3): of the residual and of the ends   r (n, 6)  A, B, W (n, 6, 6)
-         diagonal (variables, 6, 6)  cross (n, 6, 6): Σ between the ends
-    out  T (n, 6, 6)   distance (n,): d²   gain (n,): nats
+         diagonal (variables, d, d)  cross (n, d, d): Σ between the ends
+    out  T (n, e, e)   distance (n,): d²   gain (n,): nats
     """
     G, S, y = np.empty((_DIM, _DIM)), np.empty((_DIM, _DIM)), np.empty(_DIM)
     for k in range(len(ends)):

@@ -47,14 +47,14 @@ def diagonal_blocks(order: I64, clique: I64, lists: I64, numbers: F64, dims: I64
     """
     starts, level, widest, first, size = lay_out(order, clique)
     a = np.zeros(size)
-    column, places = np.empty(len(dims), np.int64), np.empty(2 * widest, np.int64)
+    column, runs = np.empty(len(dims), np.int64), np.empty(3 * widest, np.int64)
     starts[0] = first
     for c in order:
         row, depth = clique[c], level[c]
         starts[depth + 1] = starts[depth] + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
         if row[tl.C_BORDER] > 0:
             above = clique[row[tl.C_PARENT]]
-            gather(row, above, lists, dims, column, places, a, starts[depth - 1], starts[depth])
+            gather(row, above, lists, dims, column, runs, a, starts[depth - 1], starts[depth])
         solve_clique(row, numbers, a, starts[depth], row[tl.C_CHILD] >= 0)
         put_diagonal(row, lists, dims, a, starts[depth], out)
 

@@ -8,11 +8,12 @@ the pivots in reverse, which makes of back-substitution the forward kind that `s
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put, solve_rows, tile
+from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put, solve_rows, tile, zero
 from factorbus.solver.kernels.simd import at as load
 
 _SCRATCH = 16
 _DIMS = 6  # of the largest variable
+_STRIP = 8
 
 
 @inline_kernel
@@ -41,31 +42,50 @@ def room_of(p: int, m: int) -> int:
 
 @part
 def gather(
-    row: I64, above: I64, lists: I64, dims: I64, column: I64, places: I64, a: F64, source: int, target: int
+    row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int
 ) -> None:
     """Σ_SS into the square at `target`, from that of the parent at `source`.
 
-    column, places: scratch
+    column, runs: scratch
     """
     scalar = 0
     for s in range(above[tl.C_LIST], above[tl.C_LIST] + above[tl.C_FRONTALS] + above[tl.C_SEPARATORS]):
         column[lists[s]] = scalar
         scalar += dims[lists[s]]
     wide, pivots = row_length(above[tl.C_PIVOTS], above[tl.C_BORDER]), above[tl.C_PIVOTS]
-    gap = padded(pivots) - pivots
-    m, start = 0, row[tl.C_LIST] + row[tl.C_FRONTALS]
+    count, m, end, start = 0, 0, -1, row[tl.C_LIST] + row[tl.C_FRONTALS]
     for s in range(start, start + row[tl.C_SEPARATORS]):
-        first = column[lists[s]]
-        for k in range(first, first + dims[lists[s]]):
-            places[2 * m] = source + k * wide
-            places[2 * m + 1] = k + gap if k >= pivots else k
-            m += 1
-    p = row[tl.C_PIVOTS]
+        first, d = column[lists[s]], dims[lists[s]]
+        if first != end or first == pivots:
+            runs[3 * count], runs[3 * count + 1], runs[3 * count + 2] = first, 0, m
+            count += 1
+        runs[3 * count - 2] += d
+        m, end = m + d, first + d
+    p, gap = row[tl.C_PIVOTS], padded(pivots) - pivots
     ld = row_length(p, m)
-    for i in range(m):
-        line, into = places[2 * i], target + (p + i) * ld + padded(p)
-        for j in range(m):
-            put(a, into + j, load(a, line + places[2 * j + 1]))
+    for k in range(count):
+        for i in range(runs[3 * k + 1]):
+            line, into = source + (runs[3 * k] + i) * wide, target + (p + runs[3 * k + 2] + i) * ld + padded(p)
+            for n in range(count):
+                first = runs[3 * n]
+                copy(a, into + runs[3 * n + 2], line + (first + gap if first >= pivots else first), runs[3 * n + 1])
+
+
+@inline_kernel
+def copy(a: F64, target: int, source: int, count: int) -> None:
+    """a[target : target + count] = a[source : source + count]"""
+    for j in range(count):
+        put(a, target + j, load(a, source + j))
+
+
+@inline_kernel
+def transpose(a: F64, rows: int, columns: int, source: int, step: int, target: int, ld: int) -> None:
+    """The transpose of a matrix at `source`, rows `step` apart (also backwards), to `target`, rows `ld` apart."""
+    for first in range(0, columns, _STRIP):
+        last = min(first + _STRIP, columns)
+        for i in range(rows):
+            for k in range(first, last):
+                put(a, target + k * ld + i, load(a, source + i * step + k))
 
 
 @part
@@ -78,24 +98,26 @@ def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> No
     w = _SCRATCH + 2 * p * padded(p + m) + LANES
     solve_rows_of(row, numbers, a, ld, w)
     for i in range(p):
-        for j in range(m):
-            put(a, target + i * ld + border + j, 0.0)
+        zero(a, target + i * ld, ld)
     product(p, m, m, a, target + border, ld, w, target + p * ld + border, ld)
-    for i in range(p):
-        line = target + i * ld
-        for j in range(m):
-            put(a, target + (p + j) * ld + i, load(a, line + border + j))
-        for j in range(p):
-            put(a, target + (p + m + j) * ld + i, -load(a, w + (m + j) * ld + i))
-            put(a, line + j, 0.0)
-    for i in range(0, p, TILE_ROWS):
-        rows = min(TILE_ROWS, p - i)
-        first = i & ~(LANES - 1)
-        last = p if whole else min(p, i + TILE_ROWS + _DIMS)
-        across(rows, last - first, m + p, a, target + i * ld + first, ld, target + p * ld + i, w + first, ld)
-    for i in range(p):
-        for j in range(i + 1, p):
-            put(a, target + j * ld + i, load(a, target + i * ld + j))
+    transpose(a, p, m, target + border, ld, target + p * ld, ld)
+    for k in range(p):
+        for i in range(p):
+            put(a, target + (p + m + k) * ld + i, -load(a, w + (m + k) * ld + i))
+    x = target + p * ld
+    for j in range(0, p, TILE_VECTORS * LANES):
+        some = min(TILE_VECTORS, (p - j + LANES - 1) // LANES)
+        for i in range(0, min(p, j + some * LANES), TILE_ROWS):
+            if whole or j < i + TILE_ROWS + _DIMS:
+                tile(a, min(TILE_ROWS, p - i), some, target + i * ld + j, ld, x + i, w + j, ld, m + p)
+    if whole:
+        for i in range(p):
+            for j in range(i + 1, p):
+                put(a, target + j * ld + i, load(a, target + i * ld + j))
+    else:
+        for i in range(p):
+            for j in range(i + 1, min(i + _DIMS, p)):
+                put(a, target + j * ld + i, load(a, target + i * ld + j))
 
 
 @part
@@ -109,8 +131,7 @@ def solve_rows_of(row: I64, numbers: F64, a: F64, ld: int, w: int) -> None:
         source, v = start + (p - 1 - i) * step, _SCRATCH + i * wide
         for j in range(m):
             put(a, v + j, load(numbers, source + p + j))
-        for j in range(p):
-            put(a, v + m + j, 0.0)
+        zero(a, v + m, p)
         put(a, v + m + p - 1 - i, 1.0)
         for k in range(i):
             put(a, turned + k * wide + i, load(numbers, source + p - 1 - k))
@@ -124,17 +145,19 @@ def solve_rows_of(row: I64, numbers: F64, a: F64, ld: int, w: int) -> None:
             for i in range(j):
                 put(a, 4 + j * (j - 1) // 2 + i, load(a, corner + i * wide + j))
         solve_rows(a, rows, wide // LANES, v, wide, 0)
-    for i in range(p):
-        v = _SCRATCH + (p - 1 - i) * wide
-        for k in range(width):
-            put(a, w + k * ld + i, load(a, v + k))
+    transpose(a, p, width, _SCRATCH + (p - 1) * wide, -wide, w, ld)
 
 
 @inline_kernel
 def product(p: int, width: int, depth: int, a: F64, c: int, ldc: int, x: int, y: int, ld: int) -> None:
-    """C −= XᵀY:  C (p, width) at c,  X (depth, p) at x,  Y (depth, width) at y; the width is rounded up to vectors."""
-    for i in range(0, p, TILE_ROWS):
-        across(min(TILE_ROWS, p - i), width, depth, a, c + i * ldc, ldc, x + i, y, ld)
+    """C −= XᵀY:  C (p, width) at c,  X (depth, p) at x,  Y (depth, width) at y; the width is rounded up to vectors.
+
+    A few columns of Y, which stay in the cache, with all of X.
+    """
+    for j in range(0, width, TILE_VECTORS * LANES):
+        some = min(TILE_VECTORS, (width - j + LANES - 1) // LANES)
+        for i in range(0, p, TILE_ROWS):
+            tile(a, min(TILE_ROWS, p - i), some, c + i * ldc + j, ldc, x + i, y + j, ld, depth)
 
 
 @inline_kernel
