@@ -15,7 +15,8 @@ def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ask, "_problem", lambda name, poses: SIMULATED[0].shortened(120))
     monkeypatch.setattr(ask, "_CANDIDATES", 200)
     found = ask.run(120)
-    assert len(found["targets"]) == 4
+    assert len(found["targets"]) == 5
+    assert found["every_step"]["worst_difference_to_recursion"] < 1e-8
     assert all(target["seen"] > 0 for target in found["targets"])
     assert found["large"]["worst_difference_to_gtsam"] < 0.05
     assert "manhattan" in ask.report(found).lower()

@@ -14,6 +14,8 @@ class DenseCovariance:
         self.graph, self.starts = graph, graph.starts()
         information, _ = graph.system()
         scale = np.sqrt(np.diag(information))
+        # What differences instead of Jacobians, and inverting, may cost: relative.
+        self.tell = max(1e-8, 1e-13 * float(np.linalg.cond(information / scale / scale[:, None])))
         self.sigma = np.linalg.inv(information / scale / scale[:, None]) / scale / scale[:, None]
 
     def joint(self, keys: list[int]) -> np.ndarray:

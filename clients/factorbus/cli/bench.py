@@ -28,8 +28,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
     idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
                --figures FOLDER, --no-workers
-    ask        covariances against GTSAM's and a full batch pass, the last pose at every step, gates of 10,000
-               candidates; --quick
+    ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
+               of 10,000 candidates; --quick
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;

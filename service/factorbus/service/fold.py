@@ -131,7 +131,7 @@ class Folder:
             answer = 0
         if not answer:
             return self._in_pieces(_Staged(insert, first_factor, content.settle), report, started)
-        self._revision += 1
+        self._next(account)
         self._held = variables, factors = variables + report.new_variables, factors + report.new_factors
         # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
         self._cpu_s += 1e-3 * solver_ms

@@ -12,6 +12,7 @@ from factorbus.solver.admission import admit, try_admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
 from factorbus.solver.covariance.live import Live
+from factorbus.solver.covariance.upkeep import Upkeep
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
@@ -211,6 +212,10 @@ class Solver:
         None: this mode keeps no R that could be read in place; `factored` makes one.
         """
         return viewed(self._graph, self._tree.tree) if self._tree else None
+
+    def try_upkeep(self) -> Upkeep | None:
+        """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
+        return Upkeep(self._graph, self._tree.tree) if self._tree else None
 
     def try_joint(self, variables: I64) -> F64 | None:
         """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
