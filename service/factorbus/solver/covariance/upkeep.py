@@ -126,7 +126,7 @@ class Upkeep:
         tree, width = self._tree, int(self._dims.max())
         hubs, partners = np.repeat(ends, old), np.tile(np.arange(old), ends.size)
         partners[self._scalar[partners] < 0] = -1
-        cross = np.empty((hubs.size, width, width))
+        cross = np.zeros((hubs.size, width, width))
         cross_blocks(
             hubs, partners, self._order(), self._scalar, tree.node, tree.clique, tree.lists, tree.numbers, self._dims,
             cross,
