@@ -63,12 +63,11 @@ def factored_anew(graph: Graph) -> Factored:
     """The same for a graph that is solved in another way: factorised here at its values.  Raises Underconstrained."""
     copy = graph.copied()
     values = copy.values.copy()
-    tree = Tree(copy, Options(mode="tree"))
-    failed = tree.step()
-    if failed >= 0:
-        raise errors.Underconstrained(
-            int(graph.keys[failed]), graph.factors_of(failed), "its covariance is infinite; add a prior or a factor"
-        )
+    # The graph is solved, so all of it is held; and the linearisation points are the estimate.
+    tree = Tree(copy, Options(mode="tree", place_new=False))
+    if tree.step(sure=True) == tl.FAILED:
+        key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
+        raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")
     copy.values = values
     return _copied(copy, tree)
 

@@ -37,7 +37,7 @@ def search(
     while t >= 0:
         if t == n:
             k = depth_of[n]
-            if k > most or (k == most and total[k] < least):
+            if total[k] <= gates[k] and (k > most or (k == most and total[k] < least)):
                 most, least = k, total[k]
                 best[:] = chosen
             t -= 1
@@ -56,7 +56,7 @@ def search(
                     count[0], count[1] = max(most, 0), tried
                     return 0
                 d2 = total[k] + append_pair(dim, k, q, picked, S, r, L, y)
-                if d2 <= gates[k + 1]:
+                if d2 <= gates[k + n - t]:  # d² only grows: as large a set as can still come would be refused
                     found = True
                     picked[k], total[k + 1] = q, d2
             q += 1
