@@ -185,8 +185,9 @@ class Uncertain:
 
 
 def _checked(groups: Sequence[Factors]) -> Sequence[Factors]:
+    """Without their losses: a gate is to judge the measurement as it is."""
     _check_size("the question", sum(len(group.keys) for group in groups), "candidates")
-    return groups
+    return [Factors(group.kind, group.keys, group.measured, group.information) for group in groups]
 
 
 def _check_size(what: str, count: int, unit: str) -> None:

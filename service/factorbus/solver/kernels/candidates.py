@@ -2,8 +2,8 @@
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, kernel
-from factorbus.solver.kernels.linearise import evaluate
-from factorbus.solver.kernels.omega import information_at, residual_dim
+from factorbus.solver.kernels.linearise import evaluate_apart
+from factorbus.solver.kernels.sizes import information_at, residual_dim
 
 
 @kernel(
@@ -19,7 +19,7 @@ def evaluate_factors(
     """
     for f in range(first, last):
         k = f - first
-        evaluate(f, var, fac, values, payload, r[k], A[k], B[k])
+        evaluate_apart(f, var, fac, values, payload, r[k], A[k], B[k])
         dim = residual_dim(fac[f, at.F_KIND])
         p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
         for a in range(dim):
