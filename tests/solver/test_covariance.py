@@ -130,6 +130,8 @@ def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
     for group in solver.estimate():
         of_kind.setdefault(group.kind, []).append(group.keys)
     for kind in FACTOR_KINDS.values():
+        if kind.code >= at.IDP_FIRST:  # what a camera sees is not drawn by chance
+            continue
         ends = [np.concatenate(of_kind[end.name]) for end in kind.connects]
         keys = np.array([[rng.choice(end) for end in ends] for _ in range(3)])
         keys = keys[[len(set(row)) == len(row) for row in keys.tolist()]]
