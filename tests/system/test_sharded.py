@@ -27,7 +27,7 @@ def test_spread_move_and_restart(spawn: Spawn) -> None:
     router = spawn(ROUTER, "tcp/127.0.0.1:0").ready()[0]
     services = [serve(spawn, router, shard) for shard in (0, 1)]
     spawn("-m", "factorbus.workers", "--connect", router, "--name", "worker1", "--no-warm").ready()
-    with connect(router, client="robot1", timeout_s=30) as bus:
+    with connect(router, client="robot1", timeout_s=300) as bus:
         with bus.map("shard0-hall") as hall, bus.map("shard1-yard") as yard:
             for driven in (hall, yard):
                 driven.insert(Draft().se2("x0", (0, 0, 0), fixed=True))

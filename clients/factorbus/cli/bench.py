@@ -34,6 +34,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
+    fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
     all        cholesky, bus and idp
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
