@@ -7,6 +7,7 @@ The rules, in the order they are tried (n is the number that the client has to s
     answered, same bytes                the first answer again
     used for other bytes, or forgotten  bad_sequence
     the map is closing                  shutting_down, not used up
+    the journal cannot be written       journal_failed, not used up
     n                                   admitted if the inbox has room, else busy, not used up
     after n, within the window          parked until the gap is closed; no room: busy; gap not closed: bad_sequence
     further                             bad_sequence
@@ -20,6 +21,7 @@ begins first goes first.  So a small one overtakes large ones of others, and equ
 """
 
 from collections import OrderedDict, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count
@@ -63,6 +65,7 @@ class Admission:
         self._ready = self._parked = self._bytes = 0
         self._pace_s = 0.01  # seconds per insert, smoothed
         self._closing: Problem | None = None
+        self._blocked: Problem | None = None
 
     @property
     def ready(self) -> int:
@@ -96,6 +99,7 @@ class Admission:
             or self._ready
             or self._parked
             or self._closing is not None
+            or self._blocked is not None
         ):
             return None
         insert = _waiting(arrived)
@@ -160,6 +164,32 @@ class Admission:
                     effects += self.answer(insert, problem)
         return effects
 
+    def take_back(self, problem: Problem, given: bool) -> list[Effect]:
+        """What waits did not happen: refuse it, its numbers not used up; `given`: what the solver has, too."""
+        effects: list[Effect] = []
+        for client in self._clients.values():
+            gone = list(client.open.values()) if given else [*client.ready, *client.parked.values()]
+            for insert in gone:
+                effects += [Refuse(asker, problem) for asker in insert.askers]
+                del client.open[insert.sequence]
+                self._bytes -= insert.size
+            client.next = min([*(insert.sequence for insert in gone), client.next])
+            client.ready.clear()
+            client.parked.clear()
+        self._turns.clear()
+        self._ready = self._parked = 0
+        return effects
+
+    def block(self, problem: Problem | None) -> None:
+        """Refuse everything new with `problem`, its numbers not used up, until this is called with None."""
+        self._blocked = problem
+
+    def restore(self, name: str, following: int, answered: Iterable[tuple[int, int, object]], now: float) -> None:
+        """`name` was here before: it has to send `following` next, and has had answers, (sequence, digest, answer)."""
+        client = _Client(following, heard=now, seen=now)
+        client.answered.update((sequence, (digest, answer)) for sequence, digest, answer in answered)
+        self._clients[name] = client
+
     def took(self, inserts: int, seconds: float) -> None:
         """Learn the pace: `inserts` were folded in `seconds`."""
         if inserts:
@@ -179,6 +209,8 @@ class Admission:
             return [_reply(arrived.asker, _remembered(client, arrived))]
         if self._closing is not None:
             raise self._closing
+        if self._blocked is not None:
+            raise self._blocked
         if arrived.sequence == client.next:
             self._admit_next(client, arrived)
         else:

@@ -15,12 +15,15 @@ lanes a second, then Zenoh closes that client's transport.
 """
 
 import logging
+import os
 import secrets
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from factorbus.journal.problems import JournalFailed
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown, TooLarge, UnknownMap
 from factorbus.proto.version import __version__
@@ -36,6 +39,7 @@ from factorbus.service.health import Health
 from factorbus.service.host import Host
 from factorbus.service.jobs import Jobs
 from factorbus.service.lane import Lane, Lanes
+from factorbus.service.library import Kept, Library, log_owner, make_folder, open_library
 from factorbus.service.memory import give_back
 from factorbus.service.metrics import open_metrics
 from factorbus.service.optima import Optima
@@ -53,6 +57,7 @@ _AT_ONCE_BYTES = 64 << 10
 _MESSAGES = (Answer, Publish)
 _ANSWERERS = 4
 _ADMIN_WAITING = 1024
+_TOKEN_S = 10.0
 
 
 def serve(
@@ -67,17 +72,37 @@ def serve(
     several times a second: for whoever watches over it.  Raises BadConfig, Problem.
     """
     checked(config)
-    get_ready_to_compute(config.warm)
-    if stop.is_set():
-        return
+    # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.
+    library = open_library(config, log_owner, stop) if config.journal and not config.standby else None
+    try:
+        get_ready_to_compute(config.warm)
+        if config.standby:
+            library = open_library(config, log_owner, stop)
+        if not stop.is_set():
+            _serve(config, library, on_ready, stop, on_look)
+    finally:
+        if library is not None:
+            library.close()
+
+
+def _serve(
+    config: Config,
+    library: Library | None,
+    on_ready: Callable[[list[str]], None],
+    stop: threading.Event,
+    on_look: Callable[[Health], None],
+) -> None:
     bus = open_bus(config)
     try:
-        shell = Shell(bus, config)
+        shell = Shell(bus, config, library)
         try:
             for name in config.create:
-                shell.create(name, "auto")
+                shell.create(name, None)
             shell.vitals.health.open = True
-            on_ready(bus.endpoints())
+            endpoints = bus.endpoints()
+            if library is not None:
+                library.say(f"process {os.getpid()} on {socket.gethostname()}, {' '.join(endpoints)}")
+            on_ready(endpoints)
             while not stop.wait(_TICK_S):
                 shell.tick()
                 on_look(shell.vitals.health)
@@ -99,8 +124,9 @@ class _Map:
 class Shell:
     """Everything a running service has declared on the bus, and the threads behind it."""
 
-    def __init__(self, bus: Bus, config: Config) -> None:
-        self._bus, self._config = bus, config
+    def __init__(self, bus: Bus, config: Config, library: Library | None = None) -> None:
+        self._bus, self._config, self._library = bus, config, library
+        self._unopened: dict[str, Problem] = {}  # maps that are there and cannot be trusted
         self._service = config.name or f"s{secrets.token_hex(4)}"
         self._decoding = config.limits.message()
         self._maps: dict[str, _Map] = {}
@@ -125,6 +151,8 @@ class Shell:
         chunk = config.maps.replace("*", "$*") if config.maps != "*" else "*"
         root = f"{keys.PREFIX}/map/{chunk}"
         self._refuse_if_kept_elsewhere(f"{root}/live/service/*")
+        # Before anybody can ask for one of them: it would be told that there is none.
+        self._open_kept()
         bus.answer_on(f"{root}/in/*", self._on_insert)
         bus.answer_on(f"{root}/ask/*", self._on_question)
         bus.answer_on(keys.admin_key("*"), self._on_admin)
@@ -132,14 +160,19 @@ class Shell:
         bus.watch(keys.any_worker_token(), self._on_worker)
         self._metrics = open_metrics(config.metrics, self.vitals)
         # Last of all: alive means askable.
+        for found in self._maps.values():
+            found.place.announce()
+            found.host.created()
         self._withdraw_features = bus.announce(keys.features_token(self._service))
 
-    def create(self, name: str, mode: str) -> dict[str, Any]:
-        """The row of map `name`, made if it is not there.  On the desk, or before it has work.  Raises Problem."""
-        mode = settled_mode(mode)
+    def create(self, name: str, mode: str | None) -> dict[str, Any]:
+        """The row of map `name`, made if it is not there.  On the desk, or before it has work.  Raises Problem.
+
+        mode: None for whichever it has.
+        """
         if found := self._maps.get(name):
-            if found.host.core.mode != mode:
-                raise OtherMode(name, found.host.core.mode, mode)
+            if mode is not None and found.host.core.mode != settled_mode(mode):
+                raise OtherMode(name, found.host.core.mode, settled_mode(mode))
             return found.host.core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
@@ -149,12 +182,15 @@ class Shell:
             raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
         if (full := self.vitals.memory.no_room(0)) is not None:
             raise full
-        made = self._make(name, mode)
+        made = self._make(name, settled_mode(mode or "auto"))
         self._maps[name] = made
         made.place.announce()
         made.host.created()
-        log.info("map %s created, mode %s, epoch %d", name, mode, made.host.core.epoch, extra={"map": name})
-        return made.host.core.row()
+        core = made.host.core
+        log.info(
+            "map %s, mode %s, epoch %d, revision %d", name, core.mode, core.epoch, core.revision, extra={"map": name}
+        )
+        return core.row()
 
     def tick(self) -> None:
         """Time went by."""
@@ -253,12 +289,20 @@ class Shell:
 
     # ---- effects of the maps ----------------------------------------------------------------------------------------
 
-    def _make(self, name: str, mode: str) -> _Map:
-        from factorbus.solver import Options, Solver
+    def _open_kept(self) -> None:
+        """The maps that were here before.  One that cannot be trusted does not keep the others from coming back."""
+        names = self._library.names() if self._library else []
+        for name in names:
+            if ours(self._config.maps, name):
+                try:
+                    self._maps[name] = self._make(name, None)
+                except Problem as problem:
+                    log.error("map %s does not come back: %s", name, problem)
+                    self._unopened[name] = problem
 
-        options = Options(mode=mode, clock=time.perf_counter)
-        core = MapCore(name, mode, secrets.randbits(62) | 1, self._config.limits, time.monotonic())
-        folder = Folder(lambda: Solver(options), core.epoch, self._config.limits)
+    def _make(self, name: str, mode: str | None) -> _Map:
+        """mode: None for that of the map which is there.  Raises Problem."""
+        core, folder, kept = self._begin(name, mode)
 
         def perform(effects: list[Effect]) -> None:
             self._perform(made, effects)
@@ -280,16 +324,35 @@ class Shell:
             for read in reads:
                 self._answers.hand(self._answer_read, made, read, taken)
 
-        host = Host(core, folder, perform, send, answer_reads, self._seat, send_both)
-        made = _Map(host, self._bus.place(name, self._service), options.as_dict())
+        host = Host(core, folder, perform, send, answer_reads, self._seat, send_both, kept)
+        made = _Map(host, self._bus.place(name, self._service), folder.options())
         return made
+
+    def _begin(self, name: str, mode: str | None) -> tuple[MapCore, Folder, Kept | None]:
+        """What a map is made of, as it was or new.  Raises Problem."""
+        limits, library, now = self._config.limits, self._library, time.monotonic()
+        if problem := self._unopened.get(name):
+            raise problem
+        if library is not None and library.has(name):
+            if mode is not None and (had := library.mode(name)) != mode:
+                raise OtherMode(name, had, mode)
+            kept = library.open(name, limits)
+        elif library is not None:
+            kept = library.make(name, mode or settled_mode("auto"), limits)
+        else:
+            epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
+            return MapCore(name, mode, epoch, limits, now), make_folder(mode, {}, epoch, limits), None
+        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now)
+        kept.restore(core)
+        return core, kept.folder, kept
 
     def _perform(self, found: _Map, effects: list[Effect]) -> None:
         """Hand on what a map wants done: what is to be sent in one piece to the outbox, in order."""
         sending: list[Effect] = []
         for effect in effects:
             if isinstance(effect, Tell):
-                self._answers.hand(self._tell, effect.asker, {**effect.content, "options": found.options})
+                content = {**effect.content, "options": found.options, **found.host.journal()}
+                self._answers.hand(self._tell, effect.asker, content)
             elif isinstance(effect, Drained):
                 found.on_drained()
             else:
@@ -308,7 +371,9 @@ class Shell:
                 refuse(effect.asker, effect.problem)
 
     def _no_map(self, query: Asker, name: str) -> None:
-        if self._config.connect:
+        if problem := self._unopened.get(name):
+            refuse(query, problem)
+        elif self._config.connect:
             ignore(query)  # another service at the router may have it
         else:
             refuse(query, UnknownMap(name))
@@ -394,10 +459,17 @@ class Shell:
 
     def _dropped(self, query: Asker, found: _Map) -> None:
         self._leaving.remove(found)
-        found.host.end()
+        found.host.end(keep=False)
         self._outbox.hand(found.place.close)  # behind the map's last publications
         self.vitals.forget(found.host.core.name)
         self._desk.hand(give_back)
+        if self._library is not None:
+            try:
+                self._library.remove(found.host.core.name)
+            except JournalFailed as problem:
+                log.error("the journal of map %s stays: %s", found.host.core.name, problem)
+                self._refuse(query, problem)
+                return
         self._desk.hand(self._reply, query, codec.encode_map({}))
         log.info("map %s dropped", found.host.core.name, extra={"map": found.host.core.name})
 
@@ -428,7 +500,11 @@ class Shell:
 
     def _refuse_if_kept_elsewhere(self, tokens: str) -> None:
         """Two processes must not keep one map: at a router, look who is there.  Raises BadConfig."""
-        if self._config.connect and (others := self._bus.alive(tokens)):
+        # The token of one that was killed goes a moment after its lock.
+        patience = time.monotonic() + (_TOKEN_S if self._config.standby else 0.0)
+        while self._config.connect and (others := self._bus.alive(tokens)):
+            if time.monotonic() < patience:
+                continue
             raise BadConfig(
                 f"{others[0]} is alive: another service keeps maps named {self._config.maps}; "
                 "give each service a pattern of its own with maps ="

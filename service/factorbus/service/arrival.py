@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from factorbus.journal.digest import digest_of
 from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, Limits
+from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem
-from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Asker, Located, Refuse
 from factorbus.service.kernels.read import read_insert as read_usual
 from factorbus.service.kernels.words import LETTERS, WORDS
@@ -34,6 +35,16 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
             return Refuse(asker, problem)
         return Arrived(asker, client, *place, len(payload), digest_of(payload), problem, now, payload)
     return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), digest_of(payload), insert, now, payload)
+
+
+def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:
+    """(digest, content) of an insert that was read before, as `read_insert` has them."""
+    if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, ANSWER_LIMITS)):
+        return located[2:]
+    try:
+        return digest_of(payload), codec.decode_insert(payload, ANSWER_LIMITS)
+    except Problem as problem:
+        return digest_of(payload), problem
 
 
 def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] | None:

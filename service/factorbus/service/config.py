@@ -14,6 +14,7 @@ from factorbus.proto.problems import Problem
 _HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
 # Limits for which 0 means: find it out.
 _MAY_BE_0 = ("memory_bytes",)
+DURABILITIES = ("none", "group", "commit")
 
 
 class BadConfig(Problem):
@@ -38,6 +39,7 @@ class Limits:
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
     fold: int = 64  # inserts that one step takes in ...
     fold_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
+    unwritten: int = 1024  # inserts that the journal has yet to write before the solver gets more
     parked_s: float = 5.0  # how long an insert waits for the one before it
     message_bytes: int = 64 << 20
     insert_variables: int = 1_000_000
@@ -78,6 +80,11 @@ class Config:
     job_deadline_s: float = 120.0  # for one worker to answer one job
     stuck_s: float = 120.0  # a thread that does not come to its next work for so long is stuck, the service not alive
     metrics: str = ""  # HOST:PORT where /metrics, /live and /ready are served over HTTP; empty: nowhere
+    journal: str = ""  # folder where maps are kept; empty: they end with the service
+    durability: str = "commit"  # what an answer promises of it: none, group or commit
+    group_s: float = 0.05  # durability group: written no later than this after the answer
+    snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
+    standby: bool = False  # wait until whoever owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
 
@@ -103,11 +110,15 @@ def checked(config: Config) -> Config:
         least = 0 if name in _MAY_BE_0 else 1e-9
         if getattr(config.limits, name) < least:
             raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
-    for name in ("job_deadline_s", "stuck_s"):
+    for name in ("job_deadline_s", "stuck_s", "group_s", "snapshot_s"):
         if getattr(config, name) <= 0:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
+    if config.durability not in DURABILITIES:
+        raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
+    if config.standby and not config.journal:
+        raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
     stem = config.maps.removesuffix("*")
     if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
         raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")

@@ -69,9 +69,14 @@ class Outcome(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The solver accepted or refused these inserts."""
+    """The solver accepted or refused these inserts.
+
+    revision, together: of the step that took in those that were accepted, and how many they were.
+    """
 
     outcomes: tuple[Outcome, ...]
+    revision: int = 0
+    together: int = 0
 
 
 class Stepped(NamedTuple):
@@ -175,12 +180,14 @@ class Publish(NamedTuple):
 class Run(NamedTuple):
     """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
 
-    short: most likely done sooner than another thread would have taken it over.
+    short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
+    the journal has.
     """
 
     reads: tuple[Read, ...]
     inserts: tuple[Waiting, ...]
     short: bool = False
+    reload: bool = False
 
 
 @dataclass(frozen=True, slots=True)

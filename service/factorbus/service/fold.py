@@ -13,7 +13,8 @@ published again; the insert that brought the fault about is refused as internal.
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,7 +62,10 @@ class _TakenBack(Exception):
 class Folder:
     """The solver of one map, and what it is known to hold.  For one thread at a time."""
 
-    def __init__(self, make_solver: Callable[[], Any], epoch: int, limits: Limits) -> None:
+    def __init__(
+        self, make_solver: Callable[[], Any], epoch: int, limits: Limits, options: Mapping[str, Any] | None = None
+    ) -> None:
+        self._options = dict(options or {})
         self._make, self._epoch, self._limits = make_solver, epoch, limits
         self._solver = make_solver()
         self._revision = 0
@@ -82,6 +86,72 @@ class Folder:
         taken = snapshot(self._solver, self._epoch, self._revision, questions, self._account, self._uncertain)
         self._uncertain = taken.uncertain
         return taken
+
+    def options(self) -> dict[str, Any]:
+        """The settings of its solver."""
+        return self._options
+
+    @property
+    def revision(self) -> int:
+        """Steps that were made."""
+        return self._revision
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Variables and factors."""
+        return self._solver.variable_count, self._solver.factor_count
+
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate."""
+        return float(self._solver.chi2())
+
+    def enter(self, epoch: int) -> None:
+        """From now on answers and deltas name this epoch."""
+        self._epoch = epoch
+
+    def dump(self) -> dict[str, Any]:
+        """All that later folds depend on, a copy.  Raises Broken."""
+        if self._broken:
+            raise Broken(self._broken)
+        return {"solver": self._solver.dump(), "revision": self._revision, "held": list(self._held)}
+
+    def load(self, state: Mapping[str, Any] | None) -> None:
+        """Be where the folder was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
+        self._solver, self._revision, self._broken = self._make(), 0, ""
+        self._held = 0, 0
+        if state is not None:
+            self._solver.load(state["solver"])
+            self._revision = state["revision"]
+            self._held = tuple(state["held"])
+
+    def fold_again(self, inserts: Sequence[Waiting], rebuilt: bool) -> Iterator[Judged | Stepped]:
+        """Fold in what was folded in together before: no limit that has been set since refuses it.
+
+        rebuilt: the solver was replaced meanwhile.
+        """
+        limits, self._limits = self._limits, replace(self._limits, variables=1 << 62, factors=1 << 62)
+        try:
+            yield from self.fold_whole(inserts)[0] if inserts else ()
+            if rebuilt:
+                yield from self._replace_solver("replayed")
+        finally:
+            self._limits = limits
+
+    def fold_whole(self, inserts: Sequence[Waiting]) -> tuple[list[Judged | Stepped], Folded]:
+        """All that comes of a fold, at its end.  Of the same inserts in the same groups always the same, to the bit."""
+        came = self.fold_alone(inserts[0]) if len(inserts) == 1 else self.fold(inserts)
+        if isinstance(came, Alone):
+            judged = Judged((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
+            stepped = Stepped(came.revision, came.delta, came.strategy, came.chi2, came.solver_ms)
+            return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now)
+        events: list[Judged | Stepped] = []
+        folded = self._folded(time.thread_time())
+        for event in came:
+            if isinstance(event, Folded):
+                folded = event
+            else:
+                events.append(event)
+        return events, folded
 
     def fold(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
@@ -238,7 +308,7 @@ class Folder:
             for s in staged
         ]
         self._held = self._solver.variable_count, self._solver.factor_count
-        yield Judged((*accepted, *refused))
+        yield Judged((*accepted, *refused), self._revision, len(staged))
         try:
             told = self._told(account)
         except Exception:

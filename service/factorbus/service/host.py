@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
+from factorbus.journal.problems import JournalFailed
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core import MapCore
 from factorbus.service.events import (
@@ -37,6 +38,7 @@ from factorbus.service.events import (
 )
 from factorbus.service.fold import Folder
 from factorbus.service.health import Pulse
+from factorbus.service.keeping import Events, Keeper, Keeping
 from factorbus.service.questions import Snapshot
 from factorbus.solver.errors import SolverError
 
@@ -64,8 +66,11 @@ class Host:
         answer: AnswerReads,
         seat: threading.Lock,
         send_both: SendBoth,
+        keeping: Keeping | None = None,
     ) -> None:
         self.core = core
+        self._keeper = keeping.keeper(self) if keeping else None
+        self._keeping = keeping
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
         self._send_both = send_both
         self._lock = threading.Lock()
@@ -73,6 +78,8 @@ class Host:
         self._pulse = Pulse(self._runs.put)
         self._thread = threading.Thread(target=self._solve_all, name=f"solver {core.name}", daemon=True)
         self._thread.start()
+        if self._keeper is not None:
+            self._keeper.start()
 
     def created(self) -> None:
         """The map is on the bus."""
@@ -128,10 +135,44 @@ class Host:
             effects = self.core.drop(time.monotonic())
         self._perform(effects)
 
-    def end(self) -> None:
-        """End the solver's thread, which may still be sending its last delta; after Drained."""
+    def end(self, keep: bool = True) -> None:
+        """End the solver's thread, which may still be sending its last delta, and then the journal's; after Drained.
+
+        keep: the map is to come back, and quickly.
+        """
         self._runs.put(None)
         self._thread.join()
+        if self._keeper is not None:
+            self._keeper.close(self._folder.dump if keep else None)
+
+    def journal(self) -> dict[str, Any]:
+        """What ask/stats says of the journal, if there is one."""
+        return {} if self._keeper is None else {"journal": self._keeper.stats()}
+
+    # ---- what becomes of the writing: on the journal's thread -------------------------------------------------------
+
+    def kept(self, events: Events) -> None:
+        """What came of a Run is safe."""
+        with self._lock:
+            effects = self.core.kept(events, time.monotonic())
+        self._perform(effects)
+
+    def unkept(self, problem: JournalFailed) -> None:
+        """What was not kept did not happen."""
+        with self._lock:
+            effects = self.core.unkept(problem, time.monotonic())
+        self._perform(effects)
+
+    def blocked(self, problem: JournalFailed) -> None:
+        """Nothing can be kept at the moment."""
+        with self._lock:
+            effects = self.core.block(problem, time.monotonic())
+        self._perform(effects)
+
+    def unblocked(self) -> None:
+        """It can again."""
+        with self._lock:
+            self.core.unblock()
 
     def _perform(self, effects: list[Effect]) -> None:
         if effects and isinstance(run := effects[-1], Run):
@@ -149,6 +190,9 @@ class Host:
 
     def _solve(self, run: Run, tell: Perform) -> None:
         try:
+            if self._keeper is not None:
+                self._run_kept(run, self._keeper, tell)
+                return
             if run.reads:
                 self._read(run.reads)
             events = (
@@ -188,6 +232,25 @@ class Host:
             (tell if stepped else self._perform)(effects)
             effects = []
 
+    def _run_kept(self, run: Run, keeper: Keeper, tell: Perform) -> None:
+        """The same with a journal: what comes of it is told when that is safe, or at once if it need not be."""
+        if run.reload and self._keeping is not None:
+            keeper.reloaded(self._keeping.reload(self._folder))
+        if run.reads:
+            self._read(run.reads)
+        events, folded = self._folder.fold_whole(run.inserts)
+        keeper.hand(run.inserts, events)
+        if not keeper.waits:
+            with self._lock:
+                effects = self.core.kept(events, time.monotonic())
+            tell(effects)
+        if run.inserts and (keeper.wants_snapshot() or any(isinstance(e, Stepped) and e.rebuilt for e in events)):
+            started = time.perf_counter()
+            keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
+        with self._lock:
+            effects = self.core.folded(folded)
+        self._perform(effects)
+
     def _read(self, reads: Sequence[Read]) -> None:
         try:
             taken = self._folder.snapshot([read.question for read in reads])
@@ -198,7 +261,14 @@ class Host:
             log.exception("fault %s: no snapshot of map %s", reference, self.core.name)
             self._refuse(reads, Internal(reference))
         else:
+            self._answer_after(reads, taken)
+
+    def _answer_after(self, reads: Sequence[Read], taken: Snapshot) -> None:
+        """Nobody sees what a crash could take back."""
+        if self._keeper is None:
             self._answer(reads, taken)
+        else:
+            self._keeper.after(lambda: self._answer(reads, taken), lambda problem: self._refuse(reads, problem))
 
     def _refuse(self, reads: Sequence[Read], problem: Exception) -> None:
         self._do([Refuse(read.asker, problem) for read in reads if read.asker is not None])
