@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help pictures setup demo test test-data test-kernels test-faults lint check bench wheel clean
+.PHONY: help pictures setup demo test test-data test-kernels test-faults lint check crash bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -56,6 +56,10 @@ lint: $(READY_DEV) ## ruff, pyright, import contracts
 	$(BIN)/lint-imports
 
 check: lint test ## lint and test: what CI runs
+
+crash: $(READY_DEV) ## a service with a journal is killed 150 times; nothing answered may be lost, nothing be there twice
+	@$(BIN)/factorbus warm
+	FACTORBUS_KILLS=$(or $(KILLS),110) $(BIN)/python -m pytest tests/system/test_journal_crash.py $(ARGS)
 
 bench: $(READY_DEV) ## the measurements, each with what it is held against
 	@$(BIN)/factorbus bench all $(ARGS)

@@ -33,6 +33,13 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
     default=None,
     help="Listen to other machines even where whoever reaches the port could read and write.",
 )
+@click.option("--journal", metavar="DIR", help="Keep maps in this folder, across restarts and crashes.")
+@click.option(
+    "--durability",
+    type=click.Choice(("none", "group", "commit")),
+    help="With a journal: what an answer promises (see below).  [default: commit]",
+)
+@click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
@@ -51,13 +58,21 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
     \b
     factorbus serve
     factorbus serve --listen tls/0.0.0.0:7447 --zenoh service.json5 --map warehouse
+    factorbus serve --journal /var/lib/factorbus
     factorbus serve --config /etc/factorbus/serve.toml
+
+    \b
+    With --journal, when an insert is answered:
+      commit   the disk has it: it survives a power cut, as far as the disk keeps its word
+      group    it is written within 50 ms; a crash may cost what was answered in that time, and begins a new epoch
+      none     it is written now and then, with no promise but for an orderly stop
 
     \b
     A configuration file has the names of these options and more, for example:
       listen = ["tls/0.0.0.0:7447"]
       metrics = "127.0.0.1:9464"
       create = ["warehouse"]
+      journal = "/var/lib/factorbus"
       zenoh = "/etc/factorbus/zenoh.json5"     # TLS, users, access control
       [limits]
       waiting = 1024

@@ -114,7 +114,7 @@ class Host:
     def account(self) -> dict[str, Any]:
         """What admin/stats says of the map."""
         with self._lock:
-            return self.core.account(time.monotonic())
+            return self.core.account(time.monotonic()) | self.journal()
 
     def silent_s(self) -> float:
         """For how long the solver has not come to its next work, whichever thread it is on."""
