@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factorbus.service.digest import digest_of
 
 from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -16,6 +15,7 @@ from factorbus.proto.symbols import parse_symbol
 from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
 from factorbus.service.fold import Folder
 from factorbus.service.host import Host

@@ -7,7 +7,6 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from factorbus.service.digest import digest_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.random_graphs import random_steps
@@ -18,6 +17,7 @@ from factorbus.proto.limits import REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service.arrival import read_insert, try_locate
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Located
 from factorbus.service.kernels.words import LETTERS, LONGEST, WORDS
 from factorbus.service.kernels.write import write_messages

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from factorbus.journal.digest import digest_of
 from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Asker, Located, Refuse
 from factorbus.service.kernels.read import read_insert as read_usual
 from factorbus.service.kernels.words import LETTERS, WORDS

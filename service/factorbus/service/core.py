@@ -74,7 +74,7 @@ class MapCore:
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
         self._strategies: dict[str, int] = {}
-        self._counts = dict.fromkeys(_COUNTED, 0)
+        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
         self._refusals: Counter[str] = Counter()
         self._step_s, self._insert_s = Histogram(), Histogram()
