@@ -121,7 +121,7 @@ class Folder:
         self._held = 0, 0
         if state is not None:
             self._solver.load(state["solver"])
-            self._revision = state["revision"]
+            self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 
     def fold_again(self, inserts: Sequence[Waiting], rebuilt: bool) -> Iterator[Judged | Stepped]:
