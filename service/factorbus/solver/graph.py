@@ -16,6 +16,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.move import gather
+from factorbus.solver.rows import Rows
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 Mark: TypeAlias = tuple[int, ...]
@@ -23,6 +24,8 @@ Mark: TypeAlias = tuple[int, ...]
 
 class Graph:
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
+
+    NOT_KEPT = ("_rows",)  # of a solver's state: it follows from the rest
 
     def __init__(self) -> None:
         self.keys: I64 = np.empty(16, np.int64)
@@ -33,6 +36,7 @@ class Graph:
         self.payload: F64 = np.empty(256)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(64, np.int64)
+        self._rows = Rows()
 
     @property
     def sights(self) -> bool:
@@ -47,6 +51,7 @@ class Graph:
         """Go back to `mark`."""
         remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.counts[:] = mark
+        self._rows.forget(mark[at.VARIABLES])
 
     def copied(self) -> "Graph":
         """The same graph with arrays of its own, as large as what is in use."""
@@ -93,18 +98,27 @@ class Graph:
 
     def variables(self, picked: I64 | None = None) -> list[Group]:
         """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness."""
-        var = self.var[: self.counts[at.VARIABLES]]
-        if picked is not None:
-            var = var[picked]
-        label = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
-        groups = []
-        for code in np.flatnonzero(np.bincount(label)).tolist():
-            rows = np.flatnonzero(label == code)
-            kind = VARIABLE_KIND_OF_CODE[code // 2]
-            keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
-            gather(rows if picked is None else picked[rows], self.var, self.keys, self.values, keys, values)
-            groups.append(Group(kind.name, keys, values, fixed=bool(code % 2)))
-        return groups
+        if picked is None:
+            following = self._rows.follow(self.var, int(self.counts[at.VARIABLES]))
+            return [self._side_by_side(label, rows) or self._gathered(label, rows) for label, rows in following]
+        var = self.var[picked]
+        labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
+        return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
+
+    def _side_by_side(self, label: int, rows: I64) -> Group | None:
+        """The group of all variables with one label, `rows`, where no others are between them: their values neither."""
+        first, last = int(rows[0]), int(rows[-1]) + 1
+        if last - first != rows.size:
+            return None
+        kind, start = VARIABLE_KIND_OF_CODE[label // 2], int(self.var[first, at.V_AT])
+        values = self.values[start : start + rows.size * kind.size].copy().reshape(-1, kind.size)
+        return Group(kind.name, self.keys[first:last].copy(), values, fixed=bool(label % 2))
+
+    def _gathered(self, label: int, rows: I64) -> Group:
+        kind = VARIABLE_KIND_OF_CODE[label // 2]
+        keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
+        gather(rows, self.var, self.keys, self.values, keys, values)
+        return Group(kind.name, keys, values, fixed=bool(label % 2))
 
     def factors(self, most: int | None = None) -> list[FactorGroup]:
         """All factors, or the first `most`: a copy, a group for each kind and loss."""
