@@ -56,7 +56,7 @@ def test_in_process(local: dict[str, Any], town: Path) -> None:
     assert local["steps"] == local["inserts"] == POSES
     assert local["revision"] == POSES + 1
     assert local["settled"]
-    assert local["mode"] == "inc-l"
+    assert local["mode"] == "tree"
     assert sum(local["strategies"].values()) == POSES
     assert local["strategies"]["omega"] > 10
     for name in ("p50", "p95", "p99", "max"):

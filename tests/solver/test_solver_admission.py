@@ -5,9 +5,12 @@ import pickle
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver import Solver, errors
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.blocks import Blocks
+from factorbus.solver.kernels import tree_layout as tl
 
 I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 I2 = np.array([[1.0, 0, 1]])
@@ -112,8 +115,8 @@ REFUSED = {
 }  # fmt: skip
 
 
-def small_map() -> Solver:
-    solver = Solver()
+def small_map(mode: str = "auto") -> Solver:
+    solver = Solver(Options(mode=mode))
     solver.stage(
         Batch(
             (
@@ -135,24 +138,35 @@ def small_map() -> Solver:
 
 def everything(solver: Solver) -> bytes:
     """All there is to see of a solver and of what it keeps, to the bit."""
-    graph, blocks = solver._graph, solver._system.blocks
+    graph = solver._graph
     n, m, v, p, _, scalars = graph.counts.tolist()
     return pickle.dumps(
         [
             [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.var[:n], graph.fac[:m], graph.values[:v])],
-            [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size, blocks.table.nonzero()[0].size],
-            [a.tobytes() for a in (blocks.fill, blocks.rows, blocks.cols, blocks.offsets)],
-            [blocks.data[: blocks.fill[1]].tobytes(), blocks.eta[:scalars].tobytes()],
+            [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
+            normal_equations(solver._system.blocks, scalars) if solver._tree is None else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
         ]
     )
 
 
+def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:
+    kept = (blocks.table.nonzero()[0], blocks.fill, blocks.rows, blocks.cols, blocks.offsets)
+    return [a.tobytes() for a in (*kept, blocks.data[: blocks.fill[1]], blocks.eta[:scalars])]
+
+
+def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[bytes]:
+    tree, scratch = tree_of(solver), (tl.N_STAMP, tl.N_LOCAL, tl.N_COLUMN)
+    kept = np.delete(tree.node[:variables], scratch, axis=1)
+    return [a.tobytes() for a in (kept, tree.link[:factors], tree.lin[0, :values], tree.scalars[:2], tree.lever)]
+
+
 @pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled
+@pytest.mark.parametrize("mode", ["inc-l", "tree"])
 @pytest.mark.parametrize("name", REFUSED)
-def test_bad_batches_are_refused_whole(name: str) -> None:
+def test_bad_batches_are_refused_whole(name: str, mode: str) -> None:
     code, bad = REFUSED[name]
-    solver = small_map()
+    solver = small_map(mode)
     before = everything(solver)
     good = Batch((poses(50),), (edge(1, 50),))
     mixed = Batch(good.variables + bad.variables, good.factors + bad.factors)

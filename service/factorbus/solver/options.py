@@ -17,7 +17,7 @@ class Options:
     mode            "inc-l": R is updated, and made anew when that is better (2013 paper, Algorithm 1); "inc-l-b10",
                     "inc-l-b100": the same with a batch after every 10 or 100 new variables and none in between;
                     "all-batch": every step that solves factorises anew; "tree": only the part of R that a step affects
-                    is made again, and only variables that need it are relinearised (MATH §9); "auto" is "inc-l"
+                    is made again, and only variables that need it are relinearised (MATH §9); "auto" is "tree"
     clock           seconds, for the phases in the report; without one they are zero
     tolerance       all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
     tol             inc-l: the same, and a first step that would is not made.  The paper's tol, with the length of δ

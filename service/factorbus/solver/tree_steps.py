@@ -4,8 +4,11 @@ A step solves a linear problem and is taken as it is where nothing bends far (MA
 compared with what it was, and a step that would raise it is replaced by a batch from where the estimate stood.
 """
 
+import copy
+
 import numpy as np
 
+from factorbus.solver import errors
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, minimise
@@ -13,8 +16,9 @@ from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.incremental import Incremental
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
+from factorbus.solver.kernels.move import differing
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.system import System
@@ -33,6 +37,7 @@ class TreeSteps:
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched = 0, False
+        self._moved: I64 = np.empty(0, np.int64)  # by a batch
 
     @property
     def tree(self) -> Tree:
@@ -50,22 +55,29 @@ class TreeSteps:
                 because = self._check_held()
                 status = tree.step(sure=True)
             if status == tl.FAILED:
-                raise self._system().underconstrained(tree.failed)
+                raise self._system(self._apart()).underconstrained(tree.failed)
+            if status == tl.INFINITE:
+                raise errors.NotFinite("χ² of the new factors")
         except BaseException:
             self._graph.forget(self._mark)
             raise
         compiled = clock()
         course = None
-        if settle:
-            course, because = self._batch(settle=True), "asked to settle"
+        if settle and self._graph.counts[at.COLUMNS]:
+            tree.exchange()
+            before = self._graph.values.copy()
+            tree.exchange()
+            course, because = self._batch(before, settle=True), "asked to settle"
         elif tree.account[tl.A_BEND] > self._options.trust and self._is_worse():
-            course, because = self._batch(settle=False), "χ² would have risen: a batch from where the estimate stood"
+            before = self._graph.values.copy()
+            course = self._batch(before, settle=False)
+            because = "χ² would have risen: a batch from where the estimate stood"
         return self._account(started, compiled, clock(), course, because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
         if self._batched:
-            return np.arange(int(self._graph.counts[at.VARIABLES]))
+            return self._moved
         return self._tree.list_moved(self._first_new)
 
     def chi2(self) -> float:
@@ -78,7 +90,7 @@ class TreeSteps:
         if not suspects.size:
             return ""
         free = find_unanchored(self._graph, self._mark)
-        system = self._system()
+        system = self._system(self._apart())
         if free >= 0:
             raise system.underconstrained(
                 free,
@@ -89,11 +101,17 @@ class TreeSteps:
         system.factorize(0.0)
         return f"{suspects.size} new variables are held only by several factors together"
 
-    def _system(self) -> System:
+    def _apart(self) -> Graph:
+        """The graph with rows of its own, for equations that leave it as it is."""
+        graph = copy.copy(self._graph)
+        graph.var, graph.fac = graph.var.copy(), graph.fac.copy()
+        return graph
+
+    def _system(self, graph: Graph) -> System:
         """All normal equations at the estimate, apart from the tree."""
         options = self._options
-        system = System(self._graph, Incremental(Elimination(options), options))
-        system.blocks.extend(self._graph, _START)
+        system = System(graph, Incremental(Elimination(options), options))
+        system.blocks.extend(graph, _START)
         system.factor.moved()
         return system
 
@@ -107,10 +125,13 @@ class TreeSteps:
         self._tree.exchange()
         return False
 
-    def _batch(self, settle: bool) -> Course:
-        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows."""
+    def _batch(self, before: F64, settle: bool) -> Course:
+        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows.
+
+        before: the values as they were before the step
+        """
         options = self._options
-        system = self._system()
+        system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = Rule(options.tolerance, options.negligible, options.max_iterations)
@@ -119,7 +140,10 @@ class TreeSteps:
         course = minimise(system, chi2, 0.0, rule)
         self._tree.move_all()
         self._tree.step()
-        self._batched = True
+        count = int(self._graph.counts[at.VARIABLES])
+        found = np.empty(count, np.int64)
+        bits = before.view(np.int64), self._graph.values.view(np.int64)
+        self._moved = found[: differing(self._mark[at.VARIABLES], count, self._graph.var, *bits, found)]
         return course
 
     def _sum_chi2(self, factors: int) -> float:
@@ -131,7 +155,7 @@ class TreeSteps:
         now = self._mark
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         state = self._tree.state[: tl.S_FREE].tolist()
-        relinearised, changed = state[tl.S_RELINEARISED], state[tl.S_CHANGED]
+        relinearised, changed = state[tl.S_RELINEARISED], self._moved.size if course else state[tl.S_TOLD]
         chi2 = self.chi2() if course else float(self._tree.account[tl.A_CHI2])
         cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
         share = 1e3 * (compiled - started) / max(sum(cycles), 1)

@@ -36,6 +36,7 @@ def begin(
             held[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
         if reach(False, v0, f0, f1, var, fac, values, payload, held) >= 0:
             return tl.UNSURE
+    state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
     state[tl.S_ELIMINATED : tl.S_ROUNDS + 1] = 0
     state[tl.S_CYCLES : tl.S_CYCLES + tl.SUBSTITUTE + 1] = 0
     state[tl.S_FAILED] = -1

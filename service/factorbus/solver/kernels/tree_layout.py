@@ -111,14 +111,16 @@ S_EXACT = 40  # factors whose bend is computed exactly
 S_ASLEEP = 41  # sights that had no pixel where they were linearised
 S_WAIT = 26  # 1: the step under way relinearises nothing, because that failed
 S_BEGUN = 29  # 1: a step is under way; the arenas lacked room
+S_TOLD = 21  # variables whose estimate has other bits than before the step, new ones included
 S_CHECKED = 30  # 1: that everything is held has been made sure of otherwise
+S_CHANGED_BEFORE = 31  # S_CHANGED of the step before, for when this one fails
 S_CYCLES = 32  # of the phases of the last step, PHASES of them
 S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
-DONE, NO_ROOM, FAILED, UNSURE = 0, 1, 2, 3
+DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
 
 # Settings of a step.
 P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again

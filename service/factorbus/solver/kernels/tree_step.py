@@ -30,6 +30,7 @@ from factorbus.solver.kernels.tree_fronts import (
 )
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
+from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_order import find_lowest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
 from factorbus.solver.kernels.tree_solve import find_bent, substitute
@@ -53,7 +54,8 @@ def tree_step(
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
-    or FAILED: the pivot of S_FAILED was not positive, and the tree is as it was before the step.
+    or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
+    the last two the tree is as it was before the step.
     """
     began = cycles()
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
@@ -68,11 +70,12 @@ def tree_step(
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_BENT_NOW] *= unit
     scaled[tl.P_LOOK] *= unit
-    v0 = state[tl.S_FIRST_NEW]
+    v0 = old = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, lever, state)
-    take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state)
+    if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state):
+        undo(v0, var, fac, node, link, scalars, lever, saved, state)
+        return tl.INFINITE
     wait = state[tl.S_WAIT] != 0
-    status = tl.DONE
     while True:
         if not wait:
             some = pending[: state[tl.S_PENDING]]
@@ -92,23 +95,31 @@ def tree_step(
                 relinearised = some.size > 0
                 go_back(some, var, fac, payload, node, link, hessian, lin, scalars, state)
             if state[tl.S_ROUNDS] > 0:
-                status = tl.DONE
                 break
             if relinearised:
                 wait = True
                 state[tl.S_WAIT] = 1
                 continue
-            take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
-            state[tl.S_STEP] -= 1
-            break
+            undo(v0, var, fac, node, link, scalars, lever, saved, state)
+            return tl.FAILED
         account[tl.A_BEND] = max(account[tl.A_BEND], bow / unit)
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
         if wait or not bow > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
+    state[tl.S_TOLD] = count_differing(old, v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
-    return status
+    return tl.DONE
+
+
+@part
+def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, lever: F64, saved: F64, state: I64) -> None:
+    """The tree is as it was before the step."""
+    take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
+    state[tl.S_STEP] -= 1
+    state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
+    state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
 
 
 @inline_kernel

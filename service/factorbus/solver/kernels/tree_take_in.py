@@ -1,5 +1,7 @@
 """Taking new variables and factors into the tree's arenas, and out again when their step fails.  MATH §9.2."""
 
+import math
+
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
@@ -35,12 +37,12 @@ def take_in_variables(
 def take_in_factors(
     f1: int, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64, stiff: F64,
     lever: F64, saved: F64, state: I64,
-) -> None:  # fmt: skip
-    """Factors up to f1 are linearised, and join the incidences of their variables.
+) -> bool:  # fmt: skip
+    """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
-    f0 = state[tl.S_FACTORS]
+    f0, finite = state[tl.S_FACTORS], True
     r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
@@ -53,6 +55,7 @@ def take_in_factors(
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
         linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
+        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1])
         _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
@@ -63,6 +66,7 @@ def take_in_factors(
             link[f, tl.L_J], node[j, tl.N_ADJ] = node[j, tl.N_ADJ], 2 * f + 1
             node[j, tl.N_SEEN] = state[tl.S_STEP]
     state[tl.S_FACTORS] = f1
+    return finite
 
 
 @part
