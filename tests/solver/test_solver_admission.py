@@ -10,6 +10,7 @@ from naive.tree_records import tree_of
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.blocks import Blocks
+from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 
 I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
@@ -142,12 +143,18 @@ def everything(solver: Solver) -> bytes:
     n, m, v, p, _, scalars = graph.counts.tolist()
     return pickle.dumps(
         [
-            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.var[:n], graph.fac[:m], graph.values[:v])],
+            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.values[:v], *rows(solver, n, m))],
             [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
             normal_equations(solver._system.blocks, scalars) if solver._tree is None else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
         ]
     )
+
+
+def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the graph says of them; in the mode "tree" nobody writes where blocks of Λ are."""
+    var, fac = solver._graph.var[:variables], solver._graph.fac[:factors]
+    return (var, fac) if solver._tree is None else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
 
 
 def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:
@@ -157,8 +164,9 @@ def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:
 
 def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[bytes]:
     tree, scratch = tree_of(solver), (tl.N_STAMP, tl.N_LOCAL, tl.N_COLUMN)
-    kept = np.delete(tree.node[:variables], scratch, axis=1)
-    return [a.tobytes() for a in (kept, tree.link[:factors], tree.lin[0, :values], tree.scalars[:2], tree.lever)]
+    kept, links = np.delete(tree.node[:variables], scratch, axis=1), tree.link[:factors, [tl.L_OWN, tl.L_I, tl.L_AT]]
+    scalars = tree.scalars[:2, : solver._graph.counts[at.SCALARS]]
+    return [a.tobytes() for a in (kept, links, tree.lin[0, :values], scalars, tree.lever[:variables])]
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled

@@ -66,7 +66,7 @@ class Options:
     bent_now: float = 1.0
     trust: float = 3.0
     rounds: int = 3
-    look_every: int = 16
+    look_every: int = 4
     look_turned: float = 0.3
     ripple: float = 0.05
     recent_steps: int = 3

@@ -56,11 +56,11 @@ class Tree:
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
     def step(self, sure: bool = False) -> int:
-        """Take in what is new in the graph and solve; gives a status of `tree_layout`: DONE, UNSURE, FAILED or INFINITE.
+        """Take in what is new in the graph and solve; gives a status: DONE, UNSURE, FAILED, INFINITE.
 
         UNSURE: only the numbers can tell whether everything new is held; the next call is to be with `sure`.  FAILED:
-        the pivot of variable `failed` was not positive.  INFINITE: see `tree_step`.  After these nothing has changed, and the graph has to forget
-        what is new where it is to be refused.
+        the pivot of variable `failed` was not positive.  INFINITE: the χ² of a new factor is beyond numbers.  After
+        these nothing has changed, and the graph has to forget what is new where it is to be refused.
         """
         graph, state = self._graph, self.state
         if sure:

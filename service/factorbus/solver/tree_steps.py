@@ -138,8 +138,9 @@ class TreeSteps:
         if settle:
             rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
         course = minimise(system, chi2, 0.0, rule)
-        self._tree.move_all()
-        self._tree.step()
+        if course.iterations or not settle:
+            self._tree.move_all()
+            self._tree.step()
         count = int(self._graph.counts[at.VARIABLES])
         found = np.empty(count, np.int64)
         bits = before.view(np.int64), self._graph.values.view(np.int64)
@@ -161,7 +162,7 @@ class TreeSteps:
         share = 1e3 * (compiled - started) / max(sum(cycles), 1)
         return StepReport(
             mode="tree",
-            strategy="batch" if course else ("tree" if changed or relinearised else "extend"),
+            strategy="batch" if course else ("tree" if state[tl.S_CHANGED] or relinearised else "extend"),
             because=because or f"{relinearised} variables bent too far",
             iterations=course.iterations if course else state[tl.S_ROUNDS],
             chi2=chi2,

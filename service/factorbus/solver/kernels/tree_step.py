@@ -29,8 +29,8 @@ from factorbus.solver.kernels.tree_fronts import (
     place_fronts,
 )
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
-from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_moved import count_differing
+from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
 from factorbus.solver.kernels.tree_solve import find_bent, substitute
