@@ -3,7 +3,7 @@
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
 `inline_kernel`  melts into the kernels that call it; for what runs in their innermost loops.
-`part`           a step of a kernel, called by it: one large function takes far longer to compile.
+`part`           a step of a kernel, called by it and compiled apart: one large function takes far longer to compile.
 
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
 numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
@@ -33,10 +33,7 @@ import numba
 import numba.extending
 import numpy as np
 from llvmlite import ir
-from numba import _dynfunc  # pyright: ignore[reportAttributeAccessIssue]  (a C extension)
 from numba.core import caching, cgutils, config, event, types
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
@@ -76,37 +73,6 @@ _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _KEPT_FOLDERS = 6
 
 
-class _PartLibrary(JITCodeLibrary):
-    """The code of a part: linked into every kernel that calls it, optimised and made native there and only there.
-
-    Numba's own libraries go through all of that at every level of calls, which doubles the time it takes.
-    """
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._finalized = True
-
-
-class _PartCompiler(Compiler):
-    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
-        super().__init__(typingctx, targetctx, library or _PartLibrary(targetctx.codegen(), "part"), *rest)
-        self.state.targetctx.get_executable = _not_executable
-
-
-def _not_executable(library: Any, fndesc: Any, env: Any) -> Any:
-    """What stands for a part among the functions that kernels know: it has no native code of its own."""
-    library._ensure_finalized()
-    return _dynfunc.make_function(fndesc.lookup_module(), fndesc.qualname.split(".")[-1], "a part", 0, env, (library,))
-
-
-_INLINED: dict[str, Any] = {"forceinline": True}
-_KERNEL: dict[str, Any] = {"no_cfunc_wrapper": True}
-_PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _PartCompiler}
-
-
 class KernelFolder:
     """The decorators for the kernels of one folder of sources, and where they are kept.
 
@@ -134,13 +100,13 @@ class KernelFolder:
         """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
         if DISABLED:
             return function
-        return _ours(numba.njit(**_PART, **self._flags, **_INLINED)(function))
+        return _ours(numba.njit(forceinline=True, **self._flags)(function))
 
     def part(self, function: Callable[..., Any]) -> Any:
-        """A step of a kernel, kept on disk with the kernel that calls it; Python cannot call it."""
+        """A step of a kernel, kept on disk with the kernel that calls it."""
         if DISABLED:
             return function
-        return _ours(numba.njit(**_PART, **self._flags)(function))
+        return _ours(numba.njit(**self._flags)(function))
 
     def path(self) -> Path:
         """The cache folder, made when it is first asked for."""
@@ -151,7 +117,7 @@ class KernelFolder:
     def _compiled(self, function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
         if DISABLED:
             return function
-        dispatcher = _ours(numba.njit(**_KERNEL, **self._flags)(function))
+        dispatcher = _ours(numba.njit(**self._flags)(function))
         dispatcher._cache = self._cache(function)
         dispatcher.factorbus_signatures = signatures
         if signatures:
