@@ -37,9 +37,9 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(seed:
     assert total == pytest.approx(report.chi2, rel=1e-9)
 
 
-def test_the_graphs_above_have_every_kind() -> None:
+def test_the_graphs_above_have_every_kind_but_sights() -> None:
     kinds = {group.kind for seed in (1, 2, 3) for step in random_steps(seed) for group in step.factors}
-    assert kinds == set(FACTOR_KINDS)
+    assert kinds == set(FACTOR_KINDS) - {"idp_first", "idp_seen", "point_seen"}  # a lens is more than colours need
 
 
 def test_what_has_no_value_or_an_unknown_kind_is_nan_and_not_an_error() -> None:

@@ -14,7 +14,9 @@ from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-WRITABLE = [name for name in FACTOR_KINDS if name not in ("bearing_range_se2", "prior_point2")]
+UNWRITABLE = ("bearing_range_se2", "prior_point2", "idp_first", "idp_seen", "point_seen")
+WRITABLE = [name for name in FACTOR_KINDS if name not in UNWRITABLE]
+WRITABLE_VARIABLES = {name: kind for name, kind in VARIABLE_KINDS.items() if name != "idp"}
 NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
 
 
@@ -36,7 +38,7 @@ def batches(draw: st.DrawFn) -> Batch:
     """Graphs as `read` gives them: per kind fixed ones first, those with a value before those without."""
     ids = iter(draw(st.permutations(range(40))))
     groups, keys = [], {}
-    for kind, facts in VARIABLE_KINDS.items():
+    for kind, facts in WRITABLE_VARIABLES.items():
         keys[kind] = []
         for fixed, valued in ((True, True), (False, True)):
             mine = [symbol(letter(kind), next(ids)) for _ in range(draw(st.integers(0, 3)))]
@@ -128,6 +130,12 @@ def test_keys_that_share_an_index_are_numbered_anew(tmp_path: Path) -> None:
     path = tmp_path / "a.g2o"
     path.write_text(text)
     assert read(path).batch.variable_count == 3
+
+
+def test_features_of_inverse_depth_have_no_record() -> None:
+    feature = Variables("idp", np.array([symbol("f", 1)]), np.zeros((1, 6)))
+    with pytest.raises(FormatError, match=r"1 variable\(s\) of kind idp"):
+        g2o_text(Batch((feature,)))
 
 
 @pytest.mark.parametrize("kind", ["bearing_range_se2", "prior_point2"])

@@ -124,7 +124,7 @@ def replay(request: Request) -> dict[str, Any]:
         before = target.account()
         with screen.progress(request.file.name, graph.poses) as show:
             driven = drive(target, steps, request.every, show)
-        unsettled = driven.steps[-1].report["chi2"]
+        unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
         compared = target.compared()
         after = target.account()
