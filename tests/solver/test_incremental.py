@@ -222,7 +222,7 @@ def test_a_backend_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("name", ["intel"])
 def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) -> None:
-    solver = Solver()
+    solver = Solver(Options(mode="inc-l"))
     for batch in read(datasets / f"{name}.g2o").steps():
         solver.stage(batch)
     solver.step()

@@ -137,7 +137,7 @@ def replay(request: Request) -> dict[str, Any]:
         "where": request.where,
         **measured,
         "revision": last.revision,
-        "chi2": last.report["chi2"],
+        "chi2": last.report["chi2"] if request.settle else unsettled,
         "chi2_unsettled": unsettled,
         "chi2_initial": _chi2_initial(steps),
         "settled": bool(request.settle and last.report["converged"]),
