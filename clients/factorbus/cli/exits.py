@@ -23,15 +23,9 @@ EXIT_CODES = {
 }
 
 # What the extras of pyproject.toml bring, by import name.
-EXTRAS = {
-    "service": ("numba", "scipy", "sksparse"),
-    "viz": ("matplotlib",),
-    "watch": ("rerun",),
-    "record": ("foxglove",),
-    "gateway": ("starlette", "uvicorn", "websockets"),
-}
+EXTRAS = {"service": ("numba", "scipy", "sksparse"), "viz": ("matplotlib",)}
 
-_USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_setting", "exposed")
+_USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option")
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down")
 
 
