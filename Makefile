@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-data test-kernels lint check bench wheel clean
+.PHONY: help pictures setup demo test test-data test-kernels test-faults lint check crash bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -23,7 +23,7 @@ $(READY): pyproject.toml $(SETUP)
 
 # bench: other libraries to compare with, which the tests have as oracles.
 $(READY_DEV): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz,dev,bench
+	@bash deploy/setup/environment.sh $(VENV) service,viz,watch,record,gateway,dev,bench
 	@touch $(READY) $@
 
 demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as processes on the bus
@@ -39,11 +39,15 @@ test-data: $(READY_DEV) ## the long tests on the public data sets (FACTORBUS_DAT
 
 # Compiled code neither checks an index nor counts as covered.  Each way has kernels of its own in the cache.
 KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_kernels.py \
-	tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py tests/workers/test_idp_factors.py
+	tests/solver/test_sights.py tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py
 test-kernels: $(READY_DEV) ## the kernels again: as plain Python, and with every index checked
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(ARGS)
 	@NUMBA_BOUNDSCHECK=1 $(BIN)/factorbus warm
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) tests/solver/test_solver_steps.py $(ARGS)
+
+test-faults: $(READY_DEV) ## workers killed and frozen in mid-job, 400 times
+	@$(BIN)/factorbus warm
+	FACTORBUS_FAULTS=400 $(BIN)/python -m pytest -s --timeout 3600 tests/system/test_features_faults.py $(ARGS)
 
 lint: $(READY_DEV) ## ruff, pyright, import contracts
 	$(BIN)/ruff check .
@@ -53,8 +57,16 @@ lint: $(READY_DEV) ## ruff, pyright, import contracts
 
 check: lint test ## lint and test: what CI runs
 
+crash: $(READY_DEV) ## a service with a journal is killed 150 times; nothing answered may be lost, nothing be there twice
+	@$(BIN)/factorbus warm
+	FACTORBUS_KILLS=$(or $(KILLS),110) $(BIN)/python -m pytest tests/system/test_journal_crash.py $(ARGS)
+
 bench: $(READY_DEV) ## the measurements, each with what it is held against
 	@$(BIN)/factorbus bench all $(ARGS)
+
+pictures: $(READY_DEV) ## draw the picture of the README again
+	@$(BIN)/factorbus simulate manhattan --poses 1500 --seed 7 --out $(BIN)/../town.g2o
+	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --out docs/town.png
 
 wheel: $(READY_DEV) ## build the wheel and try it in a clean virtual environment
 	@bash deploy/setup/try-wheel.sh $(BIN)/python

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the wheel and installs it, with the base dependencies only, into a virtual environment of its own:
 # the four source roots must arrive as one namespace package, the light client must work without the service's extras,
-# and what needs them must say so.
+# and what needs them must say so.  Then, with those extras, the demo must run.
 #
 #     deploy/setup/try-wheel.sh PYTHON        PYTHON has pip; the build back end is brought by pip itself
 set -euo pipefail
@@ -20,6 +20,9 @@ main() {
     every_root_is_there
     light_client_works
     service_says_what_it_needs
+    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+        "$(echo "$folder"/dist/factorbus-*.whl)[service,viz]"
+    demo_runs
     echo "wheel: $(cd dist && ls) is whole, light, and says what it lacks"
 }
 
@@ -27,15 +30,23 @@ every_root_is_there() {
     venv/bin/python - <<'EOF'
 from importlib.util import find_spec
 
-for part in ("proto", "solver", "service", "formats", "workers", "client", "cli", "viz", "simulate"):
+for part in ("proto", "solver", "service", "formats", "workers", "client", "cli", "viz", "simulate", "gateway"):
     assert find_spec(f"factorbus.{part}"), f"factorbus.{part} is not in the wheel"
 assert find_spec("factorbus").origin is None, "factorbus must stay a namespace package"
 EOF
 }
 
+demo_runs() {
+    says "every one: 100 steps" venv/bin/factorbus demo --poses 100 --workers 1
+    [ -s out/demo.png ]
+}
+
 light_client_works() {
     says "factorbus demo" venv/bin/factorbus --help
     says "factorbus 0." venv/bin/factorbus version
+    says "leave a variable free to move" venv/bin/factorbus explain underconstrained
+    says "pip install 'factorbus[watch]'" venv/bin/factorbus watch town
+    says "pip install 'factorbus[gateway]'" venv/bin/factorbus gateway
     venv/bin/python -c 'import sys, factorbus.client; assert not {"numba", "scipy", "sksparse"} & set(sys.modules)'
 }
 

@@ -3,8 +3,9 @@
     python proto/vectors/make.py [FOLDER]        (default: the folder of this file)
 
 A client in another language reads the .msgpack and compares with the .json, or builds the message from the .json and
-compares with the .msgpack.  In the .json a bin is {"i64": [...]} or {"f64": [...]} (little-endian columns, flattened)
-or {"msgpack": {...}} (a message inside a message); floats are written so that they read back bit for bit.
+compares with the .msgpack.  In the .json a bin is {"i64": [...]}, {"f64": [...]} or {"u8": [...]} (little-endian
+columns, flattened) or {"msgpack": {...}} (a message inside a message); floats are written so that they read back bit
+for bit.
 The bytes are part of wire version 1: they never change; new optional fields get new files.
 """
 
@@ -16,7 +17,8 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from factorbus.proto import codec
+from factorbus.proto import asking, codec
+from factorbus.proto import asking_codec as asked
 from factorbus.proto.messages import (
     Accepted,
     Batch,
@@ -34,7 +36,11 @@ from factorbus.proto.messages import (
 from factorbus.proto.problems import Busy
 from factorbus.proto.symbols import symbol
 
-_COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64"}
+_COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
+# Of the questions about uncertainty and their answers, §16.
+_COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "sightings", "candidates"), "i64")
+_COLUMNS |= dict.fromkeys(("covariance", "distance", "threshold", "gain", "distances"), "f64")
+_COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 
 
 def main() -> None:
@@ -55,6 +61,8 @@ def vectors() -> dict[str, bytes]:
         "insert": codec.encode_insert(Insert(1, Batch(pair, (_odometry(0),)), epoch=7)),
         "insert_without_values": codec.encode_insert(Insert(2, Batch((_poses(first=2),), (_odometry(1),)), epoch=7)),
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
+        "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
+        "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
         "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
@@ -73,7 +81,50 @@ def vectors() -> dict[str, bytes]:
         "ask_export": codec.encode_map({"format": "g2o"}),
         "admin_create": codec.encode_map({"map": "kitchen", "mode": "auto"}),
         "event": codec.encode_map({"event": "created", "epoch": 7, "revision": 0}),
+        **_about_uncertainty(),
     }
+
+
+def _about_uncertainty() -> dict[str, bytes]:
+    x = [symbol("x", i) for i in range(4)]
+    pairs, two, odometry = np.array([[x[1], x[2]]]), np.array(x[1:3]), (_odometry(1),)
+    block = np.array([[0.25, 0.0, 0.125], [0.0, 0.5, 0.0], [0.125, 0.0, 0.0625]])
+    group = asking.CovarianceGroup("se2", np.array(x[1:2]), block[None])
+    relative = asking.CovarianceGroup("se2", pairs, block[None], np.array([[1.5, 0.25, 0.125]]))
+    dims, matrix = np.array([3, 3]), np.vstack([np.hstack([2 * block, block]), np.hstack([block, 2 * block])])
+    sights = np.array([[2.0, 1.0], [3.0, 0.0]])
+    account = {"factor": 0, "kind": "between_se2", "keys": x[:2], "chi2": 0.25, "without": None, "dims": 3}
+    return {
+        "ask_covariance": asked.encode_ask_covariance(asking.AskCovariance()),
+        "ask_covariance_cross": asked.encode_ask_covariance(asking.AskCovariance("cross", two, np.array(x[:1]))),
+        "ask_covariance_relative": asked.encode_ask_covariance(asking.AskCovariance("relative", pairs)),
+        "covariances": asked.encode_covariances(asking.Covariances(7, 2, "diagonal", (group,))),
+        "covariances_relative": asked.encode_covariances(asking.Covariances(7, 2, "relative", (relative,))),
+        "covariances_joint": asked.encode_covariances(
+            asking.Covariances(7, 2, "joint", keys=two, dims=dims, covariance=matrix)
+        ),
+        "covariances_cross": asked.encode_covariances(
+            asking.Covariances(7, 2, "cross", (), two, dims, np.array(x[3:]), np.array([3]), matrix[:, :3])
+        ),
+        "ask_gate": asked.encode_ask_gate(asking.AskGate(odometry, 0.99)),
+        "gated": asked.encode_gated(
+            asking.Gated(7, 2, np.array([0.5]), np.array([3]), np.array([11.25]), np.array([True]))
+        ),
+        "ask_gain": asked.encode_ask_gain(asking.AskGain(odometry)),
+        "gained": asked.encode_gained(asking.Gained(7, 2, np.array([1.25]))),
+        "ask_associate": asked.encode_ask_associate(
+            asking.AskAssociate(x[1], "landmark_se2", sights, np.tile([4.0, 0.0, 4.0], (2, 1)), two, 0.95)
+        ),
+        "associated": asked.encode_associated(
+            asking.Associated(
+                7, 2, np.array([x[2], 0]), np.array([True, False]), 0.5, 2, 5.75, True,
+                np.array([0, 0]), np.array([x[2], x[1]]), np.array([0.5, 4.5]),
+            )
+        ),
+        "ask_why": asked.encode_ask_why(asking.AskWhy(key=x[1])),
+        "ask_why_factor": asked.encode_ask_why(asking.AskWhy(factor=0)),
+        "why": asked.encode_why(asking.Why(7, 2, {}, account, {"strategy": "tree", "because": "2 variables bent"})),
+    }  # fmt: skip
 
 
 def described(data: bytes) -> str:
@@ -115,6 +166,27 @@ def _every_kind() -> Batch:
     return Batch(variables, factors)
 
 
+def _sights() -> Batch:
+    """What cameras see, with and without losses."""
+    x, f, p = (symbol(letter, 1) for letter in "xfp")
+    unit2, unit6 = (np.array([np.eye(r)[np.triu_indices(r)]]) for r in (2, 6))
+    radtan = [1.0, 400.0, 401.0, 320.0, 240.0, 0.0, -0.25, 0.125, 0.001, -0.002, 0.0]
+    radial = [0.0, 195.5, 196.0, 162.0, 125.0, 0.0, 0.0112, 0.0112, 0.0633, 0.0139, 0.0]
+    variables = (
+        Variables("se3", np.array([x, x + 1]), np.array([[0.0, 0, 0, 0, 0, 0, 1], [0.5, 0, 0, 0, 0, 0, 1]])),
+        Variables("idp", np.array([f])),
+        Variables("point3", np.array([p]), np.array([[0.25, 0.5, 4.0]])),
+    )
+    factors = (
+        Factors("idp_first", np.array([[x, f]]), np.array([[330.0, 250.0, 0.25, *radtan]]), unit6),
+        Factors(
+            "idp_seen", np.array([[x + 1, f]]), np.array([[280.0, 250.0, *radtan]]), unit2, "huber", np.array([1.5])
+        ),
+        Factors("point_seen", np.array([[x, p]]), np.array([[175.0, 150.0, *radial]]), unit2, "dcs", np.array([2.0])),
+    )
+    return Batch(variables, factors)
+
+
 def _plain(content: Any, name: str = "") -> Any:
     if isinstance(content, dict):
         return {key: _plain(value, key) for key, value in content.items()}
@@ -124,7 +196,7 @@ def _plain(content: Any, name: str = "") -> Any:
         if name not in _COLUMNS:
             return {"msgpack": _plain(msgpack.unpackb(content))}
         dtype = _COLUMNS[name]
-        return {dtype: np.frombuffer(content, "<i8" if dtype == "i64" else "<f8").tolist()}
+        return {dtype: np.frombuffer(content, {"i64": "<i8", "f64": "<f8", "u8": "u1"}[dtype]).tolist()}
     return content
 
 

@@ -12,7 +12,13 @@ All hubs run all the time and are asked in turn, BLOCK exchanges each, in an ord
 else the machine does, and every exchange follows one with the same hub: with each sample another hub, an exchange also
 pays for what the other hub before it has driven out of the caches, or gains from the cores that it has kept awake.
 
-Beside the floor there are two more echoes, to see where a difference comes from:
+Around every exchange, with whichever hub, the client does the same: before it makes an insert and encodes it, after it
+decodes an answer and a delta.  That is not in the time, but it decides what is in the caches of the client when it
+asks, and for how long hub and link have rested, and neither is the service's doing.
+
+Beside the floor there are three more echoes, to see where a difference comes from:
+
+`idle` leaves that work out: a client that does nothing between its exchanges, with the hub of the floor.
 
 `held` first keeps a core busy for as long as the solver did, and that time is taken off: what being busy in between
 costs by itself (threads that have gone to sleep, a second core that is taken).  It uses the hub of the floor.
@@ -43,7 +49,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.proto import codec, keys
-from factorbus.proto.messages import Batch, Factors, Insert, Variables
+from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE
 
@@ -84,7 +90,9 @@ def run(rounds: int, samples: int) -> dict[str, Any]:
         gc.freeze()
         taken = [one_round(client, *echoes, f"bench{n}", samples) for n in range(rounds)]
     bus = [np.array([s.bus for s in row.ours]) for row in taken]
-    bare, held, laid = ([np.array(getattr(row, name)) for row in taken] for name in ("bare", "held", "laid_out"))
+    bare, idle, held, laid = (
+        [np.array(getattr(row, name)) for row in taken] for name in ("bare", "idle", "held", "laid_out")
+    )
     every = [s for row in taken for s in row.ours]
     answer, delta = every[-1].sizes
     return {
@@ -93,11 +101,13 @@ def run(rounds: int, samples: int) -> dict[str, Any]:
         "bytes": {"insert": len(client.payload), "answer": answer, "delta": delta},
         "bus_us": percentiles(np.concatenate(bus)),
         "floor_us": percentiles(np.concatenate(bare)),
+        "idle_us": percentiles(np.concatenate(idle)),
         "held_us": percentiles(np.concatenate(held)),
         "laid_out_us": percentiles(np.concatenate(laid)),
         "solver_us": percentiles(np.array([s.solver for s in every])),
         "client_codec_us": percentiles(np.array([s.codec for s in every])),
         "ratio": {f"p{q}": round(ratio(bus, bare, q), 3) for q in (50, 90, 99)},
+        "ratio_idle": {f"p{q}": round(ratio(bus, idle, q), 3) for q in (50, 90, 99)},
         "ratio_held": {f"p{q}": round(ratio(bus, held, q), 3) for q in (50, 90, 99)},
         "ratio_laid_out": {f"p{q}": round(ratio(bus, laid, q), 3) for q in (50, 90, 99)},
         "goal": GOAL,
@@ -119,13 +129,14 @@ class Round:
 
     ours: list[Sample]
     bare: list[float]
+    idle: list[float]
     held: list[float]
     laid_out: list[float]
 
 
 def one_round(client: "Client", echo: "Echo", laid_out: "Echo", name: str, samples: int) -> Round:
     """A new map, so that the solver's part stays small; the first exchanges are not counted."""
-    taken = Round([], [], [], [])
+    taken = Round([], [], [], [], [])
     with client.joined(name):
         for _ in range(40):
             warm_up = client.exchange()
@@ -137,16 +148,19 @@ def one_round(client: "Client", echo: "Echo", laid_out: "Echo", name: str, sampl
             taken.ours.append(client.exchange())
 
         def ask_bare() -> None:
-            taken.bare.append(echo.exchange(client.payload))
+            taken.bare.append(client.at_work(echo.exchange))
+
+        def ask_idle() -> None:
+            taken.idle.append(echo.exchange(client.payload))
 
         def ask_held() -> None:
-            taken.held.append(echo.exchange(client.payload, hold_us))
+            taken.held.append(client.at_work(echo.exchange, hold_us))
 
         def ask_laid_out() -> None:
-            taken.laid_out.append(laid_out.exchange(client.payload))
+            taken.laid_out.append(client.at_work(laid_out.exchange))
 
         for _ in range(-(-samples // BLOCK)):
-            for ask in client.random.permutation(np.array([ask_ours, ask_bare, ask_held, ask_laid_out])):
+            for ask in client.random.permutation(np.array([ask_ours, ask_bare, ask_idle, ask_held, ask_laid_out])):
                 for _ in range(BLOCK):
                     ask()
             hold_us = float(np.median([sample.solver for sample in taken.ours[-BLOCK:]]))
@@ -160,6 +174,7 @@ class Client:
         self._bus, self._came = bus, queue.SimpleQueue()
         self.random = np.random.default_rng(1)
         self.payload = b""
+        self._last: dict[str, bytes] = {}
 
     @contextmanager
     def joined(self, name: str) -> Iterator[None]:
@@ -175,6 +190,12 @@ class Client:
         """Ten more factors between the poses."""
         return self._insert(Batch(factors=(edges(self.random),)))
 
+    def at_work(self, exchange: Callable[..., float], *how: float) -> float:
+        """An exchange of an insert with another hub, with the work around it that one of ours has."""
+        microseconds = exchange(codec.encode_insert(Insert(self._sequence, Batch(factors=(edges(self.random),)))), *how)
+        self._decode(self._last)
+        return microseconds
+
     def _insert(self, batch: Batch) -> Sample:
         self._sequence += 1
         times = [time.perf_counter()]
@@ -185,12 +206,15 @@ class Client:
         times.append(time.perf_counter())
         if "problem" in came:
             raise codec.decode_problem(came["problem"])
-        codec.decode_accepted(came["answer"])
-        delta = codec.decode_delta(came["delta"])
+        delta, self._last = self._decode(came), came
         times.append(time.perf_counter())
         encoding, total, decoding = np.diff(times) * 1e6
         sizes = len(came["answer"]), len(came["delta"])
         return Sample(total, delta.report["solver_ms"] * 1e3, encoding + decoding, sizes)
+
+    def _decode(self, came: dict[str, bytes]) -> Delta:
+        codec.decode_accepted(came["answer"])
+        return codec.decode_delta(came["delta"])
 
     def _on_reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is None:
@@ -363,6 +387,7 @@ def table(result: dict[str, Any]) -> str:
     for what, row in (
         ("ours without solver", "bus_us"),
         ("bare Zenoh echo", "floor_us"),
+        ("the same, client idle", "idle_us"),
         ("the same, held", "held_us"),
         ("the same, laid out", "laid_out_us"),
         ("solver", "solver_us"),
@@ -371,6 +396,7 @@ def table(result: dict[str, Any]) -> str:
         lines.append(f"{what:24}" + "".join(f"{result[row][p]:9.0f}" for p in ("p50", "p90", "p99")))
     for what, row in (
         ("ratio to the echo", "ratio"),
+        ("ratio to that idle", "ratio_idle"),
         ("ratio to the held one", "ratio_held"),
         ("ratio to that laid out", "ratio_laid_out"),
     ):

@@ -18,7 +18,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one core for everybody
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from bench import idp_bus, idp_euroc, idp_paper, idp_times
+from bench import idp_bus, idp_euroc, idp_map, idp_paper, idp_times
 
 _SIZES = ((3, 0), (10, 0), (100, 0), (1000, 0), (10, 100))
 _MANY = 10_000
@@ -53,6 +53,7 @@ def run(workers: bool) -> dict[str, Any]:
                 "multiplications": None,
             }
             rows.append(row | {"seconds": seconds, "workers": count, "extrapolated": False})
+        found["maps"] = idp_map.measure()
         if folder := idp_euroc.try_find_tracks():
             with TemporaryDirectory() as scratch:
                 found["euroc"] = idp_euroc.run(folder, 1, Path(scratch))
@@ -84,6 +85,10 @@ def targets(found: dict[str, Any]) -> list[dict[str, Any]]:
     ]
     if "bus" in found:
         wanted.append(("two workers do more than one", found["bus"]["ratio"], ">=", found["bus"]["goal"]))
+    for row in found.get("maps", ()):
+        name = f"a map whose features {'become' if row['points'] else 'are not'} points"
+        wanted.append((f"{name}: positions within 3σ", row["nees_position"]["within"], ">=", 0.99))
+        wanted.append((f"{name}: inverse depths within 3σ", row["inverse_depth"]["within"], ">=", 0.99))
     return [
         {"target": name, "seen": seen, "wanted": f"{sign} {limit:g}", "met": _meets(seen, sign, limit)}
         for name, seen, sign, limit in wanted
@@ -107,6 +112,8 @@ def report(found: dict[str, Any]) -> str:
     lines += ["", "Seconds, one process", "", *_times(found["rows"])]
     if "bus" in found:
         lines += ["", *_bus(found["bus"])]
+    if "maps" in found:
+        lines += ["", idp_map.report(found["maps"])]
     if "euroc" in found:
         lines += ["", idp_euroc.report(found["euroc"])]
     lines += ["", "Targets", ""]

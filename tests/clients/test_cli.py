@@ -82,7 +82,7 @@ def test_version_names_the_libraries() -> None:
         (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
         (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--wait", "0.1"], UNAVAILABLE, "[unavailable]"),
         (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
-        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o or .tum"),
+        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .tum or .kitti"),
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
         (["simulate", "manhattan"], USAGE, "there is nothing to write"),
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
@@ -178,12 +178,48 @@ def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
     assert found["healthy"], checks
     assert ran.returncode == OK
     assert set(checks) == {
-        "python", "libraries", "cholmod", "kernel cache", "machine", "clock", "shared memory", "port", "bus",
+        "python", "libraries", "extras", "cholmod", "kernel cache", "machine", "clock", "wall clock", "shared memory",
+        "permissions", "port", "bus",
     }  # fmt: skip
     assert checks["kernel cache"]["state"] == "warn"
     assert checks["kernel cache"]["mend"] == "factorbus warm compiles ahead"
     assert "CHOLMOD" in checks["cholmod"]["seen"]
     assert "answers on loopback" in checks["bus"]["seen"]
+
+
+def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    from factorbus.cli import checks
+
+    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "rerun" else object())
+    found = checks.extras()
+    assert (found.state, found.mend) == ("ok", "if wanted: pip install 'factorbus[watch]'")
+    assert "without watch" in found.seen
+
+
+@pytest.mark.parametrize(("answer", "state"), [(0, "ok"), (5, "warn"), (-1, "ok")])
+def test_doctor_asks_the_kernel_who_keeps_the_clock(answer: int, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from factorbus.cli import checks
+
+    class Libc:
+        @staticmethod
+        def adjtimex(_: object) -> int:
+            return answer
+
+    monkeypatch.setattr(checks.ctypes, "CDLL", lambda _: Libc)
+    assert checks.wall_clock().state == state
+
+
+def test_extras_are_those_of_the_project() -> None:
+    """What the commands ask for is what `pip install 'factorbus[...]'` brings."""
+    import tomllib
+
+    from factorbus.cli.exits import EXTRAS
+
+    project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
+    distributions = {"sksparse": "scikit-sparse", "rerun": "rerun-sdk", "foxglove": "foxglove-sdk"}
+    for extra, names in EXTRAS.items():
+        brought = {re.split(r"[<>=\[]", each)[0] for each in project["optional-dependencies"][extra]}
+        assert {distributions.get(name, name) for name in names} <= brought
 
 
 def test_doctor_fails_where_kernels_cannot_be_kept(tmp_path: Path) -> None:

@@ -56,9 +56,9 @@ def test_in_process(local: dict[str, Any], town: Path) -> None:
     assert local["steps"] == local["inserts"] == POSES
     assert local["revision"] == POSES + 1
     assert local["settled"]
-    assert local["mode"] == "inc-l"
+    assert local["mode"] == "tree"
     assert sum(local["strategies"].values()) == POSES
-    assert local["strategies"]["omega"] > 10
+    assert local["strategies"]["tree"] > 10
     for name in ("p50", "p95", "p99", "max"):
         assert local["step_ms"][name] > 0
     assert local["step_ms"]["p50"] <= local["step_ms"]["p95"] <= local["step_ms"]["p99"] <= local["step_ms"]["max"]
@@ -71,7 +71,7 @@ def test_in_process(local: dict[str, Any], town: Path) -> None:
 def test_chi2_along_the_drive_is_the_batch_optimum(local: dict[str, Any]) -> None:
     assert [each["revision"] for each in local["against_batch"]] == [100, 200]
     for each in local["against_batch"]:
-        assert each["ratio"] == pytest.approx(1.0, abs=1e-4)
+        assert 1 - 1e-6 < each["ratio"] < 1.01
         assert each["ratio"] == each["chi2"] / each["batch"]
 
 

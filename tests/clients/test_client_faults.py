@@ -67,7 +67,7 @@ def test_inserts_are_answered_and_seen_in_the_mirror(start: Callable[..., Servic
         assert same(kitchen.estimate, service)
         assert not kitchen.estimate.stale
         assert kitchen.estimate.age_s < 10
-        assert kitchen.stats() == {"epoch": 1, "revision": 199}
+        assert kitchen.stats()["revision"] == 199
         assert [row.name for row in bus.maps()] == [MAP]
         with pytest.raises(KeyError, match="x7 is not in map 'kitchen'"):
             kitchen.estimate["x7"]

@@ -17,7 +17,7 @@ from zenoh.handlers import Callback
 
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Accepted, Delta, Estimate, Variables
-from factorbus.proto.problems import BadSequence, Busy, Problem, WrongEpoch
+from factorbus.proto.problems import BadSequence, Busy, Problem, UnknownMap, WrongEpoch
 
 MAP = "kitchen"
 
@@ -40,7 +40,7 @@ class Service:
         self._session = zenoh.open(_peer(folder))
         self._queryables = [
             self._session.declare_queryable(key, Callback(self._inbox.put, indirect=False), complete=True)
-            for key in (keys.inserts_of_any_client(MAP), keys.any_question(MAP), f"{keys.PREFIX}/admin/*")
+            for key in (keys.inserts_of_any_client(MAP), f"{keys.PREFIX}/map/*/ask/*", f"{keys.PREFIX}/admin/*")
         ]
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -75,6 +75,8 @@ class Service:
                 if "/in/" in key:
                     answer = self._insert(keys.client_of(key), codec.decode_insert(payload), query)
                 elif "/ask/" in key:
+                    if key != keys.ask_key(MAP, key.rpartition("/")[2]):
+                        raise UnknownMap(key.split("/")[3])
                     answer = self._ask(key.rpartition("/")[2], payload)
                 else:
                     answer = self._admin(key.rpartition("/")[2])
@@ -123,15 +125,18 @@ class Service:
         if self.ask_fault == "silence":
             return None
         if question == "stats":
-            return codec.encode_map({"epoch": self.epoch, "revision": self.revision})
+            return codec.encode_map(self._row())
         wanted = codec.decode_keys_asked(payload)
         chosen = list(self.values) if wanted is None else wanted.tolist()
         return codec.encode_estimate(Estimate(self.epoch, self.revision, self._columns(chosen)))
 
     def _admin(self, operation: str) -> bytes:
-        row = {"name": MAP, "mode": "auto", "epoch": self.epoch, "revision": self.revision}
-        row |= {"variables": len(self.values), "factors": 0}
+        row = self._row()
         return codec.encode_map({"maps": [row]} if operation == "maps" else row)
+
+    def _row(self) -> dict[str, Any]:
+        row = {"name": MAP, "mode": "auto", "epoch": self.epoch, "revision": self.revision}
+        return row | {"variables": len(self.values), "factors": 0}
 
     def _columns(self, chosen: list[int]) -> tuple[Variables, ...]:
         if not chosen:

@@ -4,9 +4,12 @@ Nothing here shares a formula with them: poses are homogeneous matrices, Jacobia
 """
 
 import numpy as np
+from naive import dense_idp
 from scipy.spatial.transform import Rotation
 
-TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3}
+from factorbus.proto.camera import Camera
+
+TANGENT = {"se2": 3, "se3": 6, "point2": 2, "point3": 3, "idp": 6}
 
 
 def pose_matrix(x: np.ndarray) -> np.ndarray:
@@ -33,6 +36,10 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
     """x ⊞ δ for a kind of variable."""
     if kind.startswith("point"):
         return x + delta
+    if kind == "idp":
+        moved = x + delta
+        moved[3] = np.angle(np.exp(1j * moved[3]))
+        return moved
     n = 2 if kind == "se2" else 3
     step = np.eye(n + 1)
     step[:n, n] = delta[:n]
@@ -42,6 +49,8 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
 
 def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """r of a kind of factor at the values of its variables."""
+    if kind in ("idp_first", "idp_seen", "point_seen"):
+        return _sight(kind, *ends, z)
     if kind.startswith("prior_point"):
         return ends[0] - z
     if kind.startswith("prior"):
@@ -54,6 +63,23 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
         turn = np.angle(np.exp(1j * (np.arctan2(seen[1], seen[0]) - z[0])))
         return np.array([turn, np.hypot(*seen) - z[1]])
     return seen - z
+
+
+def camera_of(lens: np.ndarray) -> Camera:
+    """The camera that a measurement's lens describes."""
+    code, fu, fv, cx, cy, _, *more = lens.tolist()
+    if code == 0:
+        return Camera("radial", (fu * more[0], more[0], more[1], cx, cy, more[2], more[3]))
+    return Camera(*(("radtan", (fu, fv, cx, cy, *more)) if code == 1 else ("fisheye", (fu, fv, cx, cy, *more[:4]))))
+
+
+def _sight(kind: str, pose: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
+    camera = camera_of(z[3 if kind == "idp_first" else 2 :])
+    state = np.concatenate([pose[:3], pose[[6, 3, 4, 5]], np.zeros(6)])
+    if kind == "point_seen":
+        return dense_idp.pixel(camera, dense_idp.matrix(state[3:7]).T @ (end - pose[:3])) - z[:2]
+    off = dense_idp.observed(camera, state, end) - z[:2]
+    return np.concatenate([end[:3] - pose[:3], off, [end[5] - z[2]]]) if kind == "idp_first" else off
 
 
 def _pose_error(E: np.ndarray) -> np.ndarray:

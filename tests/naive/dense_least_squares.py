@@ -13,6 +13,9 @@ CONNECTS = {
     "landmark_se2": ["se2", "point2"],
     "landmark_se3": ["se3", "point3"],
     "bearing_range_se2": ["se2", "point2"],
+    "idp_first": ["se3", "idp"],
+    "idp_seen": ["se3", "idp"],
+    "point_seen": ["se3", "point3"],
 }
 
 
@@ -24,6 +27,7 @@ class DenseGraph:
         self.fixed: set[int] = set()
         self.values: dict[int, np.ndarray] = {}
         self.factors: list[tuple[str, list[int], np.ndarray, np.ndarray]] = []
+        self.losses: list[tuple[str, float]] = []
 
     def add(self, batch) -> None:
         """Take in a batch; values come by `put`."""
@@ -33,8 +37,10 @@ class DenseGraph:
                 if group.fixed:
                     self.fixed.add(key)
         for group in batch.factors:
-            for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True):
+            scales = np.ones(len(group.keys)) if group.scale is None else group.scale
+            for keys, z, upper, k in zip(group.keys.tolist(), group.measured, group.information, scales, strict=True):
                 self.factors.append((group.kind, keys, z, full(upper)))
+                self.losses.append((group.loss, float(k)))
 
     def put(self, groups) -> None:
         """Take over values."""
@@ -43,9 +49,9 @@ class DenseGraph:
 
     def chi2(self) -> float:
         total = 0.0
-        for kind, keys, z, information in self.factors:
+        for (kind, keys, z, information), (loss, k) in zip(self.factors, self.losses, strict=True):
             r = residual(kind, [self.values[key] for key in keys], z)
-            total += r @ information @ r
+            total += rho(loss, k, r @ information @ r)
         return float(total)
 
     def starts(self) -> dict[int, int]:
@@ -62,9 +68,11 @@ class DenseGraph:
         starts = self.starts()
         n = sum(TANGENT[self.kinds[key]] for key in starts)
         information, eta = np.zeros((n, n)), np.zeros(n)
-        for kind, keys, z, W in self.factors:
+        for (kind, keys, z, W), (loss, k) in zip(self.factors, self.losses, strict=True):
             ends = [self.values[key] for key in keys]
             r = residual(kind, ends, z)
+            if loss:
+                W = W * weight(loss, k, r @ W @ r)
             H = np.zeros((len(r), n))
             for key, J in zip(keys, jacobians(kind, CONNECTS[kind], ends, z), strict=True):
                 if key in starts:
@@ -88,6 +96,27 @@ class DenseGraph:
         return length
 
 
+def rho(loss: str, k: float, s: float) -> float:
+    """What a factor with rᵀ Ω r = s counts."""
+    if loss == "huber":
+        return s if s <= k**2 else 2 * k * s**0.5 - k**2
+    if loss == "cauchy":
+        return k**2 * np.log(1 + s / k**2)
+    if loss == "geman-mcclure":
+        return k**2 * s / (k**2 + s)
+    if loss == "tukey":
+        return k**2 / 3 * (1 - max(1 - s / k**2, 0) ** 3)
+    if loss == "dcs":
+        return s if s <= k**2 else k**2 * (3 * s - k**2) / (s + k**2)
+    return s
+
+
+def weight(loss: str, k: float, s: float) -> float:
+    """∂ρ/∂s by a central difference."""
+    h = 1e-6 * max(s, 1.0)
+    return (rho(loss, k, s + h) - rho(loss, k, max(s - h, 0.0))) / (h + min(s, h))
+
+
 def full(upper: np.ndarray) -> np.ndarray:
     """The symmetric matrix with this upper triangle, row by row."""
     n = int((np.sqrt(8 * len(upper) + 1) - 1) / 2)
@@ -100,6 +129,8 @@ def distance(kind: str, a: np.ndarray, b: np.ndarray) -> float:
     """How far two values of a kind are apart; angles modulo 2π, quaternions up to sign."""
     if kind == "se2":
         return float(max(np.abs(a[:2] - b[:2]).max(), abs(np.angle(np.exp(1j * (a[2] - b[2]))))))
+    if kind == "idp":
+        return float(max(np.abs(a - b)[[0, 1, 2, 4, 5]].max(), abs(np.angle(np.exp(1j * (a[3] - b[3]))))))
     if kind == "se3":
         return float(max(np.abs(a[:3] - b[:3]).max(), min(np.abs(a[3:] - b[3:]).max(), np.abs(a[3:] + b[3:]).max())))
     return float(np.abs(a - b).max())

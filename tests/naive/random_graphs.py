@@ -4,11 +4,16 @@ from collections.abc import Iterator
 
 import numpy as np
 from naive.dense_factors import TANGENT, boxplus, pose_matrix, pose_vector, residual
+from naive.dense_idp import feature, point
 from naive.dense_least_squares import CONNECTS
+from naive.random_sightings import CAMERAS
+from naive.random_sights import SIGHTS, measurement, state_of
 
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
+
+_PIXEL = 0.01  # what a pixel is against a metre
 
 
 def random_value(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -37,6 +42,11 @@ def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Gen
             relative = np.linalg.inv(relative) @ pose_matrix(ends[1])
         space = CONNECTS[kind][0]
         return boxplus(space, pose_vector(relative), noise * rng.normal(size=TANGENT[space]))
+    if kind in ("idp_first", "idp_seen", "point_seen"):
+        z = measurement(kind, CAMERAS["radtan"], np.zeros(2), ends[1][5] if kind == "idp_first" else 0.0)
+        rows = slice(3, 5) if kind == "idp_first" else slice(0, 2)
+        z[:2] = residual(kind, ends, z)[rows] + noise / _PIXEL * rng.normal(size=2)
+        return z
     zero = np.zeros(FACTOR_KINDS[kind].size)
     z = residual(kind, ends, zero) + noise * rng.normal(size=len(zero))
     if kind.startswith("bearing_range"):
@@ -47,7 +57,11 @@ def measured(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Gen
 def factor(kind: str, keys: list[int], truth: dict[int, np.ndarray], noise: float, rng: np.random.Generator) -> Factors:
     """One factor of a kind between known true values."""
     z = measured(kind, [truth[key] for key in keys], noise, rng)
-    information = random_information(FACTOR_KINDS[kind].dim, rng)
+    dim = FACTOR_KINDS[kind].dim
+    information = random_information(dim, rng)
+    if kind in SIGHTS:
+        unit = np.array([1, 1, 1, _PIXEL, _PIXEL, 1])[:dim] if dim == 6 else np.full(2, _PIXEL)
+        information *= np.outer(unit, unit)[np.triu_indices(dim)]
     return Factors(kind, np.array([keys]), z[None], information[None])
 
 
@@ -104,4 +118,42 @@ def random_steps(seed: int, steps: int = 7, noise: float = 0.03) -> Iterator[Bat
                 factors.append(factor("prior_point3", [symbol("p", n)], truth, noise, rng))
         else:
             factors.append(factor("landmark_se3", [symbol("y", n), symbol("p", n - 1)], truth, noise, rng))
+        yield Batch(tuple(variables), tuple(factors))
+
+
+def camera_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") -> Iterator[Batch]:
+    """Steps of a camera that goes sideways: features seen for the first time, seen again, and points seen.
+
+    With a loss all but priors have it, and some pixels are wrong.
+    """
+    rng = np.random.default_rng(seed)
+    truth: dict[int, np.ndarray] = {}
+
+    def new(kind: str, letter: str, index: int, value: np.ndarray, given: bool = False) -> Variables:
+        truth[symbol(letter, index)] = value
+        return Variables(kind, np.array([symbol(letter, index)]), value[None] if given else None)
+
+    def made(kind: str, *keys: int) -> Factors:
+        group = factor(kind, list(keys), truth, noise, rng)
+        if not loss or kind.startswith("prior"):
+            return group
+        if kind in ("idp_seen", "point_seen") and rng.random() < 0.15:
+            group.measured[0, :2] += rng.normal(0, 20, 2) * noise / _PIXEL
+        return group._replace(loss=loss, scale=np.array([1.5]))
+
+    for n in range(steps):
+        camera, last = symbol("c", n), n - 1 - (n - 1) % 4
+        stand = boxplus("se3", np.array([0.3 * n, 0, 0, 0, 0, 0, 1]), 0.03 * rng.normal(size=6))
+        variables = [new("se3", "c", n, stand)]
+        factors = [made("between_se3", symbol("c", n - 1), camera) if n else made("prior_se3", camera)]
+        for old in range(max(last, 0), last + 3):
+            if symbol("f", old) in truth and rng.random() < 0.8:
+                factors.append(made("idp_seen", camera, symbol("f", old)))
+            if symbol("q", old) in truth and rng.random() < 0.5:
+                factors.append(made("point_seen", camera, symbol("q", old)))
+        if n % 4 < 2:
+            y = feature(CAMERAS["radtan"], state_of(stand), rng.uniform((300, 150), (450, 350)), 0.2)
+            variables += [new("idp", "f", n, y), new("point3", "q", n, point(y), given=True)]
+            factors += [made("idp_first", camera, symbol("f", n)), made("point_seen", camera, symbol("q", n))]
+            factors.append(made("prior_point3", symbol("q", n)))
         yield Batch(tuple(variables), tuple(factors))

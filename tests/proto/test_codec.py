@@ -110,6 +110,8 @@ def from_description(content: Any) -> Any:
                 return np.array(numbers, "<i8").tobytes()
             case {"f64": numbers}:
                 return np.array(numbers, "<f8").tobytes()
+            case {"u8": numbers}:
+                return bytes(numbers)
             case {"msgpack": inner}:
                 return msgpack.packb(from_description(inner))
         return {key: from_description(value) for key, value in content.items()}
@@ -269,17 +271,17 @@ def test_bytes_that_are_no_map_are_refused(data: bytes, text: str) -> None:
 
 
 def test_a_kind_that_is_not_known_is_refused_in_an_insert() -> None:
-    with pytest.raises(UnknownKind, match="'idp' is not known here; wanted one of se2, se3") as caught:
-        codec.decode_insert(msgpack.packb({"sequence": 1, "variables": [GROUP | {"kind": "idp"}]}))
-    assert (caught.value.code, caught.value.detail["kind"]) == ("unknown_kind", "idp")
+    with pytest.raises(UnknownKind, match="'sim3' is not known here; wanted one of se2, se3") as caught:
+        codec.decode_insert(msgpack.packb({"sequence": 1, "variables": [GROUP | {"kind": "sim3"}]}))
+    assert (caught.value.code, caught.value.detail["kind"]) == ("unknown_kind", "sim3")
     with pytest.raises(UnknownKind, match="between_se9"):
         codec.decode_graph(msgpack.packb({"epoch": 1, "revision": 1, "factors": [EDGE | {"kind": "between_se9"}]}))
 
 
 def test_an_older_client_reads_the_values_of_a_kind_it_does_not_know() -> None:
-    group = {"kind": "idp", "keys": b"\0" * 16, "values": np.arange(12.0).tobytes()}
+    group = {"kind": "sim3", "keys": b"\0" * 16, "values": np.arange(12.0).tobytes()}
     estimate = codec.decode_estimate(msgpack.packb({"epoch": 1, "revision": 2, "variables": [group]}))
-    assert estimate.variables[0].kind == "idp"
+    assert estimate.variables[0].kind == "sim3"
     assert estimate.variables[0].values.shape == (2, 6)
 
 
@@ -323,7 +325,9 @@ def test_no_bytes_do_harm(decoder: str, data: bytes) -> None:
     decodes_or_refuses(DECODERS[decoder], data)
 
 
-@pytest.mark.parametrize("name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds"])
+@pytest.mark.parametrize(
+    "name", [*sorted(set(GOLDEN) & set(DECODERS)), "insert_all_kinds", "insert_sights", "insert_points"]
+)
 @settings(max_examples=150)
 @given(data=st.data())
 def test_no_mutation_of_a_valid_message_does_harm(name: str, data: st.DataObject) -> None:

@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from naive.random_graphs import random_steps
 
 from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import parse_symbol
+from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Folded, Judged, Outcome, Stepped, Waiting
+from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped, Waiting
 from factorbus.service.fold import Folder
 from factorbus.service.questions import Question
 from factorbus.solver import Options, Solver
@@ -185,11 +188,17 @@ class Faulty(Solver):
     def step(self, settle: bool = False) -> Any:
         return self._run("step", lambda: super(Faulty, self).step(settle))
 
+    def try_stage(self, raw: bytes, groups: Any) -> Any:
+        return self._run("try_stage", lambda: super(Faulty, self).try_stage(raw, groups))
+
     def changed(self) -> Any:
         return self._run("changed", super().changed)
 
-    def graph(self) -> Any:
-        return self._run("graph", super().graph)
+    def pick_changed(self) -> Any:
+        return self._run("pick_changed", super().pick_changed)
+
+    def graph(self, *most: int | None) -> Any:
+        return self._run("graph", lambda: super(Faulty, self).graph(*most))
 
     def _run(self, name: str, call: Callable[[], Any]) -> Any:
         if self._failing and self._failing[0] == f"before {name}":
@@ -252,3 +261,114 @@ def test_what_cannot_be_brought_back_is_said_for_good() -> None:
     assert "drop it" in folded.outcomes[0].answer.message
     with pytest.raises(Problem, match="drop it"):
         folder.snapshot([Question("estimate")])
+
+
+# ---- one insert, read where it lies -------------------------------------------------------------------------------
+
+
+def located(batch: Batch, sequence: int = 1, settle: bool = False) -> Waiting:
+    message = codec.encode_insert(Insert(sequence, batch, settle))
+    arrived = read_insert(None, "a", message, REQUEST_LIMITS, 0.0)
+    assert isinstance(arrived, Arrived)
+    assert isinstance(arrived.content, Located)
+    return Waiting("a", sequence, len(message), arrived.digest, arrived.content, [], message)
+
+
+def fold_alone(folder: Folder, insert: Waiting) -> tuple[Result, bool]:
+    """What came of it, and whether it was had in one piece."""
+    events = folder.fold_alone(insert)
+    if isinstance(events, Alone):
+        outcome = Outcome(events.insert, events.answer, events.first_factor)
+        stepped = Stepped(events.revision, events.delta, events.strategy, events.chi2, events.solver_ms)
+        return Result((outcome,), (stepped,), events.variables, events.factors), True
+    *rest, end = events
+    assert isinstance(end, Folded)
+    outcomes = tuple(o for e in rest if isinstance(e, Judged) for o in e.outcomes)
+    return Result(outcomes, tuple(e for e in rest if isinstance(e, Stepped)), end.variables, end.factors), False
+
+
+def told(folded: Result) -> Any:
+    """All of it but the times."""
+    messages: list[Any] = [*accepted(folded), *deltas(folded)]
+    reports = [{k: v for k, v in m.report.items() if not k.endswith("_ms")} for m in messages]
+    plain = [
+        (type(m).__name__, m.epoch, m.revision, getattr(m, "sequence", None), getattr(m, "first_factor", None))
+        for m in messages
+    ]
+    columns = [
+        (g.kind, g.keys.tobytes(), None if g.values is None else g.values.tobytes(), g.fixed)
+        for d in deltas(folded)
+        for g in d.variables
+    ]
+    steps = [(s.revision, s.strategy, s.chi2, s.rebuilt) for s in folded.steps]
+    first = [o.first_factor for o in folded.outcomes]
+    return plain, reports, columns, steps, first, codes(folded), folded.variables, folded.factors
+
+
+@pytest.mark.parametrize("mode", ["inc-l", "tree"])
+def test_one_insert_comes_to_the_same_either_way(mode: str) -> None:
+    quick, usual = (Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()) for _ in range(2))
+    alone = 0
+    for sequence, batch in enumerate(random_steps(3, steps=25), 1):
+        settle = sequence % 10 == 0
+        folded, in_one_piece = fold_alone(quick, located(batch, sequence, settle))
+        assert told(folded) == told(fold(usual, waiting(batch, sequence=sequence, settle=settle)))
+        alone += in_one_piece
+    assert alone > 10, "where there is room"
+    assert values(quick) == values(usual)
+
+
+def test_a_guilty_insert_is_refused_in_the_same_words_either_way(folder: Folder) -> None:
+    for n in range(1, 20):
+        fold_alone(folder, located(pose(f"x{n}", f"x{n - 1}")))
+    lonely = Batch((Variables("se2", keys_of("x80"), np.zeros((1, 3))),))
+    before = values(folder)
+    for bad in (pose("x1", "x0"), pose("x90", "x77"), lonely, Batch(factors=(edge("x1", "x1"),))):
+        quick, in_one_piece = fold_alone(folder, located(bad))
+        assert not in_one_piece
+        assert told(quick) == told(fold(folder, waiting(bad)))
+        assert quick.outcomes[0].answer.message == fold(folder, waiting(bad)).outcomes[0].answer.message
+    assert values(folder) == before
+    assert fold_alone(folder, located(Batch(factors=(edge("x3", "x5", 2.0),))))[1], "and the next one is taken"
+
+
+def test_several_located_inserts_in_one_step(folder: Folder) -> None:
+    folded = fold(folder, located(pose("x1", "x0")), located(pose("x2", "x0"), 2), located(pose("x2", "x0"), 3))
+    assert codes(folded) == ["accepted", "accepted", "duplicate_variable"]
+
+
+def test_the_size_of_a_map_is_kept_either_way() -> None:
+    small = Folder(make, EPOCH, Limits(variables=2, factors=1))
+    folded = [fold_alone(small, located(batch))[0] for batch in (start(), pose("x1", "x0"), pose("x2", "x0"))]
+    assert [code for result in folded for code in codes(result)] == ["accepted", "accepted", "too_large"]
+
+
+def test_what_does_not_fit_into_one_piece_is_told_in_two(folder: Folder) -> None:
+    folder._out = folder._out[:100]
+    for n in range(1, 6):
+        folded, in_one_piece = fold_alone(folder, located(pose(f"x{n}", f"x{n - 1}")))
+        assert not in_one_piece
+        assert [(d.previous, d.revision) for d in deltas(folded)] == [(n, n + 1)]
+
+
+@pytest.mark.parametrize("fault", ["before try_stage", "after try_stage", "before step", "after step"])
+def test_a_fault_with_a_located_insert_refuses_it_and_keeps_what_was_accepted(fault: str) -> None:
+    folder, failing = with_faults()
+    held = set(values(folder))
+    failing.append(fault)
+    folded, in_one_piece = fold_alone(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    assert (codes(folded), in_one_piece) == (["internal"], False)
+    (delta,) = deltas(folded)
+    assert (delta.previous, delta.revision, folded.steps[0].rebuilt) == (3, 4, True)
+    assert {int(k) for g in delta.variables for k in g.keys} == held == set(values(folder))
+    assert codes(fold_alone(folder, located(pose("x3", "x2"), 2))[0]) == ["accepted"]
+
+
+def test_a_fault_after_the_step_of_a_located_insert_costs_only_a_delta() -> None:
+    folder, failing = with_faults()
+    failing += ["before pick_changed", "before changed"]
+    folded, in_one_piece = fold_alone(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    assert (codes(folded), in_one_piece) == (["accepted"], False)
+    (delta,) = deltas(folded)
+    assert (accepted(folded)[0].revision, delta.previous, delta.revision) == (4, 4, 5)
+    assert {int(k) for g in delta.variables for k in g.keys} == set(values(folder))

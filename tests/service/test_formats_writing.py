@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.formats import FormatError, g2o_text, read, tum_text, write_g2o, write_tum
+from factorbus.formats import FormatError, g2o_text, kitti_text, read, tum_text, write_g2o, write_kitti, write_tum
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-WRITABLE = [name for name in FACTOR_KINDS if name not in ("bearing_range_se2", "prior_point2")]
+UNWRITABLE = ("bearing_range_se2", "prior_point2", "idp_first", "idp_seen", "point_seen")
+WRITABLE = [name for name in FACTOR_KINDS if name not in UNWRITABLE]
+WRITABLE_VARIABLES = {name: kind for name, kind in VARIABLE_KINDS.items() if name != "idp"}
 NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
 
 
@@ -36,7 +38,7 @@ def batches(draw: st.DrawFn) -> Batch:
     """Graphs as `read` gives them: per kind fixed ones first, those with a value before those without."""
     ids = iter(draw(st.permutations(range(40))))
     groups, keys = [], {}
-    for kind, facts in VARIABLE_KINDS.items():
+    for kind, facts in WRITABLE_VARIABLES.items():
         keys[kind] = []
         for fixed, valued in ((True, True), (False, True)):
             mine = [symbol(letter(kind), next(ids)) for _ in range(draw(st.integers(0, 3)))]
@@ -130,6 +132,12 @@ def test_keys_that_share_an_index_are_numbered_anew(tmp_path: Path) -> None:
     assert read(path).batch.variable_count == 3
 
 
+def test_features_of_inverse_depth_have_no_record() -> None:
+    feature = Variables("idp", np.array([symbol("f", 1)]), np.zeros((1, 6)))
+    with pytest.raises(FormatError, match=r"1 variable\(s\) of kind idp"):
+        g2o_text(Batch((feature,)))
+
+
 @pytest.mark.parametrize("kind", ["bearing_range_se2", "prior_point2"])
 def test_what_g2o_has_no_record_for_is_refused_before_writing(tmp_path: Path, kind: str) -> None:
     facts = FACTOR_KINDS[kind]
@@ -166,3 +174,15 @@ def test_tum_of_two_robots_and_of_poses_without_value() -> None:
     assert [line.split()[:2] for line in tum_text(Batch((two, one))).splitlines()] == [["0", "0.0"], ["1", "1.0"]]
     with pytest.raises(FormatError, match="x1 has no value"):
         tum_text(Batch((Variables("se2", np.array([symbol("x", 1)])),)))
+
+
+def test_text_of_kitti(tmp_path: Path) -> None:
+    """The same poses as in TUM form, as matrices; a quarter turn about z takes x to y."""
+    space = Variables("se3", np.array([symbol("x", 12)]), np.array([[1, 2, 3, 0.5, 0.5, 0.5, -0.5]]))
+    batch = Batch((space, *small().variables))
+    rows = np.array([[float(word) for word in line.split()] for line in kitti_text(batch).splitlines()])
+    poses = rows.reshape(-1, 3, 4)
+    np.testing.assert_allclose(poses[1], [[0, -1, 0, 1], [1, 0, 0, 0.5], [0, 0, 1, 0]], atol=1e-15)
+    np.testing.assert_allclose(poses[2], [[0, 1, 0, 1], [0, 0, 1, 2], [1, 0, 0, 3]], atol=1e-15)
+    write_kitti(tmp_path / "a.kitti", batch)
+    assert (tmp_path / "a.kitti").read_text() == kitti_text(batch)

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import parse_symbol
+from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore
-from factorbus.service.events import Answer, Arrived, Drained, Effect, Publish, Refuse
+from factorbus.service.digest import digest_of
+from factorbus.service.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
 from factorbus.service.fold import Folder
 from factorbus.service.host import Host
 from factorbus.service.lane import Lane
@@ -34,6 +37,9 @@ class Told:
         with self._more:
             self.effects += [(effect, threading.current_thread().name) for effect in effects]
             self._more.notify_all()
+
+    def take_both(self, asker: Any, answer: bytes, delta: bytes) -> None:
+        self.take([Answer(asker, answer), Publish("delta", delta)])
 
     def wait_for(self, happened: Callable[[], bool]) -> None:
         with self._more:
@@ -76,7 +82,9 @@ class Setup:
         self.sequence = 0
         core = MapCore("m", "auto", EPOCH, Limits(), 0.0)
         folder = Folder(lambda: self.solver, EPOCH, Limits())
-        self.host = Host(core, folder, self.told.take, self.told.take, lambda reads, taken: None, self.seat)
+        self.host = Host(
+            core, folder, self.told.take, self.told.take, lambda reads, taken: None, self.seat, self.told.take_both
+        )
 
     def arrived(self, content: Batch, settle: bool = False, client: str = "a", size: int = 100) -> Arrived:
         self.sequence += 1
@@ -170,6 +178,85 @@ def test_what_comes_in_during_a_short_run_follows_it_on_the_maps_thread(setup: S
     accepted = [codec.decode_accepted(answer.message) for answer in setup.told.answers()]
     assert [(a.sequence, a.revision, a.folded) for a in accepted] == [(1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 3, 2)]
     check(setup, 3)
+
+
+def located(setup: Setup, content: Batch, asker: str = "") -> Arrived:
+    """The same as it comes over the bus."""
+    setup.sequence += not asker
+    message = codec.encode_insert(Insert(setup.sequence, content))
+    arrived = read_insert(asker or str(setup.sequence), "a", message, REQUEST_LIMITS, setup.now())
+    assert isinstance(arrived, Arrived)
+    assert isinstance(arrived.content, Located)
+    return arrived
+
+
+def test_an_insert_read_where_it_lies_leaves_the_map_as_any_other(setup: Setup) -> None:
+    other = Setup()
+    for n in range(1, 30):
+        for one in (setup, other):
+            one.host.core._slowest_s = 0.0
+        batch = start() if n == 1 else pose(n - 1)
+        if n % 9 == 0:
+            batch = pose(1)  # refused
+        setup.host.insert(located(setup, batch))
+        message = codec.encode_insert(Insert(n, batch))
+        arrived = other.arrived(batch, size=len(message))
+        other.host.insert(arrived._replace(digest=digest_of(message), message=message))
+        for one in (setup, other):
+            one.told.wait_for(lambda one=one: len(said(one)) == one.sequence)
+            one.wait_until_free()
+    told, usual = ([codec.decode_accepted(a.message) for a in one.told.answers()] for one in (setup, other))
+    assert [(a.sequence, a.revision, a.first_factor) for a in told] == [
+        (a.sequence, a.revision, a.first_factor) for a in usual
+    ]
+    assert [type(effect) for effect in said(setup)] == [type(effect) for effect in said(other)]
+    counted = [plain(one.host.core.account(0.0)) for one in (setup, other)]
+    sizes = [row.pop("bytes") for row in counted]
+    assert counted[0] == counted[1]
+    assert sizes[0]["received"] == sizes[1]["received"]
+    assert sizes[0]["answered"] == sum(len(a.message) for a in setup.told.answers())
+    clients = [one.host.core._admission._clients["a"] for one in (setup, other)]
+    assert (clients[0].next, clients[0].open) == (clients[1].next, clients[1].open) == (30, {})
+    assert {n: digest for n, (digest, _) in clients[0].answered.items()} == {
+        n: digest for n, (digest, _) in clients[1].answered.items()
+    }
+    other.host.stop()
+    other.told.wait_for(other.told.has(Drained))
+    other.host.end()
+
+
+def said(setup: Setup) -> list[Effect]:
+    """The answers, good and bad."""
+    return [effect for effect, _ in setup.told.effects if isinstance(effect, Answer | Refuse)]
+
+
+def plain(account: dict[str, Any]) -> dict[str, Any]:
+    """Without times."""
+    return {name: value for name, value in account.items() if not name.endswith(("_s", "_ms"))}
+
+
+def test_who_asks_again_while_it_is_folded_in_gets_the_same_answer(setup: Setup) -> None:
+    setup.until_short()
+    for n in (1, 2):
+        setup.insert(pose(n))
+        setup.host.core._slowest_s = 0.0
+    setup.solver.leave.clear()
+    setup.solver.begun = threading.Semaphore(0)
+    first = located(setup, pose(3))
+    again = [located(setup, pose(3), asker) for asker in ("again", "and again")]
+    bringing = threading.Thread(target=setup.host.insert, args=(first,), name="bringing")
+    bringing.start()
+    assert setup.solver.begun.acquire(timeout=PATIENCE_S)
+    for arrived in again:
+        setup.host.insert(arrived)
+    setup.solver.leave.set()
+    bringing.join(PATIENCE_S)
+    setup.host.insert(located(setup, pose(3), "later"))
+    answers = setup.told.answers()[3:]
+    assert [answer.asker for answer in answers] == [str(setup.sequence), "again", "and again", "later"]
+    assert len({answer.message for answer in answers}) == 1
+    assert setup.told.threads()[-1] == "bringing"
+    check(setup, 4)
 
 
 def test_stopping_during_a_short_run_answers_it_first(setup: Setup) -> None:

@@ -165,7 +165,7 @@ def test_forced_batches_come_when_due_and_the_linear_estimate_in_between(mode: s
 
 def test_modes_by_the_papers_names() -> None:
     assert Solver(Options(mode="inc-l b10")).step().mode == "inc-l-b10"
-    assert Solver(Options(mode="auto")).step().mode == "inc-l"
+    assert Solver(Options(mode="auto")).step().mode == "tree"
     with pytest.raises(errors.UnknownMode, match="inc-l b7"):
         Options(mode="inc-l b7")
     assert CLI_MODES == MODES
@@ -222,7 +222,7 @@ def test_a_backend_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("name", ["intel"])
 def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) -> None:
-    solver = Solver()
+    solver = Solver(Options(mode="inc-l"))
     for batch in read(datasets / f"{name}.g2o").steps():
         solver.stage(batch)
     solver.step()

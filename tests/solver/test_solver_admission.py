@@ -5,9 +5,13 @@ import pickle
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver import Solver, errors
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.blocks import Blocks
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
 
 I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 I2 = np.array([[1.0, 0, 1]])
@@ -31,6 +35,14 @@ def nan_info() -> np.ndarray:
     info = I3.copy()
     info[0, 4] = np.nan
     return info
+
+
+def sight(z: float = 5.0, model: float = 1.0) -> Batch:
+    lens = [model, 400, 400, 320, 240, 0, 0, 0, 0, 0, 0]
+    return Batch(
+        (Variables("point3", np.array([300]), np.array([[0, 0, z]])),),
+        (Factors("point_seen", np.array([[200, 300]]), np.array([[320.0, 240, *lens]]), I2),),
+    )
 
 
 # What every map of these tests holds: pose 0 (fixed), pose 1, landmark 100, and a pose in space 200.
@@ -69,6 +81,10 @@ REFUSED = {
     "range of zero": (
         "bad_range", Batch((), (Factors("bearing_range_se2", np.array([[0, 100]]), np.zeros((1, 2)), I2),)),
     ),
+    "point behind the camera": ("bad_sight", sight(z=-5.0)),
+    "lens of no model": ("bad_lens", sight(model=9.0)),
+    "loss of no kind": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="welsch", scale=np.ones(1)),))),
+    "loss with a scale of zero": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="huber", scale=np.zeros(1)),))),
     "variable without value that nothing reaches": (
         "uninitialised", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
     ),
@@ -100,8 +116,8 @@ REFUSED = {
 }  # fmt: skip
 
 
-def small_map() -> Solver:
-    solver = Solver()
+def small_map(mode: str = "auto") -> Solver:
+    solver = Solver(Options(mode=mode))
     solver.stage(
         Batch(
             (
@@ -123,24 +139,42 @@ def small_map() -> Solver:
 
 def everything(solver: Solver) -> bytes:
     """All there is to see of a solver and of what it keeps, to the bit."""
-    graph, blocks = solver._graph, solver._system.blocks
+    graph = solver._graph
     n, m, v, p, _, scalars = graph.counts.tolist()
     return pickle.dumps(
         [
-            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.var[:n], graph.fac[:m], graph.values[:v])],
-            [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size, blocks.table.nonzero()[0].size],
-            [a.tobytes() for a in (blocks.fill, blocks.rows, blocks.cols, blocks.offsets)],
-            [blocks.data[: blocks.fill[1]].tobytes(), blocks.eta[:scalars].tobytes()],
+            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.values[:v], *rows(solver, n, m))],
+            [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
+            normal_equations(solver._system.blocks, scalars) if solver._tree is None else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
         ]
     )
 
 
+def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
+    """What the graph says of them; in the mode "tree" nobody writes where blocks of Λ are."""
+    var, fac = solver._graph.var[:variables], solver._graph.fac[:factors]
+    return (var, fac) if solver._tree is None else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
+
+
+def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:
+    kept = (blocks.table.nonzero()[0], blocks.fill, blocks.rows, blocks.cols, blocks.offsets)
+    return [a.tobytes() for a in (*kept, blocks.data[: blocks.fill[1]], blocks.eta[:scalars])]
+
+
+def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[bytes]:
+    tree, scratch = tree_of(solver), (tl.N_STAMP, tl.N_LOCAL, tl.N_COLUMN)
+    kept, links = np.delete(tree.node[:variables], scratch, axis=1), tree.link[:factors, [tl.L_OWN, tl.L_I, tl.L_AT]]
+    scalars = tree.scalars[:2, : solver._graph.counts[at.SCALARS]]
+    return [a.tobytes() for a in (kept, links, tree.lin[0, :values], scalars, tree.lever[:variables])]
+
+
 @pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled
+@pytest.mark.parametrize("mode", ["inc-l", "tree"])
 @pytest.mark.parametrize("name", REFUSED)
-def test_bad_batches_are_refused_whole(name: str) -> None:
+def test_bad_batches_are_refused_whole(name: str, mode: str) -> None:
     code, bad = REFUSED[name]
-    solver = small_map()
+    solver = small_map(mode)
     before = everything(solver)
     good = Batch((poses(50),), (edge(1, 50),))
     mixed = Batch(good.variables + bad.variables, good.factors + bad.factors)

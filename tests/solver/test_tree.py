@@ -1,5 +1,6 @@
 """The tree of cliques keeps R, d and δ of its linearisation points, whatever was affected, split or moved."""
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -15,13 +16,14 @@ from naive.tree_records import assert_is_a_tree, tree_of
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_batch
+from factorbus.solver.blocks import Blocks
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 EXACT = {"mode": "tree", "ripple": 0.0}
 # Whole cliques only, as the default, and every clique at every place.
-SPLITS = {"never": (10**9, 1.0), "default": (48, 0.5), "always": (0, 1.0)}
+SPLITS = {"never": (10**9, 1.0), "default": (24, 0.5), "always": (0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Whole:
 
 
 def linearised(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
-    """A dense graph at the linearisation points, and δ."""
+    """A dense graph at the linearisation points, which shares no code with the solver, and δ."""
     tree, graph, dense = tree_of(solver), solver._graph, DenseGraph()
     variables, factors = solver.graph()
     dense.add(Whole(variables, factors))
@@ -51,18 +53,39 @@ def linearised(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
 
 
 def assert_solves(solver: Solver) -> None:
-    """δ is the dense solution at the linearisation points, and the account has its χ²."""
+    """δ is the solution of the dense normal equations at the linearisation points, and the account has its χ²."""
     assert_is_a_tree(solver)
-    dense, delta = linearised(solver)
-    information, eta = dense.system()
+    information, eta, chi2, delta = normal_equations(solver)
+    assert_is_solution(solver, information, eta, chi2, delta, least=1e-9)
+
+
+def assert_is_solution(
+    solver: Solver, information: np.ndarray, eta: np.ndarray, chi2: float, delta: np.ndarray, least: float
+) -> None:
     if delta.size:
         scale = np.sqrt(np.diag(information))
-        right = np.linalg.solve(information / scale / scale[:, None], eta / scale)
-        tell = max(2e-8, 1e-15 * np.linalg.cond(information / scale / scale[:, None]))
+        unit = information / scale / scale[:, None]
+        right = np.linalg.solve(unit, eta / scale)
+        tell = max(least, 1e-15 * np.linalg.cond(unit))
         np.testing.assert_allclose(delta * scale, right, rtol=0, atol=tell * max(np.abs(right).max(), 1.0))
-    chi2 = dense.chi2()
     model = chi2 - (delta @ eta if delta.size else 0.0)
     assert tree_of(solver).account[tl.A_CHI2] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
+
+
+def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Λ, η and χ² of all factors at the linearisation points, by the kernels of the other modes; and δ."""
+    graph = copy.copy(solver._graph)
+    graph.fac, graph.values = graph.fac.copy(), tree_of(solver).lin[0].copy()
+    blocks, scalars = Blocks(), int(graph.counts[at.SCALARS])
+    chi2 = blocks.extend(graph, (0,) * at.COUNTS)
+    dims = graph.dims[: graph.counts[at.COLUMNS]]
+    first = np.concatenate([[0], np.cumsum(dims)])
+    information = np.zeros((scalars, scalars))
+    for row, col, offset in zip(blocks.rows, blocks.cols, blocks.offsets, strict=True):
+        r, c = (slice(first[k], first[k + 1]) for k in (row, col))
+        information[r, c] = blocks.data[offset : offset + dims[row] * dims[col]].reshape(dims[row], dims[col])
+        information[c, r] = information[r, c].T
+    return information, blocks.eta[:scalars], chi2, tree_of(solver).scalars[0, :scalars]
 
 
 def follow(steps: Iterable[Batch], **options) -> Solver:
@@ -80,6 +103,9 @@ def test_delta_is_the_dense_solution_in_maps_of_all_kinds(seed: int, split: str)
     pivots, share = SPLITS[split]
     solver = follow(random_steps(seed, steps=12), split_pivots=pivots, split_share=share, look_every=1)
     assert solver.factor_count > 60
+    dense, delta = linearised(solver)
+    information, eta = dense.system()
+    assert_is_solution(solver, information, eta, dense.chi2(), delta, least=2e-8)
 
 
 @st.composite
@@ -116,7 +142,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
     return steps
 
 
-@settings(max_examples=40)
+@settings(max_examples=150)
 @given(steps=drives(), split=st.sampled_from(sorted(SPLITS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
 def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], split: str, bent: float) -> None:
     pivots, share = SPLITS[split]
@@ -187,7 +213,9 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world) -> None:
         if n % 50 == 49:
             best = solve_batch(*solver.graph()).chi2
             ratios.append(solver.chi2() / best if best > 1e-3 else 1.0)
-            assert report.chi2 == pytest.approx(solver.chi2(), rel=0.02, abs=1e-3)
+            assert report.chi2 == pytest.approx(
+                solver.chi2(), rel=0.15, abs=1e-3
+            )  # the linear problem's, between two looks
     assert np.median(ratios) < 1.001
     assert max(ratios) < 1.02
 

@@ -80,7 +80,7 @@ def endpoint(spawn: Spawn, tmp_path: Path) -> str:
     return service.ready()[0]
 
 
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(60 + 15 * FAULTS)
 def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str) -> None:
     chance = Random(7)
     print("seed 7")

@@ -12,11 +12,12 @@ from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
 BENCHES = ("cholesky", "bus", "idp")  # what `all` runs, a minute or two
-LONG = ("paper", "peers")  # hours; on request
+LONG = ("paper", "peers", "fuzz")  # hours (fuzz: half an hour); on request
+ASKED = ("ask",)  # a minute or two, most of it GTSAM's; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("name", type=click.Choice([*BENCHES, *LONG, "all"]), default="all")
+@click.argument("name", type=click.Choice([*BENCHES, *ASKED, *LONG, "all"]), default="all")
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
 @json_option
 def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
@@ -27,10 +28,13 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
     idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
                --figures FOLDER, --no-workers
+    ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
+               of 10,000 candidates; --quick
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
+    fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
     all        cholesky, bus and idp
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
@@ -67,7 +71,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
 def _folder() -> Path:
     """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
     folder = Path(__file__).resolve().parents[3] / "tests" / "bench"
-    if not all((folder / f"{name}.py").is_file() for name in (*BENCHES, *LONG)):
+    if not all((folder / f"{name}.py").is_file() for name in (*BENCHES, *ASKED, *LONG)):
         raise Stopped(
             "no_repository",
             "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.cli.exits import Stopped, lacking
+from factorbus.cli.exits import EXTRAS, Stopped, lacking
 from factorbus.cli.options import DEFAULT_ENDPOINT
 from factorbus.cli.version import LIBRARIES, installed
 from factorbus.proto.problems import Problem
@@ -168,8 +168,49 @@ def machine() -> Finding:
     return Finding("machine", "ok", seen)
 
 
+def wall_clock() -> Finding:
+    """whether the wall clock is kept right"""
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "adjtimex"):
+        return Finding("wall clock", "ok", "not looked at: this system does not say how it is kept")
+    state = libc.adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: only asks
+    if state == _UNSYNCHRONISED:
+        mend = "stamps of several machines will not line up: start chrony, or systemd-timesyncd"
+        return Finding("wall clock", "warn", "nobody keeps it right (no NTP)", mend)
+    if state < 0:
+        return Finding("wall clock", "ok", "not looked at: not allowed here")
+    return Finding("wall clock", "ok", "kept right by NTP or the host")
+
+
+def extras() -> Finding:
+    """the extras for looking at maps"""
+    missing = [name for name in EXTRAS if name not in ("service", "viz") and lacking(name)]
+    have = [name for name in EXTRAS if name not in missing]
+    seen = f"{', '.join(have) or 'none'} installed" + (f"; without {', '.join(missing)}" if missing else "")
+    mend = f"if wanted: pip install 'factorbus[{','.join(missing)}]'" if missing else ""
+    return Finding("extras", "ok", seen, mend)
+
+
+def permissions() -> Finding:
+    """what this user may do"""
+    for what, folder in (("the temporary folder", Path(tempfile.gettempdir())), ("this folder", Path.cwd())):
+        if not os.access(folder, os.W_OK | os.X_OK):
+            mend = (
+                "set TMPDIR to one that is" if what != "this folder" else "pictures and recordings need --out elsewhere"
+            )
+            return Finding("permissions", "warn", f"{what}, {folder}, is not writable", mend)
+    if Path("/proc/self").is_dir() and not os.access("/proc/self/fd", os.R_OK | os.X_OK):
+        mend = "features go over the bus instead of through memory; mount /proc without hidepid for this user"
+        return Finding("permissions", "warn", "/proc/self/fd cannot be read", mend)
+    user = os.getuid() if hasattr(os, "getuid") else "?"
+    return Finding("permissions", "ok", f"user {user} may write to {tempfile.gettempdir()} and {Path.cwd()}")
+
+
+# Larger than `struct timex` on every Linux; its first field, modes, is zero.
+_TIMEX_BYTES, _UNSYNCHRONISED = 512, 5
+
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    python, libraries, cholmod, cache, machine, clock, shared_memory, port, bus,
+    python, libraries, extras, cholmod, cache, machine, clock, wall_clock, shared_memory, permissions, port, bus,
 )  # fmt: skip
 
 

@@ -7,18 +7,18 @@ import numpy as np
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Factors, Variables
 
-_POSITION = {"se2": 2, "se3": 3, "point2": 2, "point3": 3}
+_POSITION = {"se2": 2, "se3": 3, "point2": 2, "point3": 3}  # an idp's first three numbers are a camera's
 
 
 def merged(batches: Iterable[Batch]) -> Batch:
-    """All of `batches` as one: a group for each kind of factor, and of variable as far as fixed and valued agree."""
+    """All of `batches` as one: a group for each kind and loss of factors; of variables, kind, fixed and valued."""
     variables: dict[tuple[str, bool, bool], list[Variables]] = {}
-    factors: dict[str, list[Factors]] = {}
+    factors: dict[tuple[str, str], list[Factors]] = {}
     for batch in batches:
         for group in batch.variables:
             variables.setdefault((group.kind, group.fixed, group.values is None), []).append(group)
         for group in batch.factors:
-            factors.setdefault(group.kind, []).append(group)
+            factors.setdefault((group.kind, group.loss), []).append(group)
     return Batch(
         tuple(_variables(kind, fixed, groups) for (kind, fixed, _), groups in variables.items()),
         tuple(
@@ -27,8 +27,10 @@ def merged(batches: Iterable[Batch]) -> Batch:
                 np.concatenate([group.keys for group in groups]),
                 np.concatenate([group.measured for group in groups]),
                 np.concatenate([group.information for group in groups]),
+                loss,
+                np.concatenate([_scale(group) for group in groups]) if loss else None,
             )
-            for kind, groups in factors.items()
+            for (kind, loss), groups in factors.items()
         ),
     )
 
@@ -57,6 +59,12 @@ def _values(group: Variables) -> F64:
     if group.values is None:
         raise ValueError(f"variables of kind {group.kind} have no values")
     return group.values
+
+
+def _scale(group: Factors) -> F64:
+    if group.scale is None:
+        raise ValueError(f"factors of kind {group.kind} with the loss {group.loss} have no scale")
+    return group.scale
 
 
 def _variables(kind: str, fixed: bool, groups: list[Variables]) -> Variables:

@@ -24,6 +24,8 @@ class Request:
     seed: int
     workers: int
     plot: Path
+    tum: Path | None = None
+    truth: Path | None = None
 
 
 class _Demos(click.Group):
@@ -44,6 +46,8 @@ class _Demos(click.Group):
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
 @click.option("--workers", type=click.IntRange(0, 64), default=2, show_default=True, metavar="N")
 @out_option("--plot", "plot", "The picture.  [default: out/demo.png]", "FILE.png")
+@out_option("--tum", "tum", "Write the estimated trajectory in TUM form.", "FILE")
+@out_option("--truth", "truth", "Write where the robot really was, in TUM form.", "FILE")
 @json_option
 @click.pass_context
 def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) -> None:
@@ -57,6 +61,7 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
     factorbus demo
     factorbus demo --world sphere --poses 1000 --plot sphere.png
     factorbus demo --json
+    factorbus demo --tum demo.tum --truth truth.tum; evo_ape tum truth.tum demo.tum
     factorbus demo monocular                    a camera, and rays that become points
     """
     if ctx.invoked_subcommand:
@@ -124,10 +129,21 @@ def demo(request: Request) -> dict[str, Any]:
         "processes": processes,
         "plot": str(request.plot),
     }
+    _write(request, estimate, world.truth)
     subtitle = f"{result['poses']:,} poses, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
     course = course_of(reports, compared)
     draw(request.plot, world.batches, estimate, course, f"{request.world}, as the bus saw it", subtitle, world.truth)
     return result
+
+
+def _write(request: Request, estimate: Any, truth: Any) -> None:
+    """The trajectories that were asked for."""
+    from factorbus.formats import write_tum
+    from factorbus.proto.messages import Batch
+
+    for path, variables in ((request.tum, estimate), (request.truth, truth)):
+        if path:
+            write_tum(path, Batch(tuple(variables)))
 
 
 def _look_on(request: Request, solver: Any, robot: Any, viewer: Any) -> None:

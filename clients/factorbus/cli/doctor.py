@@ -6,20 +6,24 @@ import click
 
 from factorbus.cli import screen
 from factorbus.cli.exits import FAILED, OK
-from factorbus.cli.options import json_option
+from factorbus.cli.options import json_option, zenoh_option
 
 _SIGNS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[red]FAIL[/]"}
 
 
 @click.command()
+@click.option("--connect", "endpoint", metavar="ENDPOINT", help="Look at the services there as well.")
+@zenoh_option
 @json_option
-def command(as_json: bool) -> int:
-    """Look at versions, SuiteSparse and its BLAS, caches, ports, the bus, shared memory and the clock.
+def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
+    """Look at versions, extras, SuiteSparse and its BLAS, caches, clocks, shared memory, permissions, ports, bus.
 
-    A warning is something that works but could be better; with a failure the exit code is 1.
+    With --connect also at the services there: are they alive, is there memory left, do versions fit, who is told to
+    wait. A warning is something that works but could be better; with a failure the exit code is 1.
 
     \b
     factorbus doctor
+    factorbus doctor --connect tls/solver.local:7447 --zenoh operator1.json5
     factorbus doctor --json
     """
     from factorbus.cli.checks import CHECKS
@@ -28,6 +32,11 @@ def command(as_json: bool) -> int:
     for look in CHECKS:
         screen.note(f"looking at {look.__doc__}")
         findings.append(look())
+    if endpoint:
+        from factorbus.cli.service_checks import services
+
+        screen.note(f"looking at the services at {endpoint}")
+        findings += services(endpoint, zenoh)
     failed = sum(finding.state == "fail" for finding in findings)
     if as_json:
         screen.document({"healthy": not failed, "checks": [asdict(finding) for finding in findings]})

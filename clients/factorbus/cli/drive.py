@@ -58,6 +58,10 @@ class Target(Protocol):
         """Iterate until converged."""
         ...
 
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate; a report has that of the linear problem."""
+        ...
+
     def compare(self) -> None:
         """Have the present χ² held against the batch optimum; the result is in `compared` sooner or later."""
         ...

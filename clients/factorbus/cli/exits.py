@@ -23,9 +23,15 @@ EXIT_CODES = {
 }
 
 # What the extras of pyproject.toml bring, by import name.
-EXTRAS = {"service": ("numba", "scipy", "sksparse"), "viz": ("matplotlib",)}
+EXTRAS = {
+    "service": ("numba", "scipy", "sksparse"),
+    "viz": ("matplotlib",),
+    "watch": ("rerun",),
+    "record": ("foxglove",),
+    "gateway": ("starlette", "uvicorn", "websockets"),
+}
 
-_USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option")
+_USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_setting", "exposed")
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down")
 
 

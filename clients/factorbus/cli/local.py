@@ -32,6 +32,10 @@ class LocalMap:
         """Iterate until converged."""
         return self._step(time.thread_time(), settle=True)
 
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate."""
+        return self._solver.chi2()
+
     def compare(self) -> None:
         """Solve the same graph from scratch, here and now: the drive waits."""
         start = time.perf_counter()
@@ -50,7 +54,10 @@ class LocalMap:
     def graph(self) -> Batch:
         """A copy of all variables and factors."""
         variables, factors = self._solver.graph()
-        return Batch(_variables(variables), tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in factors))
+        return Batch(
+            _variables(variables),
+            tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in factors),
+        )
 
     def account(self) -> dict[str, Any]:
         """CPU seconds of this thread in the solver, seconds of compiling."""
@@ -65,7 +72,7 @@ class LocalMap:
 
 def chi2_unsolved(batches: Iterable[Batch]) -> float:
     """χ² of the whole graph with every variable as composed from the first factor that reaches it."""
-    solver = Solver(Options(max_iterations=0))
+    solver = Solver(Options(mode="inc-l", max_iterations=0))
     for batch in batches:
         solver.stage(batch)
     return solver.step().chi2

@@ -24,6 +24,17 @@ class ModeChoice(click.Choice):
         return super().convert(str(value).replace(" ", "-"), param, ctx)
 
 
+def zenoh_option(command: F) -> F:
+    """--zenoh."""
+    return click.option(
+        "--zenoh",
+        default="",
+        envvar="ZENOH_CONFIG",
+        metavar="FILE.json5",
+        help="Zenoh configuration with our certificate or password.  [env: ZENOH_CONFIG]",
+    )(command)
+
+
 def json_option(command: F) -> F:
     """--json."""
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")(command)

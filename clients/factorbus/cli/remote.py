@@ -53,6 +53,10 @@ class RemoteMap:
         self.wait_for(accepted.revision)
         return _stepped(accepted, time.perf_counter() - start)
 
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate."""
+        return self._map.ask.chi2(batch=False, timeout_s=_ANSWER_S).result(_ANSWER_S).chi2
+
     def compare(self) -> None:
         """Ask for the batch optimum of the present revision; a worker finds it while the drive goes on."""
         self._comparisons.append(self._map.ask.chi2(batch=True, timeout_s=_ANSWER_S))

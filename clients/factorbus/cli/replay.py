@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option
+from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option, zenoh_option
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +27,11 @@ class Request:
     use_values: bool
     settle: bool
     tum: Path | None
+    kitti: Path | None
     out: Path | None
     plot: Path | None
+    client: str = "replay"
+    zenoh: str = ""
 
     @property
     def where(self) -> str:
@@ -42,6 +45,10 @@ class Request:
 @file_argument("file")
 @click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
 @click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
+@zenoh_option
+@click.option(
+    "--client", default="replay", show_default=True, metavar="NAME", help="Who we are, where access control asks."
+)
 @click.option(
     "--wait",
     "wait_s",
@@ -64,6 +71,7 @@ class Request:
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
 @click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
+@out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @json_option
@@ -116,7 +124,7 @@ def replay(request: Request) -> dict[str, Any]:
         before = target.account()
         with screen.progress(request.file.name, graph.poses) as show:
             driven = drive(target, steps, request.every, show)
-        unsettled = driven.steps[-1].report["chi2"]
+        unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
         compared = target.compared()
         after = target.account()
@@ -129,7 +137,7 @@ def replay(request: Request) -> dict[str, Any]:
         "where": request.where,
         **measured,
         "revision": last.revision,
-        "chi2": last.report["chi2"],
+        "chi2": last.report["chi2"] if request.settle else unsettled,
         "chi2_unsettled": unsettled,
         "chi2_initial": _chi2_initial(steps),
         "settled": bool(request.settle and last.report["converged"]),
@@ -165,7 +173,9 @@ def _target(request: Request) -> Iterator[Any]:
             note(f"solver process {solver.pid} on {endpoint}")
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
-        bus = stack.enter_context(connect(endpoint, client="replay", timeout_s=request.wait_s))
+        bus = stack.enter_context(
+            connect(endpoint, client=request.client, zenoh=request.zenoh, timeout_s=request.wait_s)
+        )
         if solver is not None:
             solver.when_ended(bus.close)
         joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))
@@ -183,13 +193,15 @@ def _target(request: Request) -> Iterator[Any]:
 
 
 def _write(request: Request, target: Any) -> None:
-    from factorbus.formats import write_g2o, write_tum
+    from factorbus.formats import write_g2o, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
     if request.out:
         write_g2o(request.out, target.graph())
     if request.tum:
         write_tum(request.tum, Batch(target.estimate()))
+    if request.kitti:
+        write_kitti(request.kitti, Batch(target.estimate()))
 
 
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:

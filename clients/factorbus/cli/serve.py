@@ -1,7 +1,5 @@
 """`factorbus serve`: own maps and answer on the bus until stopped."""
 
-import logging
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +7,8 @@ import click
 
 from factorbus.cli.children import READY
 from factorbus.cli.exits import input_file, require
+from factorbus.cli.logs import begin, log_option
+from factorbus.cli.notify import Notifier
 from factorbus.cli.options import DEFAULT_ENDPOINT
 
 
@@ -26,25 +26,53 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
 @click.option(
     "--config", type=click.Path(path_type=Path), metavar="FILE.toml", help="Settings; what is given here wins."
 )
+@click.option("--zenoh", metavar="FILE.json5", help="Zenoh configuration: TLS, users, access control (deploy/zenoh).")
+@click.option(
+    "--insecure",
+    is_flag=True,
+    default=None,
+    help="Listen to other machines even where whoever reaches the port could read and write.",
+)
+@click.option("--journal", metavar="DIR", help="Keep maps in this folder, across restarts and crashes.")
+@click.option(
+    "--durability",
+    type=click.Choice(("none", "group", "commit")),
+    help="With a journal: what an answer promises (see below).  [default: commit]",
+)
+@click.option("--standby", is_flag=True, default=None, help="Wait until the journal's owner is gone, and take over.")
 @click.option("--name", metavar="NAME", help="Of this service, as the bus sees it.  [default: made up]")
 @click.option("--warm/--no-warm", default=None, help="Compile every kernel before the first insert.  [default: warm]")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+@click.option(
+    "--metrics", metavar="HOST:PORT", help="Serve /metrics for Prometheus, /live and /ready over HTTP; to anybody."
+)
+@log_option
 @click.option("--quiet", is_flag=True, help="Log warnings only.")
-def command(config: Path | None, until_eof: bool, quiet: bool, **given: Any) -> None:
+def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **given: Any) -> None:
     """Own maps, take inserts, answer questions. Runs until Ctrl-C or SIGTERM, and finishes all it has accepted.
 
     Prints `ready ENDPOINT ...` when clients can connect. The log goes to standard error. On a cold start the kernels
-    are compiled first, which takes a while and is said; `factorbus warm` does it ahead.
+    are compiled first, which takes a while and is said; `factorbus warm` does it ahead. It does not listen beyond this
+    machine without encryption, identities and access control; `factorbus access` writes them down.
 
     \b
     factorbus serve
-    factorbus serve --listen tcp/0.0.0.0:7447 --map warehouse
+    factorbus serve --listen tls/0.0.0.0:7447 --zenoh service.json5 --map warehouse
+    factorbus serve --journal /var/lib/factorbus
     factorbus serve --config /etc/factorbus/serve.toml
 
     \b
+    With --journal, when an insert is answered:
+      commit   the disk has it: it survives a power cut, as far as the disk keeps its word
+      group    it is written within 50 ms; a crash may cost what was answered in that time, and begins a new epoch
+      none     it is written now and then, with no promise but for an orderly stop
+
+    \b
     A configuration file has the names of these options and more, for example:
-      listen = ["tcp/0.0.0.0:7447"]
+      listen = ["tls/0.0.0.0:7447"]
+      metrics = "127.0.0.1:9464"
       create = ["warehouse"]
+      journal = "/var/lib/factorbus"
       zenoh = "/etc/factorbus/zenoh.json5"     # TLS, users, access control
       [limits]
       waiting = 1024
@@ -53,10 +81,15 @@ def command(config: Path | None, until_eof: bool, quiet: bool, **given: Any) -> 
     from factorbus.cli.stopping import stop_on_signals
     from factorbus.service.app import serve
 
-    level = logging.WARNING if quiet else logging.INFO
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)-7s %(message)s")
-    with stop_on_signals(until_eof) as stop:
-        serve(_settings(config, given), lambda endpoints: click.echo(READY + " ".join(endpoints)), stop)
+    begin(log_form, quiet)
+    manager = Notifier()
+
+    def on_ready(endpoints: list[str]) -> None:
+        click.echo(READY + " ".join(endpoints))
+        manager.ready(f"listening on {' '.join(endpoints)}")
+
+    with stop_on_signals(until_eof, manager.stopping) as stop:
+        serve(_settings(config, given), on_ready, stop, lambda health: manager.alive(health.stuck()))
 
 
 def _settings(path: Path | None, given: dict[str, Any]) -> Any:

@@ -4,21 +4,25 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from factorbus.cli.exits import INTERRUPTED
 
 
 @contextmanager
-def stop_on_signals(until_eof: bool) -> Iterator[threading.Event]:
-    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set.  The second signal is final."""
+def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set.  The second signal is final.
+
+    on_stop: called at the first signal.
+    """
     stop = threading.Event()
 
     def on_signal(number: int, _frame: object) -> None:
         if stop.is_set():
             os._exit(INTERRUPTED)
         stop.set()
+        on_stop()
 
     before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
     if until_eof:

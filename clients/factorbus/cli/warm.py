@@ -8,7 +8,7 @@ from factorbus.cli.screen import note
 
 @click.command()
 def command() -> None:
-    """Compile the kernels of solver and workers into the cache, and say how long it took.
+    """Compile the kernels of solver, service and workers into the cache, and say how long it took.
 
     Do it once after installing or upgrading, on each machine that runs `factorbus serve` or `factorbus work`.
     A second time it only loads them.
@@ -17,8 +17,8 @@ def command() -> None:
     factorbus warm
     """
     require("service", "factorbus warm")
-    from factorbus.idp import warm as warm_idp
-    from factorbus.solver import compiled_seconds, warm
+    from factorbus.service.warm import warm
+    from factorbus.solver import compiled_seconds
 
-    seconds = sum(make(lambda group: note(f"  {group}")) for make in (warm, warm_idp))
+    seconds = warm(lambda group: note(f"  {group}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")

@@ -1,13 +1,13 @@
 """`factorbus work`: join the bus as a worker."""
 
-import logging
-import sys
 from typing import Any
 
 import click
 
 from factorbus.cli.children import READY
 from factorbus.cli.exits import require
+from factorbus.cli.logs import begin, log_option
+from factorbus.cli.notify import Notifier
 from factorbus.cli.options import DEFAULT_ENDPOINT
 
 
@@ -20,8 +20,9 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
 @click.option("--zenoh", default="", metavar="FILE.json5", help="Zenoh configuration: TLS, access control.")
 @click.option("--warm/--no-warm", default=True, help="Compile every kernel before the first job.  [default: warm]")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+@log_option
 @click.option("--quiet", is_flag=True, help="Log warnings only.")
-def command(until_eof: bool, quiet: bool, connect: tuple[str, ...], **given: Any) -> None:
+def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...], **given: Any) -> None:
     """Take jobs from services until Ctrl-C or SIGTERM; those begun are finished. Waits for a service not yet there.
 
     Prints `ready NAME` when it takes jobs. A job is for example the batch optimum of a map, found from scratch while
@@ -37,8 +38,13 @@ def command(until_eof: bool, quiet: bool, connect: tuple[str, ...], **given: Any
     from factorbus.workers.app import work
     from factorbus.workers.config import Config
 
-    level = logging.WARNING if quiet else logging.INFO
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)-7s %(message)s")
+    begin(log_form, quiet)
+    manager = Notifier()
+
+    def on_ready(name: str) -> None:
+        click.echo(READY + name)
+        manager.ready(f"worker {name} takes jobs")
+
     config = Config(connect=connect or (DEFAULT_ENDPOINT,), **given)
-    with stop_on_signals(until_eof) as stop:
-        work(config, lambda name: click.echo(READY + name), stop)
+    with stop_on_signals(until_eof, manager.stopping) as stop:
+        work(config, on_ready, stop)

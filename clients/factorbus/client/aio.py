@@ -12,11 +12,13 @@ are rare, and putting large covariances together borrow a thread of the loop's e
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from os import PathLike
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
+from factorbus.client.aio_uncertainty import Doubt
 from factorbus.client.draft import Draft, Key
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
@@ -36,9 +38,12 @@ async def connect(
     client: str = "client",
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
+    zenoh: str | PathLike[str] = "",
 ) -> AsyncIterator["Bus"]:
     """As `factorbus.client.connect`, in `async with`."""
-    bus = await asyncio.to_thread(sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings)
+    bus = await asyncio.to_thread(
+        sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings, zenoh=zenoh
+    )
     try:
         yield Bus(bus)
     finally:
@@ -74,8 +79,12 @@ class Bus:
             front.close()
 
     async def maps(self) -> list[MapRow]:
-        """The maps of the service.  Raises Refused, Unavailable."""
+        """The maps there are.  Raises Refused, Unavailable."""
         return await asyncio.to_thread(self._bus.maps)
+
+    async def stats(self) -> list[dict[str, Any]]:
+        """What each service counts and times.  Raises Refused, Unavailable."""
+        return await asyncio.to_thread(self._bus.stats)
 
     async def create(self, name: str, mode: str = "auto") -> MapRow:
         """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""
@@ -109,6 +118,7 @@ class Map:
         self._map = joined
         self._room = asyncio.Semaphore(window)
         self._loop = asyncio.get_running_loop()
+        self.doubt = Doubt(joined.doubt.ask)
 
     @property
     def name(self) -> str:
@@ -125,19 +135,26 @@ class Map:
         """The live estimate; reading it never waits.  Raises Unavailable for a map opened with mirror=False."""
         return self._map.estimate
 
-    async def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+    async def insert(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Accepted:
         """Add `batch` to the map and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
-        return await self.result(await self.send(batch, settle=settle), timeout_s)
+        return await self.result(await self.send(batch, settle=settle, points_below=points_below), timeout_s)
 
     async def settle(self, timeout_s: float | None = None) -> Accepted:
         """Have the map iterate until it has converged.  Raises Refused, NoAnswerYet."""
         return await self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
-    async def send(self, batch: Batch | Draft, *, settle: bool = False) -> Ticket:
+    async def send(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> Ticket:
         """Send `batch`; waits only while the window is full."""
         await self._room.acquire()
         try:
-            ticket = self._map.send(batch, settle=settle)
+            ticket = self._map.send(batch, settle=settle, points_below=points_below)
         except BaseException:
             self._room.release()
             raise

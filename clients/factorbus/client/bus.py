@@ -1,17 +1,19 @@
 """A connection to the bus, and the maps on it."""
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from typing import Any
 
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.features import Features
+from factorbus.client.gathering import gather
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import Map, MapRow
 from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.problems import UnknownMap
+from factorbus.proto.problems import Refused, UnknownMap
 
 
 def connect(
@@ -20,17 +22,18 @@ def connect(
     client: str = "client",
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
+    zenoh: str | PathLike[str] = "",
 ) -> "Bus":
     """Connect to a service or router, trying again until `timeout_s` has passed.
 
     endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
     the service's lists.  timeout_s: also the default for everything done over this connection.
-    settings: further zenoh configuration, path to value.
+    zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
     Raises Unavailable, BadEndpoint, BadName, BadSetting.
     """
     keys.checked_name("client", f"{client}-00000000")
     endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
-    return Bus(open_link(endpoints, timeout_s, settings or {}), client, timeout_s)
+    return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh)), client, timeout_s)
 
 
 class Bus:
@@ -96,8 +99,17 @@ class Bus:
         return made
 
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
-        """The maps of the service.  Raises Refused, Unavailable."""
-        return self._admin("maps", {}, _rows, timeout_s)
+        """The maps there are: of the service, or at a router of all services.  Raises Refused, Unavailable."""
+        told = gather(self._link, "maps", self.timeout_s if timeout_s is None else timeout_s)
+        return [row for each in told for row in _rows(each)]
+
+    def stats(self, timeout_s: float | None = None) -> list[dict[str, Any]]:
+        """What the service counts and times of itself and its maps; at a router a row for each service.
+
+        Raises Refused, Unavailable.
+        """
+        told = gather(self._link, "stats", self.timeout_s if timeout_s is None else timeout_s)
+        return [codec.decode_map(each) for each in told]
 
     def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
         """Create map `name`, or find it as it is if its mode is the same.  Raises Refused, Unavailable, BadName."""
@@ -115,10 +127,13 @@ class Bus:
         self._link.close()
 
     def _existing(self, name: str) -> MapRow:
-        for row in self.maps():
-            if row.name == name:
-                return row
-        raise UnknownMap(name)
+        """As the map tells of itself: who may only ask a map need not be allowed to list all of them."""
+        what = f"map {name!r}, asked for its stats,"
+        asked = Errand(what, keys.ask_key(name, "stats"), codec.encode_map({}), _row, self.timeout_s)
+        try:
+            return self._courier.carry(asked).future.result()
+        except Refused as refused:
+            raise (UnknownMap(name) if refused.code == UnknownMap.code else refused) from None
 
     def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
         timeout_s = self.timeout_s if timeout_s is None else timeout_s

@@ -9,9 +9,10 @@ from typing import TypeAlias, TypedDict, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
+from factorbus.proto.camera import Camera
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadInformation, BadShape, UnknownKind
+from factorbus.proto.problems import BadInformation, BadLoss, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol, parse_symbol
 
 Key: TypeAlias = str | int
@@ -28,10 +29,13 @@ class Certainty(TypedDict, total=False):
     information: the inverse covariance, a symmetric (r, r) matrix or its upper triangle (r(r+1)/2,) row by row.
     The rotation part of an se3 residual is the vector part of a quaternion, so half an angle: for a standard
     deviation of s radians say s/2.
+    loss: what it counts where it is far off, ("huber", 1.345) say: one of `factorbus.proto.kinds.LOSSES` and its scale,
+    standard deviations.
     """
 
     sigmas: ArrayLike
     information: ArrayLike
+    loss: tuple[str, float] | None
 
 
 class Draft:
@@ -39,12 +43,13 @@ class Draft:
 
     A key is "x12" or an int64.  A variable without a value gets one from the first factor of the same insert that
     reaches it.  fixed: the variable is held where it is (a map's first pose, say).
-    Every factor needs a certainty: sigmas= or information=.  Raises BadSymbol, BadShape, BadInformation, UnknownKind.
+    Every factor needs a certainty: sigmas= or information=.  Raises BadSymbol, BadShape, BadInformation, BadLoss,
+    UnknownKind.
     """
 
     def __init__(self) -> None:
         self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row]]] = {}
-        self._factors: dict[str, tuple[list[list[int]], list[_Row], list[_Row]]] = {}
+        self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
 
     def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
         """A pose in the plane: x y (metres), theta (radians)."""
@@ -61,6 +66,10 @@ class Draft:
     def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
         """A point in space: x y z (metres)."""
         return self.variable("point3", key, value, fixed=fixed)
+
+    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+        """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
+        return self.variable("idp", key, value, fixed=fixed)
 
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
@@ -128,6 +137,39 @@ class Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
 
+    def idp_first(
+        self,
+        pose: Key,
+        feature: Key,
+        camera: Camera,
+        pixel: ArrayLike,
+        rho: float,
+        *,
+        sigma_rho: float,
+        sigma_pixel: float = 1.0,
+        sigma_anchor: float = 1e-4,
+        loss: tuple[str, float] | None = None,
+    ) -> "Draft":
+        """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
+
+        sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
+        """
+        measured = [*_row("pixel", pixel, 2), rho, *camera.lens()]
+        sigmas = [sigma_anchor] * 3 + [sigma_pixel] * 2 + [sigma_rho]
+        return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=loss)
+
+    def idp_seen(
+        self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
+    ) -> "Draft":
+        """An idp seen again by the pose's camera: u v (pixels)."""
+        return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
+
+    def point_seen(
+        self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
+    ) -> "Draft":
+        """A point3 seen by the pose's camera: u v (pixels)."""
+        return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
+
     def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
@@ -153,8 +195,10 @@ class Draft:
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
-        triangle = _triangle(where, of, **certainty)
-        all_keys, all_measured, all_triangles = self._factors.setdefault(kind, ([], [], []))
+        name, scale = _loss(where, certainty.get("loss"))
+        triangle = _triangle(where, of, certainty.get("sigmas"), certainty.get("information"))
+        all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
+        scales.append(scale)
         all_keys.append(numbers)
         all_measured.append(row)
         all_triangles.append(triangle)
@@ -168,8 +212,15 @@ class Draft:
                 for (kind, valued, fixed), (keys, rows) in self._variables.items()
             ),
             tuple(
-                Factors(kind, np.array(keys, np.int64), np.array(measured), np.array(information))
-                for kind, (keys, measured, information) in self._factors.items()
+                Factors(
+                    kind,
+                    np.array(keys, np.int64),
+                    np.array(measured),
+                    np.array(information),
+                    loss,
+                    np.array(scales) if loss else None,
+                )
+                for (kind, loss), (keys, measured, information, scales) in self._factors.items()
             ),
         )
 
@@ -189,6 +240,18 @@ def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")
     return row
+
+
+def _loss(where: str, loss: tuple[str, float] | None) -> tuple[str, float]:
+    """(name, scale); ("", 0) for none."""
+    if loss is None:
+        return "", 0.0
+    name, scale = loss
+    if name not in LOSSES:
+        raise BadLoss(where, repr(name), f"one of {', '.join(LOSSES)}")
+    if not (np.isfinite(scale) and scale > 0.0):
+        raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
+    return name, float(scale)
 
 
 def _triangle(

@@ -35,6 +35,11 @@ class Following:
         """A delta came.  Returns what is new to the readers; afterwards `live` says whether an estimate is wanted."""
         if self.live and delta.epoch == self.epoch and delta.revision <= self.revision:
             return []
+        if self.live and delta.epoch == self.epoch and delta.previous == 0 and self.revision:
+            # The whole estimate: features have become points, so what was under their keys is no more.
+            self._tables = tables_of(Estimate(delta.epoch, delta.revision, delta.variables))
+            self.revision = delta.revision
+            return [delta]
         if self.live and delta.epoch == self.epoch and delta.previous == self.revision:
             self._apply(delta)
             return [delta]

@@ -15,6 +15,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
+from factorbus.proto import discreet
 from factorbus.proto.problems import BadEndpoint, BadSetting, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
@@ -51,6 +52,21 @@ class Link:
             )
         except zenoh.ZError:  # the session is closed
             finish(Silence())
+
+    def ask_all(self, key: str, payload: bytes, timeout_s: float, done: Callable[[list[Reply]], None]) -> None:
+        """Query `key`; `done` is called once, when the query has ended, with what everybody who answered said."""
+        replies: list[Reply] = []
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            replies.append(_read(reply))
+
+        handler = Callback(on_reply, drop=lambda: done(replies), indirect=False)
+        try:
+            self._session.get(
+                key, handler, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+            )
+        except zenoh.ZError:  # the session is closed
+            done([])
 
     @contextmanager
     def listening(self, key: str, hear: Callable[[bytes], None]) -> Iterator[None]:
@@ -94,13 +110,14 @@ class Link:
         self._session.close()
 
 
-def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any]) -> Link:
+def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any], file: str = "") -> Link:
     """A link to the first of `endpoints` that takes us, trying until `timeout_s` has passed.
 
-    settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.
+    settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.  file: path of a
+    zenoh configuration file that comes before all this.
     Raises BadEndpoint and BadSetting at once, Unavailable when time is up.
     """
-    config = _config(endpoints, settings)
+    config = _config(endpoints, settings, file)
     start, pause = time.monotonic(), _FIRST_PAUSE_S
     while True:
         try:
@@ -108,24 +125,28 @@ def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str,
         except zenoh.ZError:
             if time.monotonic() - start + pause > timeout_s:
                 raise Unavailable(
-                    " and ".join(endpoints),
+                    discreet.endpoint(" and ".join(endpoints)),
                     timeout_s,
-                    "start a service there with `factorbus serve`, or check the address",
+                    "start a service there with `factorbus serve`, or check the address; one that asks for a "
+                    "certificate or a password, and does not get the right one, does not answer either",
                 ) from None
         time.sleep(pause)  # there is nothing to wait on: nobody is there yet who could say that they are
         pause = min(2 * pause, _LONGEST_PAUSE_S)
 
 
-def _config(endpoints: Sequence[str], settings: Mapping[str, Any]) -> zenoh.Config:
+def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) -> zenoh.Config:
     for endpoint in endpoints:
         if not _ENDPOINT.fullmatch(endpoint):
-            raise BadEndpoint(endpoint)
-    config = zenoh.Config()
+            raise BadEndpoint(discreet.endpoint(endpoint))
+    try:
+        config = zenoh.Config.from_file(file) if file else zenoh.Config()
+    except zenoh.ZError as error:
+        raise BadSetting(file, discreet.reason(error)) from None
     for path, value in (_settings(endpoints) | dict(settings)).items():
         try:
             config.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
-            raise BadSetting(path, str(error).split(" at /")[0]) from None
+            raise BadSetting(path, discreet.reason(error)) from None
     return config
 
 

@@ -14,6 +14,7 @@ from factorbus.client.link import Link
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions
 from factorbus.client.ticket import Ticket
+from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -39,6 +40,8 @@ class Map:
     Inserts are numbered and sent until they are answered, each exactly once, in order, across restarts of the
     link.  They belong to the epoch that was joined: if the map is created anew (service restarted, map dropped),
     they are refused with wrong_epoch until `rejoin`; the mirror follows the new map by itself.
+
+    doubt: what the map can be asked about its uncertainty.
     """
 
     def __init__(
@@ -59,6 +62,7 @@ class Map:
         self._closed = False
         self._enter(join())
         self.ask = Questions(courier, self.name, timeout_s)
+        self.doubt = Doubt(DoubtQuestions(courier, self.name, timeout_s))
 
     def __enter__(self) -> "Map":
         return self
@@ -82,13 +86,23 @@ class Map:
             raise Unavailable(f"the mirror of map {self.name!r}", 0.0, "open the map with mirror=True")
         return self._mirror
 
-    def insert(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+    def insert(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Accepted:
         """Add `batch` to the map and wait until it is in the estimate, the mirror included.
+
+        points_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
 
         Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
         """
         end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
-        ticket = self.send(batch, settle=settle, timeout_s=end - time.monotonic())
+        left = end - time.monotonic()
+        ticket = self.send(batch, settle=settle, points_below=points_below, timeout_s=left)
         accepted = ticket.result(max(end - time.monotonic(), 0.0))
         self._catch_up(max(end - time.monotonic(), 0.0))
         return accepted
@@ -97,7 +111,14 @@ class Map:
         """Have the map iterate until it has converged.  Raises Refused, Unavailable."""
         return self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
-    def send(self, batch: Batch | Draft, *, settle: bool = False, timeout_s: float | None = None) -> Ticket:
+    def send(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        timeout_s: float | None = None,
+    ) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge: `batch` is then not sent.
@@ -107,7 +128,7 @@ class Map:
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._changed:
                 self._wait_for_room(timeout_s)
-            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch), timeout_s)
+            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch, points_below), timeout_s)
             with self._changed:
                 self._window.sent(ticket)
             self._courier.carry(ticket.errand)
@@ -158,7 +179,7 @@ class Map:
         return self.ask.stats(timeout_s).result()
 
     def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
+        """The map as the text of a file: "g2o", "tum" or "kitti".  Raises Refused, Unavailable."""
         return self.ask.export(format, timeout_s).result()
 
     def close(self) -> None:

@@ -13,6 +13,8 @@ from factorbus.proto.problems import Problem, Refused
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
 _DEFAULT_BUSY_S = 0.05
+# These do not use up an insert's number, and say when to come back.
+_WAIT = frozenset({"busy", "journal_failed"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ def _judge_failure(payload: bytes, attempt: int, passing: Callable[[Refused], bo
         refused = decode_problem(payload)
     except Problem as unreadable:
         return unreadable
-    if refused.code == "busy":
+    if refused.code in _WAIT:
         wanted = refused.detail.get("retry_after_s")
         pause_s = float(wanted) if isinstance(wanted, int | float) and 0 <= wanted <= 60 else _DEFAULT_BUSY_S
         return Again(pause_s, refused.message)

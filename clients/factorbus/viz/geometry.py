@@ -31,6 +31,20 @@ def points_of(variables: Sequence[Variables]) -> Track:
     return _positions(variables, "point")
 
 
+def rays_of(variables: Sequence[Variables], horizon_m: float = 50.0) -> Track:
+    """Inverse-depth features as rays: places (n, 2, 3), from the camera of their first sight to where they are thought
+    to be, and no further than the horizon.
+
+    A value is x y z θ φ ρ; the ray points along (cos φ sin θ, −sin φ, cos φ cos θ), 1/ρ metres (`workers/MATH.md`).
+    """
+    mine = [group for group in variables if group.kind == "idp" and group.values is not None]
+    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in mine)])
+    rows = np.concatenate([np.empty((0, 6)), *(group.values for group in mine if group.values is not None)])
+    theta, phi, rho = rows[:, 3], rows[:, 4], np.maximum(rows[:, 5], 1.0 / horizon_m)
+    ray = np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=1)
+    return Track(keys, np.stack([rows[:, :3], rows[:, :3] + ray / rho[:, None]], axis=1))
+
+
 def line_of(track: Track) -> F64:
     """The track as one line (n + gaps, 2 or 3), with NaN between robots (letters of the keys)."""
     changes = np.flatnonzero(np.diff(track.keys >> _LETTER_BITS)) + 1

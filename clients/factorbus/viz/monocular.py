@@ -2,16 +2,14 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from factorbus.proto.arrays import F64
 from factorbus.viz import style
-from factorbus.viz.picture import BadPicture
+from factorbus.viz.files import checked_ending
 
-_ENDINGS = (".png", ".svg", ".pdf")
 _HORIZON_M = 25.0  # a ray whose end is not known is drawn up to here
 _SIGMAS = 2.0
 
@@ -32,8 +30,7 @@ def save_sights(
     sights: one a frame.  truth: the camera's true positions.  points (n, 3): true.  shares: for each feature σ_ρ/ρ
     frame by frame.  Lengths in metres; seen from above: x to the right, z up.
     """
-    if Path(path).suffix.lower() not in _ENDINGS:
-        raise BadPicture(f"{path}: wanted a picture that ends in {', '.join(_ENDINGS)}")
+    checked_ending(path)
     import matplotlib as mpl
     from matplotlib.figure import Figure
 

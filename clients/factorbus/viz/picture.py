@@ -2,31 +2,24 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Variables
-from factorbus.proto.problems import Problem
 from factorbus.viz import style
 from factorbus.viz.course import Course
+from factorbus.viz.ellipses import Spread, draw_outlines
+from factorbus.viz.files import BadPicture, checked_ending, save
 from factorbus.viz.geometry import Track, View, limits, line_of, points_of, segments_of, track_of, view_of
 from factorbus.viz.panels import chi2_panel, time_panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_ENDINGS = (".png", ".svg", ".pdf")
 _MOST_LOOPS = 150_000  # more would take minutes and show nothing new; the legend says how many were left out
 _MANY = 3000  # things of one kind above which an svg or pdf gets them as pixels
-
-
-class BadPicture(Problem):
-    """A picture that cannot be drawn."""
-
-    code = "bad_picture"
 
 
 def save_map(
@@ -37,22 +30,23 @@ def save_map(
     truth: Sequence[Variables] = (),
     loops: I64 | None = None,
     course: Course | None = None,
+    spread: Spread | None = None,
     title: str = "",
     subtitle: str = "",
 ) -> None:
     """Draw a map (see `map_figure`) into a .png, .svg or .pdf file.  Raises BadPicture, or OSError from the file."""
-    ending = Path(path).suffix.lower()
-    if ending not in _ENDINGS:
-        raise BadPicture(
-            f"{path}: a picture cannot be a {ending or 'file without ending'}; wanted {', '.join(_ENDINGS)}"
-        )
-    import matplotlib as mpl
-
+    checked_ending(path)
     figure = map_figure(
-        estimate=estimate, odometry=odometry, truth=truth, loops=loops, course=course, title=title, subtitle=subtitle
+        estimate=estimate,
+        odometry=odometry,
+        truth=truth,
+        loops=loops,
+        course=course,
+        spread=spread,
+        title=title,
+        subtitle=subtitle,
     )
-    with mpl.rc_context(style.SETTINGS):
-        figure.savefig(path, dpi=160, metadata={"Title": title} if title and ending != ".png" else None)
+    save(figure, path, title)
 
 
 def map_figure(
@@ -62,6 +56,7 @@ def map_figure(
     truth: Sequence[Variables] = (),
     loops: I64 | None = None,
     course: Course | None = None,
+    spread: Spread | None = None,
     title: str = "",
     subtitle: str = "",
 ) -> "Figure":
@@ -69,13 +64,14 @@ def map_figure(
 
     estimate, odometry, truth: groups of variables with values; poses become lines in the order of their keys, one
     for each letter; points become marks.  loops (m, 2): keys of poses joined by loop closures, drawn between their
-    estimates.  course: panels below the map.  Lengths are in metres and axes equal.  Poses that fill space are drawn in
-    space, others in the plane they lie in.  Raises BadPicture when there is no pose or no point to draw.
+    estimates.  course: panels below the map.  spread: where variables may be.  Lengths are in metres and axes equal.
+    Poses that fill space are drawn in space, others in the plane they lie in.
+    Raises BadPicture when there is no pose or no point to draw.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    drawn = _Layers(estimate, odometry, truth, loops)
+    drawn = _Layers(estimate, odometry, truth, loops, spread)
     with mpl.rc_context(style.SETTINGS):
         panels = _panels(course)
         heights = [1.0, 0.05, 0.26] if panels else [1.0, 0.05]  # map, legend, panels
@@ -113,7 +109,9 @@ class _Layers:
         odometry: Sequence[Variables],
         truth: Sequence[Variables],
         loops: I64 | None,
+        spread: Spread | None,
     ) -> None:
+        self.spread = spread
         self.estimate, self.odometry, self.truth = track_of(estimate), track_of(odometry), track_of(truth)
         self.points, self.true_points = points_of(estimate), points_of(truth)
         if not len(self.estimate.keys) and not len(self.points.keys):
@@ -130,6 +128,7 @@ class _Layers:
             self._loops(axes),
             self._marks(axes, self.true_points, "true landmark", style.TRUTH, hollow=True),
             self._marks(axes, self.points, "landmark", style.POINTS, hollow=False),
+            draw_outlines(axes, self.spread, self.view) if self.spread is not None else None,
             self._start(axes),
         ]
         self._frame(axes)

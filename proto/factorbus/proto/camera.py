@@ -17,6 +17,7 @@ MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 _LEAST = MappingProxyType({"pinhole": 4, "radtan": 8, "fisheye": 8, "radial": 7})
+_CODES = MappingProxyType({"radial": 0, "pinhole": 1, "radtan": 1, "fisheye": 2})
 _POSITIVE = frozenset({"fx", "fy", "f", "dx", "dy"})
 _MOST_PIXELS = 1 << 20
 
@@ -70,3 +71,15 @@ class Camera:
         """One of its numbers by name; 0 where an optional one is left out."""
         names = MODELS[self.model]
         return (*self.numbers, *[0.0] * (len(names) - len(self.numbers)))[names.index(name)]
+
+    def lens(self) -> tuple[float, ...]:
+        """The eleven numbers that a sight in a map carries (`factorbus.proto.kinds`):
+
+        code (0 radial, 1 radtan and pinhole, 2 fisheye), f_u f_v c_x c_y (pixels), limit (0: as far as the model is one
+        to one), and five of the model: radtan k1 k2 p1 p2 k3, fisheye k1 k2 k3 k4 0, radial d_x d_y k1 k2 0.
+        """
+        if self.model == "radial":
+            f, dx, dy, cx, cy, k1, k2 = self.numbers
+            return (0.0, f / dx, f / dy, cx, cy, 0.0, dx, dy, k1, k2, 0.0)
+        more = (*self.numbers[4:], *[0.0] * 5)[:5]
+        return (float(_CODES[self.model]), *self.numbers[:4], 0.0, *more)

@@ -33,6 +33,8 @@ def encode_insert(message: Insert) -> bytes:
     }
     if message.settle:
         content["settle"] = True
+    if message.points_below:
+        content["points_below"] = message.points_below
     return _pack(content)
 
 
@@ -44,6 +46,7 @@ def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
         batch=read_batch(content, limits),
         settle=fields.flag("", content, "settle"),
         epoch=fields.integer("", content, "epoch", default=0),
+        points_below=fields.number("", content, "points_below") if "points_below" in content else 0.0,
     )
 
 
@@ -59,6 +62,11 @@ def encode_accepted(message: Accepted) -> bytes:
             "report": message.report,
         }
     )
+
+
+def report_encoder() -> Callable[[Mapping[str, Any]], bytes]:
+    """What gives the bytes of a report as it stands in the answer to an insert and in a delta.  For one thread."""
+    return msgpack.Packer().pack
 
 
 def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:

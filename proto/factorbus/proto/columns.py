@@ -7,7 +7,7 @@ import numpy as np
 
 from factorbus.proto import fields
 from factorbus.proto.fields import F8, I8, Map
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadMessage, TooLarge, UnknownKind
@@ -20,15 +20,7 @@ def variables_to_maps(groups: Sequence[Variables]) -> list[dict[str, Any]]:
 
 def factors_to_maps(groups: Sequence[Factors]) -> list[dict[str, Any]]:
     """What the field `factors` of a message holds."""
-    return [
-        {
-            "kind": group.kind,
-            "keys": _bytes(group.keys, I8),
-            "measured": _bytes(group.measured, F8),
-            "information": _bytes(group.information, F8),
-        }
-        for group in groups
-    ]
+    return [_factors_map(group) for group in groups]
 
 
 def read_batch(message: Map, limits: Limits) -> Batch:
@@ -66,6 +58,18 @@ def _variables_map(group: Variables) -> dict[str, Any]:
     return content
 
 
+def _factors_map(group: Factors) -> dict[str, Any]:
+    content: dict[str, Any] = {
+        "kind": group.kind,
+        "keys": _bytes(group.keys, I8),
+        "measured": _bytes(group.measured, F8),
+        "information": _bytes(group.information, F8),
+    }
+    if group.loss:
+        content |= {"loss": group.loss, "scale": _bytes(group.scale, F8)}
+    return content
+
+
 def _bytes(column: Any, dtype: np.dtype) -> bytes:
     if type(column) is np.ndarray and column.dtype == dtype:
         return column.tobytes()
@@ -100,7 +104,14 @@ def _read_factors(index: int, content: Map) -> Factors:
     keys = fields.keys(place, content, len(known.connects))
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)
-    return Factors(known.name, keys, measured, information)
+    loss = content.get("loss")
+    if loss is None:
+        return Factors(known.name, keys, measured, information)
+    if type(loss) is not str or loss not in LOSSES:
+        seen = repr(loss[:64]) if type(loss) is str else "not a string"
+        raise BadMessage(f"{place()}.loss", seen, f"one of {', '.join(LOSSES)}, or no such field")
+    scale = fields.rows(place, content, "scale", len(keys), 1).reshape(-1)
+    return Factors(known.name, keys, measured, information, loss, scale)
 
 
 def _row_size(content: Map, count: int) -> int:

@@ -1,7 +1,7 @@
 """Where things are on the bus: key expressions of wire version 1.
 
     factorbus/v1/map/<map>/in/<client>                  query        an insert
-    factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, stats, export
+    factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, ...: QUESTIONS
     factorbus/v1/map/<map>/out/{delta,keyframe,event}   publication
     factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
     factorbus/v1/worker/<id>/job                        query
@@ -18,7 +18,7 @@ import re
 from factorbus.proto.problems import BadName
 
 PREFIX = "factorbus/v1"
-QUESTIONS = ("estimate", "chi2", "graph", "stats", "export")
+QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why")
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 

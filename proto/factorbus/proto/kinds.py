@@ -35,6 +35,11 @@ class FactorKind:
 
 _POSE2 = "x y (metres), theta (radians)"
 _POSE3 = "x y z (metres), unit quaternion qx qy qz qw"
+_PIXEL = "u v (pixels)"
+_LENS = "lens (11 numbers: `factorbus.proto.camera.Camera.lens`)"
+
+# What a factor that is far off may count instead of r'Wr, by the name of the loss; its scale is in standard deviations.
+LOSSES = ("huber", "cauchy", "geman-mcclure", "tukey", "dcs")
 
 VARIABLE_KINDS = {
     kind.name: kind
@@ -43,6 +48,7 @@ VARIABLE_KINDS = {
         VariableKind("se3", 7, 6, _POSE3),
         VariableKind("point2", 2, 2, "x y (metres)"),
         VariableKind("point3", 3, 3, "x y z (metres)"),
+        VariableKind("idp", 6, 6, "x y z of the first camera (metres), theta, phi (radians), rho (1/metre)"),
     )
 }
 
@@ -58,5 +64,8 @@ FACTOR_KINDS = {
         FactorKind("landmark_se2", ("se2", "point2"), 2, 2, "x y (metres): the point in the pose's frame"),
         FactorKind("landmark_se3", ("se3", "point3"), 3, 3, "x y z (metres): the point in the pose's frame"),
         FactorKind("bearing_range_se2", ("se2", "point2"), 2, 2, "bearing (radians), range (metres), from the pose"),
+        FactorKind("idp_first", ("se3", "idp"), 14, 6, f"{_PIXEL}, rho (1/metre), {_LENS}"),
+        FactorKind("idp_seen", ("se3", "idp"), 13, 2, f"{_PIXEL}, {_LENS}"),
+        FactorKind("point_seen", ("se3", "point3"), 13, 2, f"{_PIXEL}, {_LENS}"),
     )
 }

@@ -30,13 +30,16 @@ class Factors(NamedTuple):
     """Factors of one kind.
 
     keys (m, arity) in the kind's `connects` order; measured (m, kind.size); information (m, r(r+1)/2): the upper
-    triangle of the information matrix (inverse covariance) row by row, r = kind.dim.
+    triangle of the information matrix (inverse covariance) row by row, r = kind.dim.  loss: one of `kinds.LOSSES` that
+    all of them have, "": none; scale (m,): of the loss, standard deviations.
     """
 
     kind: str
     keys: I64
     measured: F64
     information: F64
+    loss: str = ""
+    scale: F64 | None = None
 
 
 class Batch(NamedTuple):
@@ -59,6 +62,8 @@ class Batch(NamedTuple):
 class Insert(NamedTuple):
     """A client's request to add `batch`; with `settle`, iterate until converged afterwards.
 
+    points_below: afterwards idp features whose linearity index is below this become points; 0: none do.
+
     sequence: 1, 2, 3, ... per client and map; the same number again gets the first answer again.
     epoch: the epoch of the map the client joined, or 0 for "whichever"; another one is refused.
     """
@@ -67,6 +72,7 @@ class Insert(NamedTuple):
     batch: Batch
     settle: bool = False
     epoch: int = 0
+    points_below: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
+    ├── BadLoss              bad_loss             a loss that does not exist, a scale that is not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   └── UnknownKind      unknown_kind         a kind of variable or factor that this version does not know
     ├── TooLarge             too_large            a message, an insert or a map over its limit
@@ -87,6 +88,13 @@ class BadInformation(Problem):
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
         super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
+
+
+class BadLoss(Problem):
+    code = "bad_loss"
+
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"{where}: of the loss seen {seen}; wanted {wanted}", where=where)
 
 
 class BadMessage(Problem):

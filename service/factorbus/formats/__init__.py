@@ -1,4 +1,4 @@
-"""Graph files in and out: g2o, TORO and iSAM text are read, g2o and TUM are written.
+"""Graph files in and out: g2o, TORO and iSAM text are read, g2o, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
 """
@@ -8,6 +8,18 @@ from factorbus.formats.graph import GraphFile
 from factorbus.formats.reader import read
 from factorbus.formats.steps import Steps
 from factorbus.formats.write_g2o import g2o_text, write_g2o
+from factorbus.formats.write_kitti import kitti_text, write_kitti
 from factorbus.formats.write_tum import tum_text, write_tum
 
-__all__ = ["FormatError", "GraphFile", "Steps", "g2o_text", "read", "tum_text", "write_g2o", "write_tum"]
+__all__ = [
+    "FormatError",
+    "GraphFile",
+    "Steps",
+    "g2o_text",
+    "kitti_text",
+    "read",
+    "tum_text",
+    "write_g2o",
+    "write_kitti",
+    "write_tum",
+]

@@ -27,6 +27,8 @@ class _FactorColumns:
     keys: I64
     measured: F64
     information: F64
+    loss: str
+    scale: F64 | None
     bounds: list[int]
 
 
@@ -73,7 +75,9 @@ class Steps(Sequence[Batch]):
             low, high = group.bounds[k], group.bounds[k + 1]
             if low < high:
                 piece = slice(low, high)
-                factors.append(Factors(group.kind, group.keys[piece], group.measured[piece], group.information[piece]))
+                scale = None if group.scale is None else group.scale[piece]
+                measured, information = group.measured[piece], group.information[piece]
+                factors.append(Factors(group.kind, group.keys[piece], measured, information, group.loss, scale))
         return Batch(tuple(variables), tuple(factors))
 
 
@@ -149,8 +153,15 @@ def _origins(kind: str, count: int) -> F64:
 def _factor_columns(group: Factors, ends: I64, lines: I64, names: Roster, step: I64, count: int) -> _FactorColumns:
     at = step[ends].max(axis=1)
     order = np.lexsort((lines, ~_odometry(group, ends, lines, names), at))
+    scale = None if group.scale is None else group.scale[order]
     return _FactorColumns(
-        group.kind, group.keys[order], group.measured[order], group.information[order], _bounds(at[order], count)
+        group.kind,
+        group.keys[order],
+        group.measured[order],
+        group.information[order],
+        group.loss,
+        scale,
+        _bounds(at[order], count),
     )
 
 

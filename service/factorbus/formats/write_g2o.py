@@ -23,7 +23,7 @@ def write_g2o(path_or_file: str | os.PathLike[str] | TextIO, batch: Batch) -> No
 
     An id is the index of the variable's key (x12 → 12) when no two keys share one; otherwise variables are numbered
     in order.  Variables without a value get no vertex line.  Raises FormatError for what g2o has no record for
-    (bearing and range, priors on 2D points), before anything is written.
+    (bearing and range, priors on 2D points, sights, features of inverse depth, losses), before anything is written.
     """
     text = g2o_text(batch)
     if isinstance(path_or_file, str | os.PathLike):
@@ -77,8 +77,16 @@ def _refuse_unwritable(batch: Batch) -> None:
             raise FormatError(
                 "g2o", None, f"{len(group.keys)} factor(s) of kind {group.kind}", f"only {', '.join(_EDGE_NAMES)}"
             )
+        if group.loss:
+            raise FormatError(
+                "g2o", None, f"{len(group.keys)} factor(s) {group.kind} with the loss {group.loss}", "none with a loss"
+            )
     named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
     for group in batch.variables:
+        if group.kind not in _VERTEX_NAMES:
+            raise FormatError(
+                "g2o", None, f"{len(group.keys)} variable(s) of kind {group.kind}", f"only {', '.join(_VERTEX_NAMES)}"
+            )
         if group.values is None and not np.isin(group.keys, named).all():
             lost = group.keys[~np.isin(group.keys, named)][0]
             raise FormatError(

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from factorbus.proto.problems import Problem
-from factorbus.service.config import Config, checked, load
+from factorbus.service.config import DURABILITIES, Config, checked, load
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,7 +38,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--mode", choices=("peer", "router", "client"))
     parser.add_argument("--name", help="of this service, in its liveliness tokens")
     parser.add_argument("--maps", metavar="PATTERN", help="the maps it answers for: a name or a beginning and *")
+    parser.add_argument("--zenoh", metavar="FILE", help="Zenoh configuration: TLS, users, access control")
+    parser.add_argument("--insecure", action="store_true", help="listen to other machines even without these")
     parser.add_argument("--create", action="append", metavar="MAP", help="a map to have from the start")
+    parser.add_argument("--journal", metavar="DIR", help="keep maps here, across restarts and crashes")
+    parser.add_argument("--durability", choices=DURABILITIES, help="what an answer promises: see service/README.md")
+    parser.add_argument("--standby", action="store_true", help="wait until the journal's owner is gone, and take over")
     parser.add_argument("--no-warm", action="store_true", help="compile kernels when they are first used")
     return parser
 
@@ -46,11 +51,15 @@ def _parser() -> argparse.ArgumentParser:
 def _config(options: argparse.Namespace) -> Config:
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
-        for name in ("listen", "connect", "mode", "name", "maps", "create")
+        for name in ("listen", "connect", "mode", "name", "maps", "create", "zenoh", "journal", "durability")
         if (value := getattr(options, name)) is not None
     }
     if options.no_warm:
         given["warm"] = False
+    if options.standby:
+        given["standby"] = True
+    if options.insecure:
+        given["insecure"] = True
     return load(options.config, **given) if options.config else checked(replace(Config(), **given))
 
 

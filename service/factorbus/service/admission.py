@@ -7,15 +7,24 @@ The rules, in the order they are tried (n is the number that the client has to s
     answered, same bytes                the first answer again
     used for other bytes, or forgotten  bad_sequence
     the map is closing                  shutting_down, not used up
+    the journal cannot be written       journal_failed, not used up
     n                                   admitted if the inbox has room, else busy, not used up
     after n, within the window          parked until the gap is closed; no room: busy; gap not closed: bad_sequence
     further                             bad_sequence
 
 Parked inserts have room of their own: were they to fill the inbox, the one that closes the gap would find it full.
+
+Nobody stands in another's way by sending much.  Who has nothing waiting finds room for one insert (not a huge one) in a
+full inbox, too.  The order is that of a fair queue (start-time fair queueing, Goyal and others, 1996): each client's
+inserts are laid end to end by their sizes on a time line of its own, which begins where the others are; the insert that
+begins first goes first.  So a small one overtakes large ones of others, and equal ones take turns.
 """
 
 from collections import OrderedDict, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count
 
 from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, TooLarge, WrongEpoch
 from factorbus.service.config import Limits
@@ -24,6 +33,11 @@ from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse, Wai
 # How many may wait for one and the same answer.
 _ASKERS = 8
 _RETRY_S = (0.02, 2.0)
+# What an insert counts for besides its bytes: a step has its price, however small.
+_INSERT_COST = 1024
+# One sender (all clients of one name before its suffix) has at most this share of the names that are remembered.
+_NAMES_OF_ONE = 4
+_NAME_IDLE_S = 10.0
 
 
 @dataclass(slots=True)
@@ -31,6 +45,7 @@ class _Client:
     """One client's place in its sequence."""
 
     next: int = 1
+    served: float = 0.0  # where its inserts on the time line of fairness end
     heard: float = 0.0  # when it last sent what it has to send next
     seen: float = 0.0  # when it last sent anything
     ready: deque[Waiting] = field(default_factory=deque)
@@ -45,10 +60,12 @@ class Admission:
     def __init__(self, epoch: int, limits: Limits) -> None:
         self._epoch, self._limits = epoch, limits
         self._clients: dict[str, _Client] = {}
-        self._turns: deque[str] = deque()  # clients with something ready, next in turn first
+        self._turns: list[tuple[float, int, str]] = []  # heap of (begin, order, client with something ready)
+        self._clock, self._order = 0.0, count()
         self._ready = self._parked = self._bytes = 0
         self._pace_s = 0.01  # seconds per insert, smoothed
         self._closing: Problem | None = None
+        self._blocked: Problem | None = None
 
     @property
     def ready(self) -> int:
@@ -72,27 +89,59 @@ class Admission:
         except Problem as problem:
             return [Refuse(arrived.asker, problem)]
 
+    def take_alone(self, arrived: Arrived) -> Waiting | None:
+        """The insert as taken, if it is next, and nothing else waits here or is parked; None: `admit` it."""
+        client = self._clients.get(arrived.client)
+        if (
+            client is None
+            or arrived.sequence != client.next
+            or arrived.epoch not in (0, self._epoch)
+            or self._ready
+            or self._parked
+            or self._closing is not None
+            or self._blocked is not None
+        ):
+            return None
+        insert = _waiting(arrived)
+        client.seen = client.heard = arrived.now
+        client.open[arrived.sequence] = insert
+        client.next += 1
+        self._bytes += arrived.size
+        self._clock = begin = max(self._clock, client.served)
+        client.served = begin + arrived.size + _INSERT_COST
+        return insert
+
     def take(self, most: int) -> tuple[Waiting, ...]:
-        """Up to `most` inserts for the next step: one of each client in turn, and again."""
+        """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first."""
         taken: list[Waiting] = []
+        room = self._limits.fold_bytes
         while self._turns and len(taken) < most:
-            name = self._turns.popleft()
-            queue = self._clients[name].ready
-            taken.append(queue.popleft())
-            if queue:
-                self._turns.append(name)
+            begin, _, name = self._turns[0]
+            client = self._clients[name]
+            insert = client.ready[0]
+            if taken and insert.size > room:
+                break
+            heappop(self._turns)
+            room -= insert.size
+            taken.append(client.ready.popleft())
+            self._clock = begin
+            client.served = begin + insert.size + _INSERT_COST
+            if client.ready:
+                heappush(self._turns, (client.served, next(self._order), name))
         self._ready -= len(taken)
         return tuple(taken)
 
-    def answer(self, insert: Waiting, answer: object) -> list[Effect]:
-        """`insert` has its answer: give it to all who wait for it, and remember it."""
+    def answer(self, insert: Waiting, answer: object, answered: Asker = None) -> list[Effect]:
+        """`insert` has its answer: give it to all who wait for it, but who is `answered` already, and remember it."""
         client = self._clients[insert.client]
         del client.open[insert.sequence]
         self._bytes -= insert.size
         client.answered[insert.sequence] = (insert.digest, answer)
         if len(client.answered) > self._limits.remembered:
             client.answered.popitem(last=False)
-        return [_reply(asker, answer) for asker in insert.askers]
+        if answered is not None and len(insert.askers) == 1:
+            return []
+        return [_reply(asker, answer) for asker in insert.askers if asker is not answered]
 
     def is_open(self, insert: Waiting) -> bool:
         """Has `insert` no answer yet?"""
@@ -110,9 +159,36 @@ class Admission:
         self._closing = problem or ShuttingDown()
         effects = [e for c in self._clients.values() for e in self._unpark(c, self._closing)]
         if problem is not None:
-            for insert in self.take(self._ready):
-                effects += self.answer(insert, problem)
+            while self._ready:
+                for insert in self.take(self._ready):
+                    effects += self.answer(insert, problem)
         return effects
+
+    def take_back(self, problem: Problem, given: bool) -> list[Effect]:
+        """What waits did not happen: refuse it, its numbers not used up; `given`: what the solver has, too."""
+        effects: list[Effect] = []
+        for client in self._clients.values():
+            gone = list(client.open.values()) if given else [*client.ready, *client.parked.values()]
+            for insert in gone:
+                effects += [Refuse(asker, problem) for asker in insert.askers]
+                del client.open[insert.sequence]
+                self._bytes -= insert.size
+            client.next = min([*(insert.sequence for insert in gone), client.next])
+            client.ready.clear()
+            client.parked.clear()
+        self._turns.clear()
+        self._ready = self._parked = 0
+        return effects
+
+    def block(self, problem: Problem | None) -> None:
+        """Refuse everything new with `problem`, its numbers not used up, until this is called with None."""
+        self._blocked = problem
+
+    def restore(self, name: str, following: int, answered: Iterable[tuple[int, int, object]], now: float) -> None:
+        """`name` was here before: it has to send `following` next, and has had answers, (sequence, digest, answer)."""
+        client = _Client(following, heard=now, seen=now)
+        client.answered.update((sequence, (digest, answer)) for sequence, digest, answer in answered)
+        self._clients[name] = client
 
     def took(self, inserts: int, seconds: float) -> None:
         """Learn the pace: `inserts` were folded in `seconds`."""
@@ -133,6 +209,8 @@ class Admission:
             return [_reply(arrived.asker, _remembered(client, arrived))]
         if self._closing is not None:
             raise self._closing
+        if self._blocked is not None:
+            raise self._blocked
         if arrived.sequence == client.next:
             self._admit_next(client, arrived)
         else:
@@ -145,12 +223,26 @@ class Admission:
 
         Every run of a client has a name of its own, so the names of those long silent make room.
         """
+        self._check_share(arrived)
         if len(self._clients) >= self._limits.clients:
             name, idlest = min(self._clients.items(), key=lambda item: (bool(item[1].open), item[1].seen))
             if idlest.open or arrived.now - idlest.seen < self._limits.client_idle_s:
                 raise TooLarge("the map", len(self._clients) + 1, self._limits.clients, "clients")
             del self._clients[name]
         return _Client(heard=arrived.now)
+
+    def _check_share(self, arrived: Arrived) -> None:
+        """A sender that keeps coming under new names does not use up the names of all: it makes room among its own."""
+        sender, share = _sender(arrived.client), max(self._limits.clients // _NAMES_OF_ONE, 1)
+        if len(self._clients) < share:
+            return
+        own = {name: client for name, client in self._clients.items() if _sender(name) == sender}
+        if len(own) < share:
+            return
+        name, idlest = min(own.items(), key=lambda item: (bool(item[1].open), item[1].seen))
+        if idlest.open or arrived.now - idlest.seen < _NAME_IDLE_S:
+            raise TooLarge(f"{sender} in this map", len(own) + 1, share, "clients")
+        del self._clients[name]
 
     def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> list[Effect]:
         """One more waits for the answer; of too many, the first is told to come back: it has most likely given up."""
@@ -163,8 +255,10 @@ class Admission:
         """Into the inbox, and with it whatever waited for just this one."""
         client.heard = arrived.now
         # The smallest inbox still takes one insert, whatever its size.
-        crowded = self._ready and self._bytes + arrived.size > self._limits.waiting_bytes
-        if self._ready >= self._limits.waiting or crowded:
+        limits = self._limits
+        crowded = self._ready and self._bytes + arrived.size > limits.waiting_bytes
+        full = crowded or self._ready >= limits.waiting
+        if full and (client.ready or arrived.size > limits.waiting_bytes // limits.clients):
             raise self._busy()
         self._bytes += arrived.size
         self._make_ready(client, _waiting(arrived))
@@ -174,7 +268,7 @@ class Admission:
 
     def _make_ready(self, client: _Client, insert: Waiting) -> None:
         if not client.ready:
-            self._turns.append(insert.client)
+            heappush(self._turns, (max(self._clock, client.served), next(self._order), insert.client))
         client.ready.append(insert)
         client.open[insert.sequence] = insert
         client.next += 1
@@ -220,7 +314,21 @@ def _remembered(client: _Client, arrived: Arrived) -> object:
 
 
 def _waiting(arrived: Arrived) -> Waiting:
-    return Waiting(arrived.client, arrived.sequence, arrived.size, arrived.digest, arrived.content, [arrived.asker])
+    return Waiting(
+        arrived.client,
+        arrived.sequence,
+        arrived.size,
+        arrived.digest,
+        arrived.content,
+        [arrived.asker],
+        arrived.message,
+        arrived.now,
+    )
+
+
+def _sender(client: str) -> str:
+    """robot1 of robot1-5f3a90c1: the library adds a suffix with every run."""
+    return client.rpartition("-")[0] or client
 
 
 def _wanted(client: _Client) -> str:

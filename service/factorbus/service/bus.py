@@ -14,11 +14,12 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.proto import codec, keys
+from factorbus.proto import codec, discreet, keys
 from factorbus.proto.messages import Job
 from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.events import Asker
+from factorbus.service.exposure import refuse_exposed
 from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE, zenoh_settings
 
 log = logging.getLogger(__name__)
@@ -33,19 +34,25 @@ _PRIORITY = {
 
 
 def open_bus(config: Config) -> "Bus":
-    """The bus as `config` describes it.  Raises BadConfig."""
+    """The bus as `config` describes it.  Raises BadConfig; Exposed is one."""
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
         for path, value in zenoh_settings(config).items():
             settings.insert_json5(path, json.dumps(value))
     except zenoh.ZError as error:
-        raise BadConfig(f"Zenoh does not take this configuration ({config.zenoh or 'built in'}): {error}") from None
+        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
+        where = config.zenoh or "built in"
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {discreet.reason(error)}") from None
+    if not config.insecure and config.mode != "client":
+        refuse_exposed(config.listen, lambda path: json.loads(settings.get_json(path)))
     try:
         return Bus(zenoh.open(settings))
     except zenoh.ZError as error:
-        where = ", ".join(config.listen if config.mode != "client" else config.connect)
-        raise BadConfig(f"cannot open {where}: {error}; is the address right, and free?") from None
+        where = discreet.endpoint(", ".join(config.listen if config.mode != "client" else config.connect))
+        raise BadConfig(
+            f"cannot open {where}: {discreet.reason(error)}; is the address right and free, and its certificate there?"
+        ) from None
 
 
 class Bus:
@@ -163,6 +170,12 @@ def payload_of(query: zenoh.Query) -> bytes:
     """What was sent along."""
     payload = query.payload
     return payload.to_bytes() if payload is not None else b""
+
+
+def received(query: zenoh.Query) -> tuple[str, bytes]:
+    """Both."""
+    payload = query.payload
+    return str(query.key_expr), payload.to_bytes() if payload is not None else b""
 
 
 def reply(query: zenoh.Query, message: bytes) -> None:

@@ -1,5 +1,6 @@
 """What an operator may set: endpoints, which maps, limits.  From code, or from a TOML file of the same names."""
 
+import re
 import tomllib
 import types
 from collections.abc import Mapping
@@ -9,6 +10,11 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.problems import Problem
+
+_HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
+# Limits for which 0 means: find it out.
+_MAY_BE_0 = ("memory_bytes",)
+DURABILITIES = ("none", "group", "commit")
 
 
 class BadConfig(Problem):
@@ -31,7 +37,9 @@ class Limits:
     waiting_bytes: int = 256 << 20
     questions: int = 256  # waiting for the solver to come to a revision
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
-    fold: int = 64  # inserts that one step takes in
+    fold: int = 64  # inserts that one step takes in ...
+    fold_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
+    unwritten: int = 1024  # inserts that the journal has yet to write before the solver gets more
     parked_s: float = 5.0  # how long an insert waits for the one before it
     message_bytes: int = 64 << 20
     insert_variables: int = 1_000_000
@@ -41,6 +49,8 @@ class Limits:
     keyframe_steps: int = 1000  # a keyframe after so many steps ...
     keyframe_bytes: int = 64 << 20  # ... or so many bytes of deltas
     jobs: int = 64  # batch optima being computed or waiting, in this service
+    sessions: int = 1000  # connections to this service
+    memory_bytes: int = 0  # of this process, before what would make maps grow is refused; 0: 4/5 of what there is
 
     def message(self) -> MessageLimits:
         """The codec's part of the limits."""
@@ -55,6 +65,7 @@ class Config:
     "client" needs `connect` and meets its clients at a router.  maps: the names this service answers for, a name or
     a beginning and `*`; several services at one router need patterns that do not overlap.  create: maps there are
     from the start.  zenoh: path of a Zenoh configuration file for everything not said here (TLS, access control).
+    insecure: listen beyond this machine even without these.
     """
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -64,8 +75,16 @@ class Config:
     maps: str = "*"
     create: tuple[str, ...] = ()
     zenoh: str = ""
+    insecure: bool = False
     warm: bool = True  # compile every kernel before taking the first insert
     job_deadline_s: float = 120.0  # for one worker to answer one job
+    stuck_s: float = 120.0  # a thread that does not come to its next work for so long is stuck, the service not alive
+    metrics: str = ""  # HOST:PORT where /metrics, /live and /ready are served over HTTP; empty: nowhere
+    journal: str = ""  # folder where maps are kept; empty: they end with the service
+    durability: str = "commit"  # what an answer promises of it: none, group or commit
+    group_s: float = 0.05  # durability group: written no later than this after the answer
+    snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
+    standby: bool = False  # wait until whoever owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
 
@@ -88,10 +107,18 @@ def checked(config: Config) -> Config:
     if config.mode != "client" and not config.listen and not config.connect:
         raise BadConfig('there is nothing to listen on or connect to; give listen = ["tcp/127.0.0.1:7447"]')
     for name in (f.name for f in fields(Limits)):
-        if getattr(config.limits, name) <= 0:
+        least = 0 if name in _MAY_BE_0 else 1e-9
+        if getattr(config.limits, name) < least:
             raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
-    if config.job_deadline_s <= 0:
-        raise BadConfig(f"job_deadline_s is {config.job_deadline_s}; wanted more than 0")
+    for name in ("job_deadline_s", "stuck_s", "group_s", "snapshot_s"):
+        if getattr(config, name) <= 0:
+            raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
+    if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
+        raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
+    if config.durability not in DURABILITIES:
+        raise BadConfig(f"durability is {config.durability!r}; wanted {', '.join(DURABILITIES)}")
+    if config.standby and not config.journal:
+        raise BadConfig("standby without a journal: there is nothing to take over; give journal = DIR")
     stem = config.maps.removesuffix("*")
     if not config.maps or not all(c.isalnum() or c in "_-" for c in stem) or not stem.isascii():
         raise BadConfig(f"maps is {config.maps!r}; wanted a map name or the beginning of one and a *, such as site7-*")

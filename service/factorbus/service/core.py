@@ -9,7 +9,8 @@ At most one Run is out at a time, so what the solver does next is decided when i
 
 import math
 from collections import Counter, deque
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Insert
@@ -17,12 +18,15 @@ from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
 from factorbus.service.events import (
+    Alone,
     Arrived,
     Asked,
+    Asker,
     Drained,
     Effect,
     Folded,
     Judged,
+    Located,
     Publish,
     Read,
     Refuse,
@@ -31,6 +35,7 @@ from factorbus.service.events import (
     Tell,
     Waiting,
 )
+from factorbus.service.histogram import Histogram
 from factorbus.service.questions import Question, parse
 
 _KEYFRAME = Read(Question("keyframe"))
@@ -39,6 +44,16 @@ _KEYFRAME = Read(Question("keyframe"))
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
+_COUNTED: tuple[str, ...] = ("accepted", "refused", "busy", "received_bytes", "answered_bytes", "published_bytes")
+
+
+class Restored(NamedTuple):
+    """How a map is that was here before."""
+
+    revision: int
+    variables: int
+    factors: int
+    chi2: float
 
 
 class MapCore:
@@ -51,14 +66,18 @@ class MapCore:
         self._admission = Admission(epoch, limits)
         self._reads: deque[Read] = deque()
         self._running: Run | None = None
+        self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
+        self._must_reload = False
         self._started = self._ended = 0.0
         self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
         self._closing: Problem | None = None
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
-        self._strategies: Counter[str] = Counter()
-        self._counts: Counter[str] = Counter()
+        self._strategies: dict[str, int] = {}
+        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
         self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
+        self._refusals: Counter[str] = Counter()
+        self._step_s, self._insert_s = Histogram(), Histogram()
 
     def row(self) -> dict[str, Any]:
         """What admin/maps says of this map."""
@@ -72,16 +91,20 @@ class MapCore:
         }
 
     def created(self) -> list[Effect]:
-        """The map is on the bus."""
-        return [self._event("created")]
+        """The map is on the bus: new, or as it was before."""
+        return [self._event("opened" if self.revision else "created")]
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
+        if isinstance(arrived.content, Located) and (run := self._try_alone(arrived, arrived.content.settle)):
+            self._counts["received_bytes"] += arrived.size
+            return [run]
         effects = self._admission.expire(arrived.now)
         judged = self._admission.admit(arrived)
+        self._counts["received_bytes"] += arrived.size
         for effect in judged:
             if isinstance(effect, Refuse):
-                self._counts["busy" if effect.problem.code == "busy" else "refused"] += 1
+                self._refused(effect.problem)
         return self._go_on(effects + judged, arrived.now)
 
     def ask(self, asked: Asked, now: float) -> list[Effect]:
@@ -102,35 +125,94 @@ class MapCore:
     def judged(self, judged: Judged) -> list[Effect]:
         """The solver's word on some of what it has."""
         effects: list[Effect] = []
+        self._unjudged -= len(judged.outcomes)
         for outcome in judged.outcomes:
+            self._unjudged_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
-            self._counts["accepted" if isinstance(outcome.answer, bytes) else "refused"] += 1
+            if isinstance(outcome.answer, bytes):
+                self._counts["accepted"] += 1
+                self._counts["answered_bytes"] += len(outcome.answer)
+            else:
+                self._refused(outcome.answer)
         return effects
+
+    def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
+        """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
+        counts, insert = self._counts, alone.insert
+        others = self._admission.answer(insert, alone.answer, answered)
+        self._unjudged -= 1
+        self._unjudged_bytes -= insert.size
+        counts["accepted"] += 1
+        counts["answered_bytes"] += len(alone.answer)
+        self._count(alone)
+        self._free(alone, (insert,))
+        return self._go_on(others, alone.now)
+
+    def kept(self, events: Sequence[Judged | Stepped], now: float) -> list[Effect]:
+        """What came of a Run is written down."""
+        effects: list[Effect] = []
+        for event in events:
+            effects += self.judged(event) if isinstance(event, Judged) else self.stepped(event)
+        return self._go_on(effects, now)
+
+    def block(self, problem: Problem, now: float) -> list[Effect]:
+        """The journal cannot be written: nothing new is taken in, and what has not gone to the solver is refused."""
+        self._admission.block(problem)
+        return self._go_on(self._count_refused(self._admission.take_back(problem, given=False)), now)
+
+    def unkept(self, problem: Problem, now: float) -> list[Effect]:
+        """The same, and what came of Runs since the last `kept` did not happen: the solver is to go back."""
+        self._admission.block(problem)
+        effects = self._count_refused(self._admission.take_back(problem, given=True))
+        self._unjudged = self._unjudged_bytes = 0
+        self._must_reload = True
+        return self._go_on(effects, now)
+
+    def unblock(self) -> None:
+        """The journal can be written again."""
+        self._admission.block(None)
+
+    def restore(
+        self, senders: Iterable[tuple[str, int, Iterable[tuple[int, int, object]]]], restored: Restored
+    ) -> None:
+        """The map was here before: what its clients have sent, and how it is."""
+        for name, following, answered in senders:
+            self._admission.restore(name, following, answered, self._created)
+        self.revision, self.variables, self.factors, self._chi2 = restored
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
+        self._count(stepped)
+        return [Publish("delta", stepped.delta)]
+
+    def _count(self, stepped: Stepped | Alone) -> None:
         self.revision = stepped.revision
         self._chi2 = stepped.chi2
         self._solver_ms += stepped.solver_ms
-        self._strategies[stepped.strategy] += 1
+        self._strategies[stepped.strategy] = self._strategies.get(stepped.strategy, 0) + 1
+        self._step_s.add(stepped.solver_ms / 1e3)
+        self._counts["published_bytes"] += len(stepped.delta)
         self._since_keyframe[0] += 1
         self._since_keyframe[1] += len(stepped.delta)
         steps, size = self._since_keyframe
         if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
             self._since_keyframe = [0, 0]
             self._reads.append(_KEYFRAME)
-        return [Publish("delta", stepped.delta)]
 
     def folded(self, folded: Folded) -> list[Effect]:
         """The solver is free again."""
-        taken = self._running.inserts if self._running else ()
+        self._free(folded, self._running.inserts if self._running else ())
+        return self._go_on([], folded.now)
+
+    def _free(self, folded: Folded | Alone, taken: tuple[Waiting, ...]) -> None:
         self._running = None
         self._ended = folded.now
         seconds = self._ended - self._started
         self._admission.took(len(taken), seconds)
+        for insert in taken:
+            self._insert_s.add(folded.now - insert.since)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
-        return self._go_on([], folded.now)
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
         """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
@@ -138,6 +220,8 @@ class MapCore:
         for insert in self._running.inserts if self._running else ():
             if self._admission.is_open(insert):
                 effects += self._admission.answer(insert, problem)
+                self._unjudged -= 1
+                self._unjudged_bytes -= insert.size
         self._running = None
         return self._go_on(effects, now)
 
@@ -164,6 +248,7 @@ class MapCore:
             "uptime_s": now - self._created,
             "waiting": self._admission.ready,
             "parked": self._admission.parked,
+            "unwritten": self._unjudged - (len(self._running.inserts) if self._running else 0),
             "in_solver": len(self._running.inserts) if self._running else 0,
             "clients": self._admission.next_sequences,
             "inserts": {name: self._counts[name] for name in ("accepted", "refused", "busy")},
@@ -173,26 +258,83 @@ class MapCore:
             "solver_cpu_s": self._solver_cpu_s,
         }
 
+    def account(self, now: float) -> dict[str, Any]:
+        """What admin/stats says of this map: `stats`, with what only an operator asks for."""
+        return self.stats(now) | {
+            "clients": len(self._admission.next_sequences),
+            "refusals": dict(self._refusals),
+            "step_s": self._step_s.as_dict(),
+            "insert_s": self._insert_s.as_dict(),
+            "bytes": {
+                "received": self._counts["received_bytes"],
+                "answered": self._counts["answered_bytes"],
+                "published": self._counts["published_bytes"],
+            },
+        }
+
+    def running_s(self, now: float) -> float:
+        """For how long the solver has been at what it has; 0 when it is free."""
+        return now - self._started if self._running is not None else 0.0
+
+    def _refused(self, problem: Any) -> None:
+        self._counts["busy" if problem.code == "busy" else "refused"] += 1
+        self._refusals[problem.code] += 1
+
     def _go_on(self, effects: list[Effect], now: float) -> list[Effect]:
         """Give the solver what waits, if it is free."""
         if self._running is not None:
             return effects
-        if self._reads or self._admission.ready:
-            reads, inserts = tuple(self._reads), self._admission.take(self._limits.fold)
-            self._running = Run(reads, inserts, self._is_short(reads, inserts, now))
+        limits = self._limits
+        room = self._has_room()
+        if self._reads or self._must_reload or (self._admission.ready and room):
+            reads, inserts = tuple(self._reads), self._admission.take(limits.fold) if room else ()
+            self._running = Run(reads, inserts, self._is_short(reads, inserts, now), self._must_reload)
             self._reads.clear()
+            self._must_reload = False
+            self._unjudged += len(inserts)
+            self._unjudged_bytes += sum([insert.size for insert in inserts])
             self._started = now
             effects.append(self._running)
-        elif self._closing is not None and not self._drained:
+        elif self._closing is not None and not self._drained and not self._unjudged:
             self._drained = True
             effects.append(Drained())
         return effects
 
+    def _has_room(self) -> bool:
+        """May the solver have more, or has the journal to write first?"""
+        return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
+
+    def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
+        """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
+        if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
+            return None
+        if self._must_reload or not self._has_room():
+            return None
+        insert = self._admission.take_alone(arrived)
+        if insert is None:
+            return None
+        self._started = arrived.now
+        self._unjudged += 1
+        self._unjudged_bytes += insert.size
+        self._running = run = Run((), (insert,), True)
+        return run
+
     def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Waiting, ...], now: float) -> bool:
-        if reads or len(inserts) != 1 or self._slowest_s > _SHORT_S or now - self._ended < _ROUND_TRIP_S:
+        if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        return inserts[0].size <= _SHORT_BYTES and not (isinstance(content, Insert) and content.settle)
+        if isinstance(content, Insert) and content.points_below:
+            return False
+        return isinstance(content, Problem) or not content.settle
+
+    def _is_quick(self, size: int, now: float) -> bool:
+        return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S
+
+    def _count_refused(self, effects: list[Effect]) -> list[Effect]:
+        for effect in effects:
+            if isinstance(effect, Refuse):
+                self._refused(effect.problem)
+        return effects
 
     def _event(self, what: str) -> Publish:
         return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

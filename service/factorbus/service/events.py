@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
+from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Problem
 from factorbus.service.questions import Question
@@ -20,11 +21,20 @@ Asker: TypeAlias = Any
 # ---- events -----------------------------------------------------------------------------------------------------
 
 
+class Located(NamedTuple):
+    """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
+
+    message: bytes
+    groups: I64
+    settle: bool
+
+
 class Arrived(NamedTuple):
     """An insert came in.
 
     content: the message, or the problem with it when only its sequence number could be read; such an insert takes
     its place in the sequence and is refused there.  digest tells a repetition from another message of that number.
+    message: the bytes as they came, for the journal.
     """
 
     asker: Asker
@@ -33,8 +43,9 @@ class Arrived(NamedTuple):
     epoch: int
     size: int
     digest: int
-    content: Insert | Problem
+    content: Insert | Located | Problem
     now: float
+    message: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,31 +58,61 @@ class Asked:
 
 
 class Outcome(NamedTuple):
-    """What became of one insert: the bytes of its Accepted, or why it was refused."""
+    """What became of one insert: the bytes of its Accepted, or why it was refused.
+
+    first_factor: the id of its first factor; −1 where it was refused.
+    """
 
     insert: "Waiting"
     answer: bytes | Any
+    first_factor: int = -1
 
 
 class Judged(NamedTuple):
-    """The solver accepted or refused these inserts."""
+    """The solver accepted or refused these inserts.
+
+    revision, together: of the step that took in those that were accepted, and how many they were.
+    """
 
     outcomes: tuple[Outcome, ...]
+    revision: int = 0
+    together: int = 0
 
 
 class Stepped(NamedTuple):
-    """The solver made a step; the delta tells of it."""
+    """The solver made a step; the delta tells of it.
+
+    rebuilt: it brought back what had been accepted, in a new solver, after a fault.
+    """
 
     revision: int
     delta: bytes
     strategy: str
     chi2: float
     solver_ms: float
+    rebuilt: bool = False
 
 
 class Folded(NamedTuple):
     """The solver is done with a Run; how large the map is now, and what its thread has used."""
 
+    variables: int
+    factors: int
+    solver_cpu_s: float
+    now: float
+
+
+class Alone(NamedTuple):
+    """One insert was taken in by a step of its own: what Judged, Stepped and Folded say of it, in one."""
+
+    insert: "Waiting"
+    answer: bytes
+    delta: bytes
+    first_factor: int
+    revision: int
+    strategy: str
+    chi2: float
+    solver_ms: float
     variables: int
     factors: int
     solver_cpu_s: float
@@ -89,8 +130,10 @@ class Waiting:
     sequence: int
     size: int
     digest: int
-    content: Insert | Problem
+    content: Insert | Located | Problem
     askers: list[Asker] = field(default_factory=list)
+    message: bytes = b""
+    since: float = 0.0  # when it arrived
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +180,14 @@ class Publish(NamedTuple):
 class Run(NamedTuple):
     """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
 
-    short: most likely done sooner than another thread would have taken it over.
+    short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
+    the journal has.
     """
 
     reads: tuple[Read, ...]
     inserts: tuple[Waiting, ...]
     short: bool = False
+    reload: bool = False
 
 
 @dataclass(frozen=True, slots=True)

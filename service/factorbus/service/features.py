@@ -72,7 +72,10 @@ class Features:
 
     def ask(self, asker: Asker, payload: bytes) -> None:
         """A question came in."""
-        self._lane.hand(self._take, asker, payload)
+        if (waiting := self._lane.waiting) >= self._most:
+            self._refuse(asker, Busy(waiting, 0.05))
+        else:
+            self._lane.hand(self._take, asker, payload)
 
     def stop(self) -> None:
         """Refuse from now on; returns when all that was asked before is answered or handed to the desk."""

@@ -15,13 +15,30 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
 
+from factorbus.journal.problems import JournalFailed
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core import MapCore
-from factorbus.service.events import Arrived, Asked, Effect, Judged, Read, Refuse, Run, Stepped
+from factorbus.service.events import (
+    Alone,
+    Answer,
+    Arrived,
+    Asked,
+    Asker,
+    Effect,
+    Folded,
+    Judged,
+    Publish,
+    Read,
+    Refuse,
+    Run,
+    Stepped,
+)
 from factorbus.service.fold import Folder
+from factorbus.service.health import Pulse
+from factorbus.service.keeping import Events, Keeper, Keeping
 from factorbus.service.questions import Snapshot
 from factorbus.solver.errors import SolverError
 
@@ -29,6 +46,7 @@ log = logging.getLogger(__name__)
 
 # What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
 Perform: TypeAlias = Callable[[list[Effect]], None]
+SendBoth: TypeAlias = Callable[[Asker, bytes, bytes], None]
 AnswerReads: TypeAlias = Callable[[Sequence[Read], Snapshot], None]
 
 
@@ -36,7 +54,7 @@ class Host:
     """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short Run.
 
     perform: has done what the core wants done, in order, elsewhere; send: the same, at once if the order allows.
-    seat: shared by all maps; who has it may do short Runs.
+    seat: shared by all maps; who has it may do short Runs.  send_both: `send` for an answer and a delta.
     """
 
     def __init__(
@@ -47,13 +65,21 @@ class Host:
         send: Perform,
         answer: AnswerReads,
         seat: threading.Lock,
+        send_both: SendBoth,
+        keeping: Keeping | None = None,
     ) -> None:
         self.core = core
+        self._keeper = keeping.keeper(self) if keeping else None
+        self._keeping = keeping
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
+        self._send_both = send_both
         self._lock = threading.Lock()
-        self._runs: queue.SimpleQueue[Run | None] = queue.SimpleQueue()
+        self._runs: queue.SimpleQueue[Run | Callable[[], None] | None] = queue.SimpleQueue()
+        self._pulse = Pulse(self._runs.put)
         self._thread = threading.Thread(target=self._solve_all, name=f"solver {core.name}", daemon=True)
         self._thread.start()
+        if self._keeper is not None:
+            self._keeper.start()
 
     def created(self) -> None:
         """The map is on the bus."""
@@ -65,7 +91,8 @@ class Host:
             effects = self.core.insert(arrived)
         if effects and isinstance(run := effects[-1], Run) and run.short and self._seat.acquire(blocking=False):
             try:
-                self._perform(effects[:-1])
+                if len(effects) > 1:
+                    self._perform(effects[:-1])
                 self._solve(run, self._send)
             finally:
                 self._seat.release()
@@ -84,6 +111,18 @@ class Host:
             effects = self.core.tick(time.monotonic())
         self._perform(effects)
 
+    def account(self) -> dict[str, Any]:
+        """What admin/stats says of the map."""
+        with self._lock:
+            return self.core.account(time.monotonic()) | self.journal()
+
+    def silent_s(self) -> float:
+        """For how long the solver has not come to its next work, whichever thread it is on."""
+        now = time.monotonic()
+        with self._lock:
+            running_s = self.core.running_s(now)
+        return max(running_s, self._pulse.silent_s(now))
+
     def stop(self) -> None:
         """Take nothing new; Drained is performed when everything accepted is answered."""
         with self._lock:
@@ -96,10 +135,44 @@ class Host:
             effects = self.core.drop(time.monotonic())
         self._perform(effects)
 
-    def end(self) -> None:
-        """End the solver's thread, which may still be sending its last delta; after Drained."""
+    def end(self, keep: bool = True) -> None:
+        """End the solver's thread, which may still be sending its last delta, and then the journal's; after Drained.
+
+        keep: the map is to come back, and quickly.
+        """
         self._runs.put(None)
         self._thread.join()
+        if self._keeper is not None:
+            self._keeper.close(self._folder.dump if keep else None)
+
+    def journal(self) -> dict[str, Any]:
+        """What ask/stats says of the journal, if there is one."""
+        return {} if self._keeper is None else {"journal": self._keeper.stats()}
+
+    # ---- what becomes of the writing: on the journal's thread -------------------------------------------------------
+
+    def kept(self, events: Events) -> None:
+        """What came of a Run is safe."""
+        with self._lock:
+            effects = self.core.kept(events, time.monotonic())
+        self._perform(effects)
+
+    def unkept(self, problem: JournalFailed) -> None:
+        """What was not kept did not happen."""
+        with self._lock:
+            effects = self.core.unkept(problem, time.monotonic())
+        self._perform(effects)
+
+    def blocked(self, problem: JournalFailed) -> None:
+        """Nothing can be kept at the moment."""
+        with self._lock:
+            effects = self.core.block(problem, time.monotonic())
+        self._perform(effects)
+
+    def unblocked(self) -> None:
+        """It can again."""
+        with self._lock:
+            self.core.unblock()
 
     def _perform(self, effects: list[Effect]) -> None:
         if effects and isinstance(run := effects[-1], Run):
@@ -110,11 +183,33 @@ class Host:
 
     def _solve_all(self) -> None:
         while (run := self._runs.get()) is not None:
-            self._solve(run, self._do)
+            if isinstance(run, Run):
+                self._solve(run, self._do)
+            else:
+                run()
 
     def _solve(self, run: Run, tell: Perform) -> None:
         try:
-            self._run(run, tell)
+            if self._keeper is not None:
+                self._run_kept(run, self._keeper, tell)
+                return
+            if run.reads:
+                self._read(run.reads)
+            events = (
+                self._folder.fold_alone(run.inserts[0]) if len(run.inserts) == 1 else self._folder.fold(run.inserts)
+            )
+            if not isinstance(events, Alone):
+                self._tell(events, tell)
+                return
+            answered = events.insert.askers[0]
+            if tell is self._send:
+                self._send_both(answered, events.answer, events.delta)
+            else:
+                tell([Answer(answered, events.answer), Publish("delta", events.delta)])
+            with self._lock:
+                effects = self.core.alone(events, answered)
+            if effects:
+                self._perform(effects)
         except Exception:
             reference = secrets.token_hex(4)
             log.exception("fault %s: map %s has stopped", reference, self.core.name)
@@ -122,11 +217,10 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _run(self, run: Run, tell: Perform) -> None:
-        if run.reads:
-            self._read(run.reads)
+    def _tell(self, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
+        """What comes of a Run, step by step."""
         effects: list[Effect] = []
-        for event in self._folder.fold(run.inserts):
+        for event in events:
             with self._lock:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
@@ -138,6 +232,25 @@ class Host:
             (tell if stepped else self._perform)(effects)
             effects = []
 
+    def _run_kept(self, run: Run, keeper: Keeper, tell: Perform) -> None:
+        """The same with a journal: what comes of it is told when that is safe, or at once if it need not be."""
+        if run.reload and self._keeping is not None:
+            keeper.reloaded(self._keeping.reload(self._folder))
+        if run.reads:
+            self._read(run.reads)
+        events, folded = self._folder.fold_whole(run.inserts)
+        keeper.hand(run.inserts, events)
+        if not keeper.waits:
+            with self._lock:
+                effects = self.core.kept(events, time.monotonic())
+            tell(effects)
+        if run.inserts and (keeper.wants_snapshot() or any(isinstance(e, Stepped) and e.rebuilt for e in events)):
+            started = time.perf_counter()
+            keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
+        with self._lock:
+            effects = self.core.folded(folded)
+        self._perform(effects)
+
     def _read(self, reads: Sequence[Read]) -> None:
         try:
             taken = self._folder.snapshot([read.question for read in reads])
@@ -148,7 +261,14 @@ class Host:
             log.exception("fault %s: no snapshot of map %s", reference, self.core.name)
             self._refuse(reads, Internal(reference))
         else:
+            self._answer_after(reads, taken)
+
+    def _answer_after(self, reads: Sequence[Read], taken: Snapshot) -> None:
+        """Nobody sees what a crash could take back."""
+        if self._keeper is None:
             self._answer(reads, taken)
+        else:
+            self._keeper.after(lambda: self._answer(reads, taken), lambda problem: self._refuse(reads, problem))
 
     def _refuse(self, reads: Sequence[Read], problem: Exception) -> None:
         self._do([Refuse(read.asker, problem) for read in reads if read.asker is not None])

@@ -56,12 +56,12 @@ class Jobs:
 
     def joined(self, worker: str, slots: int) -> None:
         """A worker announced itself."""
-        log.info("worker %s joined with %d slots", worker, slots)
+        log.info("worker %s joined with %d slots", worker, slots, extra={"worker": worker})
         self._perform(self._dispatch.joined(worker, slots))
 
     def left(self, worker: str) -> None:
         """A worker is gone."""
-        log.info("worker %s left", worker)
+        log.info("worker %s left", worker, extra={"worker": worker})
         self._perform(self._dispatch.left(worker))
 
     def heard(self, worker: str) -> None:

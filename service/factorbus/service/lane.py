@@ -19,6 +19,11 @@ class Lane:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
+    @property
+    def waiting(self) -> int:
+        """Calls that are not done."""
+        return len(self._open)
+
     def hand(self, call: Callable[..., None], *arguments: Any) -> None:
         """Have `call(*arguments)` run after all that was handed in before.  Never blocks."""
         self._open.append(None)
@@ -29,7 +34,10 @@ class Lane:
         if self._open:
             self.hand(call, *arguments)
         else:
-            self._do(call, arguments)
+            try:
+                call(*arguments)
+            except Exception:
+                self._log(call)
 
     def close(self) -> None:
         """Return when all that was handed in is done and the thread has ended."""
@@ -47,4 +55,35 @@ class Lane:
             call(*arguments)
         except Exception:
             # One answer that cannot be given must not silence the lane for all others.
-            log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
+            self._log(call)
+
+    def _log(self, call: Callable[..., None]) -> None:
+        log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
+
+
+class Lanes:
+    """Several lanes for calls in no order: one that takes long delays few of the others."""
+
+    def __init__(self, name: str, count: int) -> None:
+        self._lanes = [Lane(f"{name} {n}") for n in range(count)]
+
+    @property
+    def waiting(self) -> int:
+        """Calls that are not done."""
+        return sum(lane.waiting for lane in self._lanes)
+
+    def hand(self, call: Callable[..., None], *arguments: Any) -> None:
+        """Have `call(*arguments)` run on the lane that has least to do.  Never blocks."""
+        min(self._lanes, key=lambda lane: lane.waiting).hand(call, *arguments)
+
+    def settle(self) -> None:
+        """Return when all that was handed in before is done."""
+        for lane in self._lanes:
+            reached = threading.Event()
+            lane.hand(reached.set)
+            reached.wait()
+
+    def close(self) -> None:
+        """Return when all that was handed in is done."""
+        for lane in self._lanes:
+            lane.close()

@@ -4,9 +4,8 @@ A snapshot is taken on the solver's thread between two steps and is a copy: maki
 somebody else's time, and no reader sees half a step or holds one up.
 """
 
-import io
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,42 +16,41 @@ from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import BadMessage, Problem, UnknownQuestion
-from factorbus.proto.symbols import format_symbol
+from factorbus.service.lacking import NotInMap
+from factorbus.service.uncertain import DECODE, Uncertain, is_near
+from factorbus.solver.errors import SolverError
 
-_FORMATS = ("g2o", "tum")
-
-
-class NotInMap(Problem):
-    """A question about a variable that the map does not have."""
-
-    code = "unknown_variable"
-
-    def __init__(self, keys: Iterable[int]) -> None:
-        names = [format_symbol(int(key)) for key in keys]
-        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-        super().__init__(f"the map has no {shown}; ask without keys for all there are", keys=names[:100])
+_FORMATS = ("g2o", "tum", "kitti")
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export."""
+    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export.
+    ask: of one about uncertainty, all of it.
+    """
 
     name: str
     keys: I64 | None = None
     batch: bool = False
     timeout_s: float = 60.0
     format: str = "g2o"
+    ask: Any = None
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Copies of what some questions need, all of one revision."""
+    """Copies of what some questions need, all of one revision.
+
+    uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.
+    """
 
     epoch: int
     revision: int
     variables: tuple[Variables, ...] = ()
     factors: tuple[Factors, ...] = ()
     chi2: float = 0.0
+    uncertain: Uncertain | None = None
+    ready: Mapping[int, bytes | Exception] = field(default_factory=dict)
 
     @property
     def graph(self) -> Graph:
@@ -66,6 +64,8 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, keys=codec.decode_keys_asked(payload))
     if name not in QUESTIONS:
         raise UnknownQuestion(name, f"one of {', '.join(QUESTIONS)}")
+    if name in DECODE:
+        return Question(name, ask=DECODE[name](payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
         return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
@@ -74,15 +74,35 @@ def parse(name: str, payload: bytes) -> Question:
     return Question(name, format=content.get("format", "g2o"))
 
 
-def snapshot(solver: Any, epoch: int, revision: int, questions: Iterable[Question]) -> Snapshot:
-    """What `questions` need of `solver`, copied."""
+def snapshot(
+    solver: Any,
+    epoch: int,
+    revision: int,
+    questions: Sequence[Question],
+    account: Mapping[str, Any],
+    uncertain: Uncertain | None = None,
+) -> Snapshot:
+    """What `questions` need of `solver`, copied.  account: of its last step.  uncertain: R, if it is copied already.
+
+    Raises SolverError.
+    """
     names = {question.name for question in questions}
     whole = bool(names & {"graph", "export"}) or any(q.batch for q in questions)
     variables, factors = solver.graph() if whole else ((), ())
     if not whole and names & {"estimate", "keyframe"}:
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
-    return Snapshot(epoch, revision, as_variables(variables), as_factors(factors), chi2)
+    asked = [question for question in questions if question.ask is not None]
+    view = solver.try_view() if any(is_near(question.ask) for question in asked) else None
+    near = [question for question in asked if view is not None and is_near(question.ask)]
+    ready = {}
+    if view is not None:
+        here = Uncertain(view, epoch, revision, keeps_steps=True, account=account)
+        ready = {id(question): _answer_or_problem(here, question) for question in near}
+    if uncertain is None and len(near) < len(asked):
+        keeps_steps = view is not None or solver.try_view() is not None
+        uncertain = Uncertain(solver.factored(), epoch, revision, keeps_steps, account)
+    return Snapshot(epoch, revision, as_variables(variables), as_factors(factors), chi2, uncertain, ready)
 
 
 def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
@@ -92,11 +112,16 @@ def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
 
 def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
     """The solver's factor groups as what the codec takes."""
-    return tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in groups)
+    return tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in groups)
 
 
 def answer(question: Question, taken: Snapshot) -> bytes:
-    """The answer to any question but stats and chi2 against batch.  Raises NotInMap."""
+    """The answer to any question but stats and chi2 against batch.  Raises Problem, SolverError."""
+    if question.ask is not None:
+        ready = taken.ready.get(id(question))
+        if isinstance(ready, Exception):
+            raise ready
+        return ready if ready is not None else _uncertain(taken).answer(question.ask)
     if question.name in ("estimate", "keyframe"):
         chosen = taken.variables if question.keys is None else _chosen(taken.variables, question.keys)
         return codec.encode_estimate(Estimate(taken.epoch, taken.revision, chosen))
@@ -114,6 +139,19 @@ def answer(question: Question, taken: Snapshot) -> bytes:
     )
 
 
+def _answer_or_problem(uncertain: Uncertain, question: Question) -> bytes | Exception:
+    try:
+        return uncertain.answer(question.ask)
+    except (Problem, SolverError) as problem:
+        return problem
+
+
+def _uncertain(taken: Snapshot) -> Uncertain:
+    if taken.uncertain is None:
+        raise ValueError("the snapshot was not taken for this question")
+    return taken.uncertain
+
+
 def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     missing = np.unique(keys)
     chosen: list[Variables] = []
@@ -128,11 +166,9 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
 
 
 def _text(kind: str, batch: Batch) -> str:
-    from factorbus.formats import write_g2o, write_tum  # only who asks for an export pays for it
+    from factorbus.formats import g2o_text, kitti_text, tum_text  # only who asks for an export pays for it
 
-    text = io.StringIO()
-    (write_g2o if kind == "g2o" else write_tum)(text, batch)
-    return text.getvalue()
+    return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[kind](batch)
 
 
 def _flag(content: dict[str, Any], name: str) -> bool:

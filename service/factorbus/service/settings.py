@@ -25,6 +25,11 @@ def zenoh_settings(config: Config) -> dict[str, Any]:
         "transport/shared_memory/enabled": False,
         # A frozen peer is noticed after 3 s, not 10.
         "transport/link/tx/lease": 3000,
+        "transport/unicast/max_sessions": config.limits.sessions,
+        # Connections that say nothing: by default a hundred of them keep everybody else out for ten seconds.  Measured,
+        # with 150 of them: the next client got in after 21 s, and now at once.
+        "transport/unicast/accept_pending": 1000,
+        "transport/unicast/accept_timeout": 3000,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
         # Zenoh drops what is larger without a word; up to here the service itself can say too_large.
         "transport/link/rx/max_message_size": max(4 * config.limits.message_bytes, 16 << 20),

@@ -11,6 +11,7 @@
 from factorbus.solver import errors
 from factorbus.solver.batch import BatchResult, solve_batch
 from factorbus.solver.errors import SolverError
+from factorbus.solver.fingerprint import fingerprint
 from factorbus.solver.groups import FactorGroup, Group
 from factorbus.solver.kernels._jit import compiled_seconds
 from factorbus.solver.options import Options
@@ -28,6 +29,7 @@ __all__ = [
     "StepReport",
     "compiled_seconds",
     "errors",
+    "fingerprint",
     "solve_batch",
     "warm",
 ]

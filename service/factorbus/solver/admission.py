@@ -6,34 +6,74 @@ behind the rows in use.  The caller goes back to its mark when this raises, so a
 
 import numpy as np
 
-from factorbus.solver import errors
-from factorbus.solver.factors import FACTOR_KINDS, FactorKind
+from factorbus.solver import errors, sights
+from factorbus.solver.factors import FACTOR_KINDS, LENS_AT, LOSSES, FactorKind
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import BatchLike, FactorsLike, VariablesLike
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
+from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.reach import reach
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
 _I64 = np.dtype(np.int64)
 _F64 = np.dtype(np.float64)
+_NO_SCALE = np.empty(0)
+_NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIABLE_KINDS.values()}}
 
 
 def admit(graph: Graph, batch: BatchLike) -> None:
     """Append `batch` to `graph` and give values to the variables that come without.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
-    BadRange, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and must go back to its mark.
+    BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and
+    must go back to its mark.
     """
-    first = int(graph.counts[at.VARIABLES])
-    first_factor = int(graph.counts[at.FACTORS])
-    given = [_admit_variables(graph, group) for group in batch.variables]
+    counts = graph.counts.tolist()
+    first, first_factor = counts[at.VARIABLES], counts[at.FACTORS]
+    new, given = 0, []
+    for group in batch.variables:
+        count, has_values = _admit_variables(graph, group)
+        if has_values:
+            given.append((new, new + count))
+        new += count
     for group in batch.factors:
         _admit_factors(graph, group)
-    if not all(has_values for _, has_values in given):
-        reached = np.repeat(np.array([flag for _, flag in given], np.int64), [count for count, _ in given])
+    if len(given) < len(batch.variables):
+        reached = np.zeros(new, np.int64)
+        for begin, behind in given:
+            reached[begin:behind] = 1
         _compose(graph, first, first_factor, reached)
+    if any(group.kind in LENS_AT for group in batch.factors):
+        sights.check(graph, first_factor)
+
+
+def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
+    """As `admit` for a small batch whose columns lie in `raw` where `groups` says; gives the id of its first factor.
+
+    None where anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
+    """
+    mark = graph.mark()
+    missing = admit_bytes(
+        raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
+        graph.counts,
+    )  # fmt: skip
+    if missing < 0:
+        return None
+    if missing:
+        first, new = mark[at.VARIABLES], [row for row in _rows(groups) if not row[at.G_FACTORS]]
+        reached = np.array([row[at.G_NUMBERS] >= 0 for row in new for _ in range(row[at.G_COUNT])], np.int64)
+        if _find_missing(graph, first, mark[at.FACTORS], reached) >= 0:
+            graph.forget(mark)
+            return None
+    return mark[at.FACTORS]
+
+
+def _rows(groups: I64) -> list[list[int]]:
+    rows = groups.tolist()
+    kinds = [row[at.G_KIND] for row in rows]
+    return rows[: kinds.index(at.END)]
 
 
 def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
@@ -43,7 +83,7 @@ def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
         raise errors.UnknownKind("variable", group.kind, tuple(VARIABLE_KINDS))
     keys = _column(group.keys, _I64, (-1,), group.kind, "keys")
     if group.values is None:
-        values = np.empty((0, kind.size))
+        values = _NO_VALUES[kind.size]
     else:
         values = _column(group.values, _F64, (keys.size, kind.size), group.kind, "values")
     graph.reserve_variables(keys.size, kind.size)
@@ -63,22 +103,44 @@ def _admit_factors(graph: Graph, group: FactorsLike) -> None:
     ends = _column(group.keys, _I64, (-1, len(kind.connects)), group.kind, "keys")
     measured = _column(group.measured, _F64, (len(ends), kind.size), group.kind, "measured")
     information = _column(group.information, _F64, (len(ends), kind.triangle), group.kind, "information")
-    graph.reserve_factors(len(ends), kind.size + kind.triangle)
+    if kind.name in LENS_AT:
+        measured = sights.with_limits(kind, measured)
+    loss, scale = at.NO_LOSS, _NO_SCALE
+    if group.loss:
+        loss, scale = _loss(group, len(ends))
+    graph.reserve_factors(len(ends), kind.size + kind.triangle + 1)
     row, wrong = admit_factors(
-        kind.code, ends, measured, information, graph.table, graph.keys, graph.var, graph.fac, graph.payload,
-        graph.counts,
+        kind.code, loss, ends, measured, information, scale, graph.table, graph.keys, graph.var, graph.fac,
+        graph.payload, graph.counts,
     )  # fmt: skip
+    if wrong == at.BAD_SCALE:
+        raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", "more than 0, standard deviations")
     if wrong != at.GOOD:
         raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
 
 
+def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
+    """(code, scales) of the loss of a group."""
+    code = LOSSES.get(group.loss)
+    if code is None:
+        raise errors.BadLoss(group.kind, f"the loss {group.loss!r}", f"none, or one of {', '.join(LOSSES)}")
+    if group.scale is None:
+        raise errors.BadLoss(f"{group.kind} {group.loss}", "no scale", "one for each factor, standard deviations")
+    return code, _column(group.scale, _F64, (count,), group.kind, "scale")
+
+
 def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
-    missing = reach(
+    missing = _find_missing(graph, first, first_factor, reached)
+    if missing >= 0:
+        raise errors.Uninitialised(int(graph.keys[missing]))
+
+
+def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> int:
+    """Compose values for those that are not `reached` yet; gives one that nothing leads to, or −1."""
+    return reach(
         True, first, first_factor, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload,
         reached,
     )  # fmt: skip
-    if missing >= 0:
-        raise errors.Uninitialised(int(graph.keys[missing]))
 
 
 def _column(array: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> np.ndarray:

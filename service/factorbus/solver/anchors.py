@@ -1,8 +1,8 @@
 """Is every variable held by something?  Checked before a factorisation would fail, or survive by luck.  MATH §7.
 
 Variables that earlier steps took in are held.  A new one is when it is fixed, has a prior, is joined to a held pose by
-a between factor, or seen from a held pose.  Those that this finds are held; the others ("suspects") may still be, by
-several factors together, which only the numbers can tell: `find_loose` asks the factor of Λ.
+a between factor, seen from a held pose, or fixed by several factors on what is held.  Those that this finds are held;
+the others ("suspects") may still be, which only the numbers can tell: `find_loose` asks the factor of Λ.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from factorbus.solver.blocks import Blocks
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.hold import hold
 from factorbus.solver.kernels.reach import join, reach
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
@@ -21,13 +22,17 @@ _NONE = np.empty(0, np.int64)
 
 
 def find_unheld(graph: Graph, since: Mark) -> I64:
-    """The free variables after `since` that no single chain of factors holds."""
+    """The free variables after `since` that neither a chain of factors holds, nor several on what is held."""
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     if first == last:
         return _NONE
     held = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
-    if reach(False, first, *factors, graph.var, graph.fac, graph.values, graph.payload, held) < 0:
+    arenas = graph.var, graph.fac, graph.values, graph.payload
+    while reach(False, first, *factors, *arenas, held) >= 0:
+        if not hold(first, *factors, *arenas, held):
+            break
+    else:
         return _NONE
     return first + np.flatnonzero(held == 0)
 

@@ -44,6 +44,8 @@ class Reach:
 class BlockFactor:
     """RᵀR = PΛPᵀ and d = R⁻ᵀPη."""
 
+    NOT_KEPT = ("_room",)
+
     def __init__(self) -> None:
         self.rec: I64 = np.empty((16, br.RECORD), np.int64)
         self.index: I64 = np.empty(64, np.int64)

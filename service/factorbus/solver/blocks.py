@@ -17,6 +17,8 @@ from factorbus.solver.kernels.pattern import connect, enter_blocks, remove_block
 class Blocks:
     """The normal equations Λ δ = η of a graph's free variables, linearised at given values."""
 
+    NOT_KEPT = ("_spare_data", "_spare_eta")
+
     def __init__(self) -> None:
         self.pattern: I64 = np.empty((3, 32), np.int64)
         self.table: I64 = np.zeros(64, np.int64)

@@ -20,6 +20,8 @@ _ANYWHERE, _RECENT_LANDMARK, _LAST_POSE = 0, 1, 2
 class Elimination:
     """The factor R of Λ = Rᵀ R, with its arena, order and analysis."""
 
+    NOT_KEPT = ("_options",)
+
     def __init__(self, options: Options) -> None:
         self._options = options
         if options.backend == "cholmod":

@@ -13,6 +13,9 @@
     ├── NotFinite              not_finite              a NaN or an infinity, given or arising
     ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
     ├── BadRange               bad_range               a range that is not positive
+    ├── BadLens                bad_lens                a lens that cannot be
+    ├── BadSight               bad_sight               a pixel of what the camera cannot see
+    ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
     ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
     ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
     └── Underconstrained       underconstrained        a variable that the factors leave free to move
@@ -142,6 +145,31 @@ class BadRange(SolverError):
         super().__init__(
             f"{where}: the range is {seen:g}, wanted more than 0; measured is (bearing, range)", where=where
         )
+
+
+class BadLens(SolverError):
+    code = "bad_lens"
+
+    def __init__(self, where: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{where}: of its lens seen {seen}, wanted {wanted}", where=where)
+
+
+class BadSight(SolverError):
+    code = "bad_sight"
+
+    def __init__(self, where: str, pixel: tuple[float, float], reason: str) -> None:
+        super().__init__(
+            f"{where}: pixel ({pixel[0]:.6g}, {pixel[1]:.6g}): {reason}; leave this sight out",
+            where=where,
+            reason=reason,
+        )
+
+
+class BadLoss(SolverError):
+    code = "bad_loss"
+
+    def __init__(self, where: str, seen: str, wanted: str) -> None:
+        super().__init__(f"{where}: seen {seen}, wanted {wanted}", where=where)
 
 
 class NotPositiveDefinite(SolverError):

@@ -6,7 +6,7 @@ Tests are run for every entry of `FACTOR_KINDS`: a new kind gets them by being d
 from dataclasses import dataclass
 
 from factorbus.solver.kernels import layout
-from factorbus.solver.variables import POINT2, POINT3, SE2, SE3, VariableKind
+from factorbus.solver.variables import IDP, POINT2, POINT3, SE2, SE3, VariableKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,18 @@ FACTOR_KINDS = {
         FactorKind(
             "bearing_range_se2", layout.BEARING_RANGE_SE2, (SE2, POINT2), 2, 2, "(radians, metres)", "MATH (3.4)"
         ),
+        FactorKind("idp_first", layout.IDP_FIRST, (SE3, IDP), 14, 6, "pixel, ρ₀, lens", "MATH (3.15)"),
+        FactorKind("idp_seen", layout.IDP_SEEN, (SE3, IDP), 13, 2, "pixel, lens", "MATH (3.16)"),
+        FactorKind("point_seen", layout.POINT_SEEN, (SE3, POINT3), 13, 2, "pixel, lens", "MATH (3.17)"),
     )
 }
+LENS_AT = {"idp_first": 3, "idp_seen": 2, "point_seen": 2}  # where in a measurement the code of its lens is
+LOSSES = {
+    "huber": layout.HUBER,
+    "cauchy": layout.CAUCHY,
+    "geman-mcclure": layout.GEMAN_MCCLURE,
+    "tukey": layout.TUKEY,
+    "dcs": layout.DCS,
+}
+LOSS_OF_CODE = {code: name for name, code in LOSSES.items()}
 FACTOR_KIND_OF_CODE = {kind.code: kind for kind in FACTOR_KINDS.values()}

@@ -21,7 +21,10 @@ class VariablesLike(Protocol):
 
 
 class FactorsLike(Protocol):
-    """Factors of one kind that come in: keys (m, arity), measured (m, size), information (m, triangle)."""
+    """Factors of one kind that come in: keys (m, arity), measured (m, size), information (m, triangle).
+
+    loss: one of `factors.LOSSES`, or "": rᵀ Ω r as it is; scale (m,): of a loss, in standard deviations.
+    """
 
     @property
     def kind(self) -> str: ...
@@ -31,6 +34,10 @@ class FactorsLike(Protocol):
     def measured(self) -> F64: ...
     @property
     def information(self) -> F64: ...
+    @property
+    def loss(self) -> str: ...
+    @property
+    def scale(self) -> F64 | None: ...
 
 
 class BatchLike(Protocol):
@@ -54,9 +61,14 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class FactorGroup:
-    """Factors of one kind in the order of their ids: keys (m, arity), measured (m, size), information (m, triangle)."""
+    """Factors of one kind with one loss, in the order of their ids.
+
+    keys (m, arity), measured (m, size), information (m, triangle); with a loss its scale (m,).
+    """
 
     kind: str
     keys: I64
     measured: F64
     information: F64
+    loss: str = ""
+    scale: F64 | None = None

@@ -31,6 +31,8 @@ class Where(Enum):
 class Incremental:
     """R and d, and solving with them."""
 
+    NOT_KEPT = ("_options",)
+
     def __init__(self, elimination: Elimination, options: Options) -> None:
         self.elimination = elimination
         self.rows = BlockFactor()

@@ -31,7 +31,7 @@ MODE_OF_NAME = {
         Mode("tree", updates=True, tree=True),
     )
 }
-AUTO = "inc-l"
+AUTO = "tree"
 MODES = ("auto", *MODE_OF_NAME)
 
 

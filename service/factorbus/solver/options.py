@@ -17,7 +17,7 @@ class Options:
     mode            "inc-l": R is updated, and made anew when that is better (2013 paper, Algorithm 1); "inc-l-b10",
                     "inc-l-b100": the same with a batch after every 10 or 100 new variables and none in between;
                     "all-batch": every step that solves factorises anew; "tree": only the part of R that a step affects
-                    is made again, and only variables that need it are relinearised (MATH §9); "auto" is "inc-l"
+                    is made again, and only variables that need it are relinearised (MATH §9); "auto" is "tree"
     clock           seconds, for the phases in the report; without one they are zero
     tolerance       all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
     tol             inc-l: the same, and a first step that would is not made.  The paper's tol, with the length of δ
@@ -39,7 +39,8 @@ class Options:
                     that factors of the map have on average (MATH §9.6); bent_now: and solved for again at once, in up
                     to `rounds` rounds, when it is by more than that; trust: above that χ² is looked at, and a step that
                     raised it is replaced
-    look_every      tree: it is looked for what is bent every so many steps, and where something turned far
+    look_every, look_turned   tree: it is looked for what is bent every so many steps, and when something turned so far
+                    that this may be bent by this much
     ripple          tree: δ follows where it is off by more than this many, as above (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
@@ -66,9 +67,10 @@ class Options:
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
+    look_turned: float = 0.3
     ripple: float = 0.05
     recent_steps: int = 3
-    split_pivots: int = 48
+    split_pivots: int = 24
     split_share: float = 0.5
     backend: Literal["blocks", "cholmod"] = "blocks"
 

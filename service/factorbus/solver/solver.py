@@ -1,26 +1,36 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from factorbus.solver import errors
-from factorbus.solver.admission import admit
+from factorbus.solver import errors, sights
+from factorbus.solver.admission import admit, try_admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
+from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
+from factorbus.solver.covariance.live import Live
+from factorbus.solver.covariance.upkeep import Upkeep
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import BatchLike, FactorGroup, Group
-from factorbus.solver.incremental import Incremental
+from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
+from factorbus.solver.ripening import find_ripe, with_points
+from factorbus.solver.state import State, dump, load
 from factorbus.solver.strategy import Plan
+from factorbus.solver.symbolic import Symbolic
 from factorbus.solver.system import System
 from factorbus.solver.tree_steps import TreeSteps
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
@@ -46,8 +56,13 @@ class _Done:
     batch: int = 0
 
 
+_VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Where)})
+
+
 class Solver:
     """Variables, factors and their estimate.  Not thread-safe: one thread owns it."""
+
+    NOT_KEPT = ("_options", "_mode", "_live")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -55,6 +70,7 @@ class Solver:
         self._mode = mode_named(self._options.mode)
         self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
         self._tree = TreeSteps(self._graph, self._options) if self._mode.tree else None
+        self._live = Live(self._graph, self._tree.tree) if self._tree else None
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
@@ -81,6 +97,14 @@ class Solver:
             self._graph.forget(mark)
             raise
         return mark[at.FACTORS]
+
+    def try_stage(self, raw: bytes, groups: I64) -> int | None:
+        """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
+
+        groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
+        caller's word: they are not checked again.
+        """
+        return try_admit(self._graph, raw, groups)
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
@@ -119,19 +143,86 @@ class Solver:
 
     def changed(self) -> list[Group]:
         """The variables whose values have other bits than before the last step, new ones included, in the same form."""
-        return self._graph.variables(self._tree.changed() if self._tree else self._changed)
+        return self._graph.variables(self.pick_changed()[0])
+
+    def pick_changed(self) -> tuple[I64, Graph]:
+        """What `changed` tells of as indices of variables, ascending, and the arenas to look them up in, to be read."""
+        return self._tree.changed() if self._tree else self._changed, self._graph
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._tree.chi2() if self._tree else self._done.chi2
 
+    def ripe(self, below: float) -> I64:
+        """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
+        return self._graph.keys[find_ripe(self._graph, below)]
+
+    def with_points(self, keys: I64) -> tuple["Solver", StepReport]:
+        """A solver in which these features are points, under their keys, and its first step; this one stays as it is.
+
+        Later sights of them may still be sent as `idp_seen`.  Raises UnknownVariable, KindMismatch, and as `step` does.
+        """
+        picked = np.array([self._graph.find(key) for key in keys.tolist()], np.int64)
+        for key, v in zip(keys.tolist(), picked.tolist(), strict=True):
+            if v < 0:
+                raise errors.UnknownVariable(key, "turning features into points")
+            if (kind := int(self._graph.var[v, at.V_KIND])) != at.IDP:
+                raise errors.KindMismatch(key, "turning features into points", VARIABLE_KIND_OF_CODE[kind].name, "idp")
+        made = Solver(self._options)
+        made._graph.take(with_points(self._graph, picked))
+        return made, made.step()
+
+    def asleep(self) -> list[tuple[int, str, str]]:
+        """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
+        return sights.asleep(self._graph)
+
     def memory_bytes(self) -> int:
         """Bytes in use for the graph and for what solves it."""
         return self._graph.memory_bytes() + (self._tree.tree if self._tree else self._system).memory_bytes()
 
-    def graph(self) -> tuple[list[Group], list[FactorGroup]]:
-        """A copy of everything: variables with their present values, and factors by kind in the order of their ids."""
-        return self._graph.variables(), self._graph.factors()
+    def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
+        """A copy of everything: variables with their present values, and factors by kind in the order of their ids.
+
+        variables, factors: no more than the first so many.
+        """
+        picked = None if variables is None else np.arange(min(variables, self.variable_count))
+        return self._graph.variables(picked), self._graph.factors(factors)
+
+    def dump(self) -> State:
+        """All that later steps depend on, as of the last step: `load` it into a solver with the same options.
+
+        That one goes on with the same bits, if it has the same `fingerprint`.  Nothing may be staged.
+        """
+        return dump(self)
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Be where the solver that gave `state` was.  Raises ValueError, and is of no use then."""
+        load(self, state, _VALUES)
+
+    def factored(self) -> Factored:
+        """A copy of R and of all that it is of, as of the last step: what covariances are computed from, elsewhere.
+
+        In the mode "tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        """
+        return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
+
+    def try_view(self) -> Factored | None:
+        """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
+
+        None: this mode keeps no R that could be read in place; `factored` makes one.
+        """
+        return viewed(self._graph, self._tree.tree) if self._tree else None
+
+    def try_upkeep(self) -> Upkeep | None:
+        """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
+        return Upkeep(self._graph, self._tree.tree) if self._tree else None
+
+    def try_joint(self, variables: I64) -> F64 | None:
+        """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
+
+        None: as for `try_view`.
+        """
+        return self._live.joint(variables) if self._live else None
 
     def _place_new(self) -> None:
         """Good first values for the few variables that a step of a robot brings."""
@@ -274,6 +365,7 @@ class Solver:
             changed=int(self._changed.size),
             relinearised=course.iterations * columns,
             eliminated=plan.rows + course.factorisations * columns,
+            asleep=len(sights.asleep(self._graph)) if self._graph.sights else 0,
             nnz_r=nonzeros,
             flops=flops,
             damping=course.damping,

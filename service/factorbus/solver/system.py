@@ -20,6 +20,8 @@ _FREE_DIRECTION = (
 class System:
     """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
 
+    NOT_KEPT = ("_before", "_moved", "_suspects", "_trial", "_watch", "graph")
+
     def __init__(self, graph: Graph, factor: Incremental) -> None:
         self.graph = graph
         self.blocks = Blocks()

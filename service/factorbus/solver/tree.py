@@ -10,24 +10,32 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.tree_begin import HESSIAN
 from factorbus.solver.kernels.tree_moved import exchange, list_moved
 from factorbus.solver.kernels.tree_step import tree_step
 from factorbus.solver.options import Options
 
-_HESSIAN = 6 * 6 * 3 + 13  # doubles of the largest record
 _LINE = 8  # doubles in a cache line
+_FEW = 8  # new variables for which good first values are looked for
 
 
 class Tree:
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
+    NOT_KEPT = ("_graph", "_settings")
+
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph = graph
-        self._recent, self._rounds = options.recent_steps, options.rounds
         self._settings: F64 = np.empty(tl.P_SIZE)
         self._settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
         self._settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
-        self._settings[tl.P_EVERY] = options.look_every
+        self._settings[[tl.P_EVERY, tl.P_LOOK, tl.P_RECENT]] = (
+            options.look_every,
+            options.look_turned,
+            options.recent_steps,
+        )
+        self._settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
+        self._settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.node: I64 = np.empty((16, tl.N_WIDTH), np.int64)
         self.link: I64 = np.empty((16, tl.L_WIDTH), np.int64)
         self.clique: I64 = np.empty((16, tl.C_WIDTH), np.int64)
@@ -47,33 +55,30 @@ class Tree:
         self.state[tl.S_FREE_CLIQUE] = -1
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
-    def step(self) -> int:
-        """Take in what is new in the graph and solve; gives −1, or the variable whose pivot failed.
+    def step(self, sure: bool = False) -> int:
+        """Take in what is new in the graph and solve; gives a status: DONE, UNSURE, FAILED, INFINITE.
 
-        When one failed nothing has changed, and the graph has to forget what is new.
+        UNSURE: only the numbers can tell whether everything new is held; the next call is to be with `sure`.  FAILED:
+        the pivot of variable `failed` was not positive.  INFINITE: the χ² of a new factor is beyond numbers.  After
+        these nothing has changed, and the graph has to forget what is new where it is to be refused.
         """
         graph, state = self._graph, self.state
-        counts = graph.counts.tolist()
-        self._reserve(counts)
-        state[tl.S_ELIMINATED : tl.S_ROUNDS + 1] = 0
-        state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)] = 0
-        state[tl.S_FAILED] = -1
-        state[tl.S_STEP] += 1
-        self.account[tl.A_BEND] = 0.0
+        if sure:
+            state[tl.S_CHECKED] = 1
         while True:
             status = tree_step(
-                counts[at.VARIABLES], counts[at.FACTORS], self._recent, self._rounds, self._settings, graph.var,
-                graph.fac, graph.values, graph.payload, self.node, self.link, self.clique, self.lists, self.numbers,
-                self.hessian, self.lin, self.scalars, self.stiff, self.lever, self.pending, self.changed, self.moved,
-                self.saved, state, self.account,
+                graph.counts, self._settings, graph.var, graph.fac, graph.values, graph.payload, self.node, self.link,
+                self.clique, self.lists, self.numbers, self.hessian, self.lin, self.scalars, self.stiff, self.lever,
+                self.pending, self.changed, self.moved, self.saved, state, self.account,
             )  # fmt: skip
             if status != tl.NO_ROOM:
-                break
+                return status
             self._make_room()
-        if status == tl.FAILED:
-            state[tl.S_STEP] -= 1
-            return int(state[tl.S_FAILED])
-        return -1
+
+    @property
+    def failed(self) -> int:
+        """The variable whose pivot made the last step fail."""
+        return int(self.state[tl.S_FAILED])
 
     def move_all(self) -> None:
         """The next step moves the linearisation points of all variables to the estimate."""
@@ -109,7 +114,22 @@ class Tree:
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
-    def _reserve(self, counts: list[int]) -> None:
+    def _make_room(self) -> None:
+        self._make_room_for_graph()
+        state = self.state
+        if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
+            self.clique = grown(self.clique, need)
+        if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
+            self.lists = grown(self.lists, need)
+        if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
+            larger = _aligned(max(need, 2 * self.numbers.size))
+            larger[: self.numbers.size] = self.numbers
+            self.numbers = larger
+        state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
+
+    def _make_room_for_graph(self) -> None:
+        """Of the arenas by variable and by factor, as `kernels/tree_begin.py` looks for it."""
+        counts = self._graph.mark()
         variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
         if variables > len(self.node):
             self.node, self.lever, self.pending, self.changed, self.moved = (
@@ -122,22 +142,10 @@ class Tree:
         if counts[at.SCALARS] > self.scalars.shape[1]:
             self.scalars = _widened(self.scalars, counts[at.SCALARS])
         new = factors - int(self.state[tl.S_FACTORS])
-        if (need := int(self.state[tl.S_HESSIAN]) + new * _HESSIAN) > self.hessian.size:
+        if (need := int(self.state[tl.S_HESSIAN]) + new * HESSIAN) > self.hessian.size:
             self.hessian = grown(self.hessian, need)
         if 2 * new > len(self.saved):
             self.saved = np.empty((4 * new, 8))
-
-    def _make_room(self) -> None:
-        state = self.state
-        if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
-            self.clique = grown(self.clique, need)
-        if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
-            self.lists = grown(self.lists, need)
-        if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            larger = _aligned(max(need, 2 * self.numbers.size))
-            larger[: self.numbers.size] = self.numbers
-            self.numbers = larger
-        state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 
 
 def _aligned(size: int) -> F64:

@@ -4,6 +4,8 @@ A step solves a linear problem and is taken as it is where nothing bends far (MA
 compared with what it was, and a step that would raise it is replaced by a batch from where the estimate stood.
 """
 
+import copy
+
 import numpy as np
 
 from factorbus.solver import errors
@@ -14,26 +16,28 @@ from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.incremental import Incremental
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
-from factorbus.solver.kernels.settle_new import settle_new
+from factorbus.solver.kernels.move import differing
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
-_FEW = 8  # new variables for which good first values are looked for
 _START: Mark = (0,) * at.COUNTS
 
 
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
+    NOT_KEPT = ("_graph", "_options")
+
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched = 0, False
+        self._moved: I64 = np.empty(0, np.int64)  # by a batch
 
     @property
     def tree(self) -> Tree:
@@ -42,75 +46,77 @@ class TreeSteps:
 
     def step(self, settle: bool) -> StepReport:
         """As `Solver.step`."""
-        watch = Stopwatch(self._options.clock)
+        clock = self._options.clock or _no_clock
+        started = clock()
+        tree, because = self._tree, ""
         try:
-            self._place_new()
-            because = self._check_held()
-            watch.lap("check")
-            failed = self._tree.step()
-            watch.lap("compiled")
-            if failed >= 0:
-                raise self._loose(failed)
+            status = tree.step()
+            if status == tl.UNSURE:
+                because = self._check_held()
+                status = tree.step(sure=True)
+            if status == tl.FAILED:
+                raise self._system(self._apart()).underconstrained(tree.failed)
+            if status == tl.INFINITE:
+                raise errors.NotFinite("χ² of the new factors")
         except BaseException:
             self._graph.forget(self._mark)
             raise
+        compiled = clock()
         course = None
-        if settle:
-            course, because = self._batch(settle=True), "asked to settle"
-        elif self._is_worse():
-            course, because = self._batch(settle=False), "χ² would have risen: a batch from where the estimate stood"
-        return self._account(watch, course, because)
+        if settle and self._graph.counts[at.COLUMNS]:
+            tree.exchange()
+            before = self._graph.values.copy()
+            tree.exchange()
+            course, because = self._batch(before, settle=True), "asked to settle"
+        elif tree.account[tl.A_BEND] > self._options.trust and self._is_worse():
+            before = self._graph.values.copy()
+            course = self._batch(before, settle=False)
+            because = "χ² would have risen: a batch from where the estimate stood"
+        return self._account(started, compiled, clock(), course, because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
         if self._batched:
-            return np.arange(int(self._graph.counts[at.VARIABLES]))
+            return self._moved
         return self._tree.list_moved(self._first_new)
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._sum_chi2(self._mark[at.FACTORS])
 
-    def _place_new(self) -> None:
-        mark, counts = self._mark, self._graph.counts.tolist()
-        if counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and self._options.place_new:
-            settle_new(
-                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS],
-                self._options.negligible, self._graph.var, self._graph.fac, self._graph.values, self._graph.payload,
-            )  # fmt: skip
-
     def _check_held(self) -> str:
-        """Refuse new variables that nothing holds; gives what the step is done for.  Raises Underconstrained."""
+        """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
         suspects = find_unheld(self._graph, self._mark)
-        if suspects.size:
-            free = find_unanchored(self._graph, self._mark)
-            system = self._system()
-            if free >= 0:
-                raise system.underconstrained(
-                    free,
-                    "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to "
-                    "the rest of the map",
-                )
-            system.begin(suspects, Stopwatch(None))
-            system.factorize(0.0)
-            return f"{suspects.size} new variables are held only by several factors together"
-        return ""
+        if not suspects.size:
+            return ""
+        free = find_unanchored(self._graph, self._mark)
+        system = self._system(self._apart())
+        if free >= 0:
+            raise system.underconstrained(
+                free,
+                "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to the "
+                "rest of the map",
+            )
+        system.begin(suspects, Stopwatch(None))
+        system.factorize(0.0)
+        return f"{suspects.size} new variables are held only by several factors together"
 
-    def _loose(self, variable: int) -> errors.Underconstrained:
-        return self._system().underconstrained(variable)
+    def _apart(self) -> Graph:
+        """The graph with rows of its own, for equations that leave it as it is."""
+        graph = copy.copy(self._graph)
+        graph.var, graph.fac = graph.var.copy(), graph.fac.copy()
+        return graph
 
-    def _system(self) -> System:
+    def _system(self, graph: Graph) -> System:
         """All normal equations at the estimate, apart from the tree."""
         options = self._options
-        system = System(self._graph, Incremental(Elimination(options), options))
-        system.blocks.extend(self._graph, _START)
+        system = System(graph, Incremental(Elimination(options), options))
+        system.blocks.extend(graph, _START)
         system.factor.moved()
         return system
 
     def _is_worse(self) -> bool:
-        """Whether a step that bent something far raised χ²; the estimate is then what it was before."""
-        if not self._tree.account[tl.A_BEND] > self._options.trust:
-            return False
+        """Whether the step raised χ²; the estimate is then what it was before."""
         factors = int(self._graph.counts[at.FACTORS])
         after = self._sum_chi2(factors)
         self._tree.exchange()
@@ -119,51 +125,62 @@ class TreeSteps:
         self._tree.exchange()
         return False
 
-    def _batch(self, settle: bool) -> Course:
-        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows."""
+    def _batch(self, before: F64, settle: bool) -> Course:
+        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows.
+
+        before: the values as they were before the step
+        """
         options = self._options
-        system = self._system()
+        system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = Rule(options.tolerance, options.negligible, options.max_iterations)
         if settle:
             rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
         course = minimise(system, chi2, 0.0, rule)
-        self._tree.move_all()
-        self._tree.step()
-        self._batched = True
+        if course.iterations or not settle:
+            self._tree.move_all()
+            self._tree.step()
+        count = int(self._graph.counts[at.VARIABLES])
+        found = np.empty(count, np.int64)
+        bits = before.view(np.int64), self._graph.values.view(np.int64)
+        self._moved = found[: differing(self._mark[at.VARIABLES], count, self._graph.var, *bits, found)]
         return course
 
     def _sum_chi2(self, factors: int) -> float:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, watch: Stopwatch, course: Course | None, because: str) -> StepReport:
-        state, tree = self._tree.state, self._tree
-        counts = self._graph.mark()
-        before, self._mark = self._mark, counts
+    def _account(self, started: float, compiled: float, done: float, course: Course | None, because: str) -> StepReport:
+        before, self._mark = self._mark, self._graph.mark()
+        now = self._mark
         self._first_new, self._batched = before[at.VARIABLES], course is not None
-        eliminated, relinearised, _, changed, flops = state[tl.S_ELIMINATED : tl.S_FLOPS + 1].tolist()
-        chi2 = self.chi2() if course else float(tree.account[tl.A_CHI2])
-        total = watch.total_ms()
-        cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)].tolist()
-        share = watch.phases_ms.get("compiled", 0.0) / max(sum(cycles), 1)
+        state = self._tree.state[: tl.S_FREE].tolist()
+        relinearised, changed = state[tl.S_RELINEARISED], self._moved.size if course else state[tl.S_TOLD]
+        chi2 = self.chi2() if course else float(self._tree.account[tl.A_CHI2])
+        cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
+        share = 1e3 * (compiled - started) / max(sum(cycles), 1)
         return StepReport(
             mode="tree",
-            strategy="batch" if course else ("tree" if changed or relinearised else "extend"),
+            strategy="batch" if course else ("tree" if state[tl.S_CHANGED] or relinearised else "extend"),
             because=because or f"{relinearised} variables bent too far",
-            iterations=course.iterations if course else int(state[tl.S_ROUNDS]),
+            iterations=course.iterations if course else state[tl.S_ROUNDS],
             chi2=chi2,
             chi2_before=chi2,
-            new_variables=counts[at.VARIABLES] - before[at.VARIABLES],
-            new_factors=counts[at.FACTORS] - before[at.FACTORS],
+            new_variables=now[at.VARIABLES] - before[at.VARIABLES],
+            new_factors=now[at.FACTORS] - before[at.FACTORS],
             changed=changed,
             relinearised=relinearised,
-            eliminated=eliminated,
-            nnz_r=int(state[tl.S_NONZEROS]),
-            flops=float(flops),
+            eliminated=state[tl.S_ELIMINATED],
+            asleep=state[tl.S_ASLEEP],
+            nnz_r=state[tl.S_NONZEROS],
+            flops=float(state[tl.S_FLOPS]),
             converged=course.converged if course else True,
             phases_ms={name: share * count for name, count in zip(tl.PHASES, cycles, strict=True)},
-            step_ms=total,
-            compiled_ms=watch.phases_ms.get("compiled"),
+            step_ms=1e3 * (done - started),
+            compiled_ms=1e3 * (compiled - started),
         )
+
+
+def _no_clock() -> float:
+    return 0.0

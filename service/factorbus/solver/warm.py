@@ -7,20 +7,23 @@ from types import ModuleType
 from typing import Any
 
 from factorbus.solver import kernels
+from factorbus.solver.covariance import kernels as covariance_kernels
 from factorbus.solver.kernels._jit import compiled_seconds, iter_compile
 
 
-def warm(progress: Callable[[str], None] | None = None, package: ModuleType = kernels) -> float:
-    """Compile (or load from disk) all kernels in `package`; gives the seconds spent compiling.
+def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -> float:
+    """Compile (or load from disk) all kernels in `packages`, the solver's own by default; gives the seconds spent
+    compiling.
 
     `progress` is called with the name of each file of kernels before its turn.
     """
     before = compiled_seconds()
-    for name, found in _iter_groups(package):
-        if progress:
-            progress(name)
-        for _ in iter_compile(*found):
-            pass
+    for package in packages or (kernels, covariance_kernels):
+        for name, found in _iter_groups(package):
+            if progress:
+                progress(name)
+            for _ in iter_compile(*found):
+                pass
     return compiled_seconds() - before
 
 

@@ -102,7 +102,7 @@ def timed_calls() -> Iterator[Callable[[Any], float]]:
 def _drive(
     mode: str, steps: Sequence[Batch], inside: Callable[[Any], float], tell: Callable[[int], None] = lambda _: None
 ) -> dict[str, Any]:
-    solver, rows = Solver(Options(mode=mode)), np.zeros((len(steps), 2))
+    solver, rows = Solver(Options(mode=mode, clock=time.perf_counter)), np.zeros((len(steps), 2))
     own = False
     gc.collect()
     gc.disable()

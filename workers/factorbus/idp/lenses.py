@@ -1,6 +1,5 @@
 """A camera's numbers as the kernels want them, with the radius up to which its lens is one to one."""
 
-import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,8 +9,7 @@ from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import pixels as kernels
 from factorbus.idp.kernels.compile import F64, I64
 from factorbus.proto.camera import Camera
-
-_CODES = {"pinhole": at.RADTAN, "radtan": at.RADTAN, "fisheye": at.FISHEYE, "radial": at.RADIAL}
+from factorbus.solver.lenses.limits import limit_of
 
 
 class Mapped(NamedTuple):
@@ -41,32 +39,8 @@ def pixels(camera: Camera, rays: F64) -> Mapped:
 
 @lru_cache(maxsize=64)
 def lens_of(camera: Camera) -> tuple[int, F64]:
-    """(code, numbers) of a camera's lens, as `kernels/layout.py` lays them out; the same array again each time."""
-    lens = np.zeros(at.LENS_SIZE)
-    code = _CODES[camera.model]
-    lens[at.CX], lens[at.CY] = camera.number("cx"), camera.number("cy")
-    if code == at.RADIAL:
-        f, dx, dy = (camera.number(name) for name in ("f", "dx", "dy"))
-        lens[at.FU], lens[at.FV] = f / dx, f / dy
-        more = (dx, dy, camera.number("k1"), camera.number("k2"))
-        lens[at.LIMIT] = _limit((1.0, 3.0 * more[2], 5.0 * more[3]))
-    else:
-        lens[at.FU], lens[at.FV] = camera.number("fx"), camera.number("fy")
-        more = camera.numbers[4:]
-        lens[at.LIMIT] = _limit_of(code, more)
-    lens[at.MORE : at.MORE + len(more)] = more
+    """(code, numbers) of a camera's lens, as `factorbus.solver.lenses.layout` has them; the same array each time."""
+    lens = np.array(camera.lens())
+    code, lens = int(lens[0]), lens[1:].copy()
+    lens[at.LIMIT] = limit_of(code, lens[at.MORE :].tolist())
     return code, lens
-
-
-def _limit_of(code: int, more: tuple[float, ...]) -> float:
-    if code == at.FISHEYE:
-        return min(_limit((1.0, *(k * (2 * i + 3) for i, k in enumerate(more)))), math.pi)
-    k1, k2, _, _, k3 = (*more, *[0.0] * (5 - len(more)))
-    return _limit((1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3))
-
-
-def _limit(slope: tuple[float, ...]) -> float:
-    """The smallest r > 0 where the slope 1 + s₁ r² + s₂ r⁴ + … of the radial function is 0; infinite if nowhere."""
-    roots = np.roots(np.trim_zeros(slope[::-1], "f"))
-    real = roots.real[(abs(roots.imag) <= 1e-9 * abs(roots)) & (roots.real > 0.0)]
-    return math.sqrt(real.min()) if real.size else math.inf

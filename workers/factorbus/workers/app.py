@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.proto import codec, keys
+from factorbus.proto import codec, discreet, keys
 from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
@@ -69,7 +69,7 @@ def _open(config: Config, stop: threading.Event) -> zenoh.Session | None:
         try:
             return zenoh.open(settings)
         except zenoh.ZError as error:
-            log.info("nothing at %s yet (%s)", ", ".join(config.connect), error)
+            log.info("nothing at %s yet (%s)", discreet.endpoint(", ".join(config.connect)), discreet.reason(error))
         stop.wait(pause)
         pause = min(2 * pause, _LONGEST_PAUSE_S)
     return None
@@ -91,7 +91,9 @@ def _settings(config: Config) -> zenoh.Config:
         for path, value in paths.items():
             settings.insert_json5(path, json.dumps(value))
     except zenoh.ZError as error:
-        raise BadConfig(f"Zenoh does not take this configuration ({config.zenoh or 'built in'}): {error}") from None
+        # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
+        where = config.zenoh or "built in"
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {discreet.reason(error)}") from None
     return settings
 
 

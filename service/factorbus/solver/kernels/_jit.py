@@ -7,8 +7,9 @@
 
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
 numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
-stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder.
-Kernels that live in another folder have a `KernelFolder` of their own, and the same rule for that one.
+stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder
+and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
+rule for that one.
 
 FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).
 NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
@@ -67,6 +68,7 @@ BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 _EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _KEPT_FOLDERS = 6
 
@@ -76,10 +78,15 @@ class KernelFolder:
 
     family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
     is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
+    quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be given back.
+    also: files outside the folder whose constants or inline kernels its kernels use.
     """
 
-    def __init__(self, sources: Path, family: str, exact: bool = False) -> None:
-        self._sources, self._family, self._flags = sources, family, _EXACT_FLAGS if exact else _FLAGS
+    def __init__(
+        self, sources: Path, family: str, exact: bool = False, quick: bool = False, also: tuple[Path, ...] = ()
+    ) -> None:
+        self._sources, self._family, self._also = sources, family, also
+        self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
         self._cache = _cache_in(self)
         self._path: Path | None = None
 
@@ -119,7 +126,7 @@ class KernelFolder:
 
     def _make(self) -> Path:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
-        path = base / self._family / sources_hash(self._sources)
+        path = base / self._family / sources_hash(self._sources, *self._also)
         try:
             path.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=path).close()
@@ -156,10 +163,10 @@ def cache_folder() -> Path:
     return _FOLDER.path()
 
 
-def sources_hash(folder: Path) -> str:
-    """The name of the cache folder for kernels whose sources are the Python files in `folder`, and this one."""
+def sources_hash(folder: Path, *also: Path) -> str:
+    """The name of the cache folder for kernels whose sources are the Python files in `folder`, this one and `also`."""
     digest = hashlib.sha256()
-    for path in sorted({*folder.glob("*.py"), Path(__file__)}, key=lambda path: path.name):
+    for path in sorted({*folder.glob("*.py"), Path(__file__), *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
     features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
@@ -263,5 +270,6 @@ def _cache_in(folder: KernelFolder) -> type[caching.FunctionCache]:
 _COMPILATIONS = _Compilations()
 event.register("numba:compile", _COMPILATIONS)
 
-_FOLDER = KernelFolder(Path(__file__).parent, "kernels")
+_LENSES = Path(__file__).parent.parent / "lenses"
+_FOLDER = KernelFolder(Path(__file__).parent, "kernels", also=tuple(_LENSES.glob("*.py")))
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -12,6 +12,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.se2 import wrap
+from factorbus.solver.kernels.sizes import dim_of, residual_dim
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -63,83 +64,137 @@ def admit_variables(
 ) -> tuple:
     """Append variables of one kind; `given` (n, size) has their values, or (0, size) none.  Gives (row, fault)."""
     size = given.shape[1]
-    dim = 6 if kind == at.SE3 else size
     for n in range(new.size):
-        v = counts[at.VARIABLES]
         slot = slot_of(new[n], table, keys)
         if table[slot] != 0:
             return n, at.DUPLICATE
         x = counts[at.VALUES]
         if given.shape[0] > 0:
             for c in range(size):
-                if not math.isfinite(given[n, c]):
-                    return n, at.NOT_FINITE
                 values[x + c] = given[n, c]
-            if kind == at.SE2:
-                values[x + 2] = wrap(values[x + 2])
-            if kind == at.SE3 and not make_unit(values, x + 3):
-                return n, at.BAD_QUATERNION
-        table[slot] = v + 1
-        keys[v] = new[n]
-        var[v, at.V_KIND], var[v, at.V_AT] = kind, x
-        var[v, at.V_SCALAR], var[v, at.V_COLUMN], var[v, at.V_DIAGONAL] = -1, -1, -1
-        if not fixed:
-            var[v, at.V_SCALAR], var[v, at.V_COLUMN] = counts[at.SCALARS], counts[at.COLUMNS]
-            dims[counts[at.COLUMNS]] = dim
-            counts[at.SCALARS] += dim
-            counts[at.COLUMNS] += 1
-        counts[at.VALUES] += size
-        counts[at.VARIABLES] += 1
+            wrong = check_value(kind, x, size, values)
+            if wrong != at.GOOD:
+                return n, wrong
+        append_variable(kind, fixed, new[n], slot, size, table, keys, var, dims, counts)
     return -1, at.GOOD
 
 
 @kernel(
-    "UniTuple(int64, 2)(int64, int64[:,::1], float64[:,::1], float64[:,::1], int64[::1], int64[::1], int64[:,::1],"
-    " int64[:,::1], float64[::1], int64[::1])"
+    "UniTuple(int64, 2)(int64, int64, int64[:,::1], float64[:,::1], float64[:,::1], float64[::1], int64[::1],"
+    " int64[::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1])"
 )
 def admit_factors(
-    kind: int, ends: I64, z: F64, info: F64, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64
-) -> tuple:
-    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle).  Gives (row, fault)."""
+    kind: int, loss: int, ends: I64, z: F64, info: F64, scale: F64, table: I64, keys: I64, var: I64, fac: I64,
+    payload: F64, counts: I64,
+) -> tuple:  # fmt: skip
+    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle), and with a loss its scale
+    (m,), else (0,).  Gives (row, fault)."""
     size, triangle = z.shape[1], info.shape[1]
-    dim = 6 if size == 7 else size
-    first, second = kinds_of_ends(kind)
     scratch = np.empty((6, 6))
     for m in range(ends.shape[0]):
-        i = table[slot_of(ends[m, 0], table, keys)] - 1
-        j = -1
-        if i < 0:
-            return m, at.UNKNOWN_FIRST
-        if var[i, at.V_KIND] != first:
-            return m, at.WRONG_KIND_FIRST
-        if second >= 0:
-            j = table[slot_of(ends[m, 1], table, keys)] - 1
-            if j < 0:
-                return m, at.UNKNOWN_SECOND
-            if i == j:
-                return m, at.SELF_LOOP
-            if var[j, at.V_KIND] != second:
-                return m, at.WRONG_KIND_SECOND
-        f, p = counts[at.FACTORS], counts[at.PAYLOAD]
+        i, j, wrong = find_ends(kind, ends[m, 0], ends[m, ends.shape[1] - 1], table, keys, var)
+        if wrong != at.GOOD:
+            return m, wrong
+        p = counts[at.PAYLOAD]
         for c in range(size):
-            if not math.isfinite(z[m, c]):
-                return m, at.NOT_FINITE
             payload[p + c] = z[m, c]
         for c in range(triangle):
-            if not math.isfinite(info[m, c]):
-                return m, at.NOT_FINITE
             payload[p + size + c] = info[m, c]
-        if size == 7 and not make_unit(payload, p + 3):
-            return m, at.BAD_QUATERNION
-        if kind == at.BEARING_RANGE_SE2 and not z[m, 1] > 0.0:
-            return m, at.BAD_RANGE
-        if not is_positive_definite(dim, payload, p + size, scratch):
-            return m, at.NOT_POSITIVE_DEFINITE
-        fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = kind, i, j, p
-        fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_SWAPPED] = -1, -1, -1, 0
-        counts[at.PAYLOAD] += size + triangle
-        counts[at.FACTORS] += 1
+        wrong = check_numbers(kind, p, size, triangle, payload, scratch)
+        if wrong != at.GOOD:
+            return m, wrong
+        numbers = size + triangle
+        if loss != at.NO_LOSS:
+            if not (scale[m] > 0.0 and scale[m] < math.inf):
+                return m, at.BAD_SCALE
+            payload[p + numbers] = scale[m]
+            numbers += 1
+        append_factor(kind, loss, i, j, numbers, var, fac, counts)
     return -1, at.GOOD
+
+
+@inline_kernel
+def check_value(kind: int, x: int, size: int, values: F64) -> int:
+    """What is wrong with the new value that starts at x; it is brought into its normal form."""
+    for c in range(size):
+        if not math.isfinite(values[x + c]):
+            return at.NOT_FINITE
+    if kind == at.SE2:
+        values[x + 2] = wrap(values[x + 2])
+    if kind == at.IDP:
+        values[x + 3] = wrap(values[x + 3])
+    if kind == at.SE3 and not make_unit(values, x + 3):
+        return at.BAD_QUATERNION
+    return at.GOOD
+
+
+@inline_kernel
+def append_variable(
+    kind: int, fixed: bool, key: int, slot: int, size: int, table: I64, keys: I64, var: I64, dims: I64, counts: I64
+) -> None:
+    """One more variable, whose value is behind those in use already, if it has one; `slot` is where its key goes."""
+    v = counts[at.VARIABLES]
+    dim = dim_of(kind)
+    table[slot] = v + 1
+    keys[v] = key
+    var[v, at.V_KIND], var[v, at.V_AT] = kind, counts[at.VALUES]
+    var[v, at.V_SCALAR], var[v, at.V_COLUMN], var[v, at.V_DIAGONAL] = -1, -1, -1
+    if not fixed:
+        var[v, at.V_SCALAR], var[v, at.V_COLUMN] = counts[at.SCALARS], counts[at.COLUMNS]
+        dims[counts[at.COLUMNS]] = dim
+        counts[at.SCALARS] += dim
+        counts[at.COLUMNS] += 1
+    counts[at.VALUES] += size
+    counts[at.VARIABLES] += 1
+
+
+@inline_kernel
+def find_ends(kind: int, a: int, b: int, table: I64, keys: I64, var: I64) -> tuple:
+    """(i, j, fault): the variables with these keys, for a factor of that kind; j is −1 where it has one end."""
+    first, second = kinds_of_ends(kind)
+    i = table[slot_of(a, table, keys)] - 1
+    if i < 0:
+        return i, -1, at.UNKNOWN_FIRST
+    if var[i, at.V_KIND] != first:
+        return i, -1, at.WRONG_KIND_FIRST
+    if second < 0:
+        return i, -1, at.GOOD
+    j = table[slot_of(b, table, keys)] - 1
+    if j < 0:
+        return i, j, at.UNKNOWN_SECOND
+    if i == j:
+        return i, j, at.SELF_LOOP
+    has_become_a_point = kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3
+    if var[j, at.V_KIND] != second and not has_become_a_point:
+        return i, j, at.WRONG_KIND_SECOND
+    return i, j, at.GOOD
+
+
+@inline_kernel
+def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scratch: F64) -> int:
+    """What is wrong with the new measurement that starts at p, or with its information."""
+    for c in range(size + triangle):
+        if not math.isfinite(payload[p + c]):
+            return at.NOT_FINITE
+    if size == 7 and not make_unit(payload, p + 3):
+        return at.BAD_QUATERNION
+    if kind == at.BEARING_RANGE_SE2 and not payload[p + 1] > 0.0:
+        return at.BAD_RANGE
+    if not is_positive_definite(residual_dim(kind), payload, p + size, scratch):
+        return at.NOT_POSITIVE_DEFINITE
+    return at.GOOD
+
+
+@inline_kernel
+def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, var: I64, fac: I64, counts: I64) -> None:
+    """One more factor, whose numbers are behind those in use already; of a feature that is a point by now, of that."""
+    f = counts[at.FACTORS]
+    if kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3:
+        kind = at.POINT_SEEN
+    fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = kind, i, j, counts[at.PAYLOAD]
+    fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_FLAGS] = -1, -1, -1, loss << at.LOSS_SHIFT
+    counts[at.PAYLOAD] += numbers
+    counts[at.FACTORS] += 1
 
 
 @inline_kernel
@@ -151,8 +206,10 @@ def kinds_of_ends(kind: int) -> tuple:
         return at.SE2, at.SE2
     if kind == at.BETWEEN_SE3:
         return at.SE3, at.SE3
-    if kind == at.LANDMARK_SE3:
+    if kind == at.LANDMARK_SE3 or kind == at.POINT_SEEN:
         return at.SE3, at.POINT3
+    if kind == at.IDP_FIRST or kind == at.IDP_SEEN:
+        return at.SE3, at.IDP
     return at.SE2, at.POINT2
 
 

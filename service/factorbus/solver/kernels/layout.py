@@ -4,7 +4,7 @@ The arenas are:
     var      (n, 5) int64    one row per variable, in insertion order
     fac      (m, 8) int64    one row per factor, in insertion order
     values   float64         the variables' values, packed one after the other
-    payload  float64         per factor: its measurement, then the upper triangle of its information
+    payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
     counts   (6,)   int64    how much of each arena is in use
 """
 
@@ -24,8 +24,12 @@ F_AT = 3  # where its measurement starts in `payload`
 F_II = 4  # where the blocks it adds to start in Λ's data; -1: no such block
 F_JJ = 5
 F_IJ = 6
-F_SWAPPED = 7  # 1: the block of the pair stands as (j, i), because column j comes first
+F_FLAGS = 7
 F_WIDTH = 8
+
+# Bits of F_FLAGS.
+SWAPPED = 1  # the block of the pair stands as (j, i), because column j comes first
+LOSS_SHIFT = 8  # from here on: the code of its loss
 
 # Entries of `counts`.
 VARIABLES = 0
@@ -41,6 +45,7 @@ SE2 = 0
 SE3 = 1
 POINT2 = 2
 POINT3 = 3
+IDP = 4
 
 # Codes of the kinds of factors.
 PRIOR_SE2 = 0
@@ -52,6 +57,21 @@ BETWEEN_SE3 = 5
 LANDMARK_SE2 = 6
 LANDMARK_SE3 = 7
 BEARING_RANGE_SE2 = 8
+IDP_FIRST = 9  # from here on: what a camera sees
+IDP_SEEN = 10
+POINT_SEEN = 11
+
+# Codes of losses.
+NO_LOSS = 0
+HUBER = 1
+CAUCHY = 2
+GEMAN_MCCLURE = 3
+TUKEY = 4
+DCS = 5
+
+# Scratch for a residual: six numbers at most, then what became of a sight (`factorbus.solver.lenses.layout`).
+R_STATUS = 6
+R_SIZE = 7
 
 # What an admission kernel found wrong with a row.
 GOOD = 0
@@ -65,3 +85,19 @@ WRONG_KIND_SECOND = 7
 SELF_LOOP = 8
 BAD_RANGE = 9
 NOT_POSITIVE_DEFINITE = 10
+BAD_SCALE = 11
+
+# Columns of `groups`: groups of variables and factors whose numbers lie in the bytes of a message, little-endian, one
+# row each in any order, and after the last one a row of kind END.  An offset is that of the first byte.
+G_KIND = 0
+G_FACTORS = 1  # 0: variables, 1: factors
+G_COUNT = 2
+G_FIXED = 3  # 1: variables that are held where they are
+G_ARITY = 4  # keys of a factor; 1 for variables
+G_SIZE = 5  # numbers of a value or a measurement
+G_TRIANGLE = 6  # numbers of an information matrix; 0 for variables
+G_KEYS = 7  # offset of the keys
+G_NUMBERS = 8  # offset of the values, -1: they come without; or of the measurements
+G_INFORMATION = 9  # offset of the information matrices; -1 for variables
+G_WIDTH = 10
+END = -1

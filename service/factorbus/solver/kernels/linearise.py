@@ -2,6 +2,8 @@
 
     Λ = Σ Hᵀ Ω H,   η = −Σ Hᵀ Ω r,   χ² = Σ rᵀ Ω r          (4.1)
 
+of a factor with a loss ρ with r and H times √ρ'(rᵀ Ω r), and ρ(rᵀ Ω r) in χ² (`losses`).
+
 Factors are taken in the order of their ids, whatever their kinds.  So the sums over all factors have the same bits
 whether they were made at once or as the factors arrived; taking back a refused insert rests on that.
 """
@@ -9,22 +11,25 @@ whether they were made at once or as the factors arrived; taking back a refused 
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.losses import soften
 from factorbus.solver.kernels.points import prior_point2, prior_point3
 from factorbus.solver.kernels.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.se3 import between_se3, landmark_se3, prior_se3
+from factorbus.solver.kernels.sights import sight
+from factorbus.solver.kernels.sizes import information_at, residual_dim
 
 
 @kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
 def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, data: F64, eta: F64) -> float:
     """Add the factors first .. last−1, linearised at `values`, to Λ's blocks in `data` and to `eta`; gives their χ²."""
-    r = np.zeros(6)
+    r = np.zeros(at.R_SIZE)
     H = np.zeros((4, 6, 6))
     W = np.zeros((6, 6))
     chi2 = 0.0
     for f in range(first, last):
         kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
-        evaluate(f, var, fac, values, payload, r, H[0], H[1])
+        chi2 += evaluate(f, var, fac, values, payload, r, H[0], H[1])
         # Sizes as constants, so that each call becomes straight code.
         if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2:
             chi2 += add_factor(3, 3, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
@@ -37,6 +42,8 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
             chi2 += add_factor(3, first_size, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
         elif kind == at.PRIOR_POINT2:
             chi2 += add_factor(2, 2, 2, f, var, fac, payload[p + 2 :], r, H, W, data, eta)
+        else:
+            chi2 += add_sight(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
     return chi2
 
 
@@ -44,13 +51,20 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
     "void(int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])"
 )
 def evaluate_one(f: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, A: F64, B: F64) -> None:
-    """Residual and Jacobians of factor `f` alone: r (6,), A and B (6, 6), upper left corners filled."""
-    evaluate(f, var, fac, values, payload, r, A, B)
+    """Residual and Jacobians of factor `f` alone: r (7,), A and B (6, 6), upper left corners filled."""
+    evaluate_apart(f, var, fac, values, payload, r, A, B)
+
+
+@part
+def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
+    """`evaluate`, compiled apart: for kernels that have more to do than this."""
+    return evaluate(f, var, fac, x, payload, r, A, B)
 
 
 @inline_kernel
-def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> None:
-    """The residual kernel of the kind of factor `f`."""
+def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
+    """The residual kernel of the kind of factor `f`, and its loss; gives what χ² has beside rᵀ Ω r."""
+    more = 0.0
     kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
     i = var[fac[f, at.F_I], at.V_AT]
     j = var[max(fac[f, at.F_J], 0), at.V_AT]
@@ -72,6 +86,19 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
         prior_point2(x, i, j, payload, p, r, A, B)
     elif kind == at.PRIOR_POINT3:
         prior_point3(x, i, j, payload, p, r, A, B)
+    else:
+        more = sight(kind, x, i, j, payload, p, r, A, B)
+    loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
+    if loss != at.NO_LOSS:
+        more = soften(kind, loss, p, payload, more, r, A, B)
+    return more
+
+
+@part
+def add_sight(kind: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64) -> float:
+    """`add_factor` of what a camera sees."""
+    dim = residual_dim(kind)
+    return add_factor(dim, 6, 3 if kind == at.POINT_SEEN else 6, f, var, fac, info, r, H, W, data, eta)
 
 
 @inline_kernel
@@ -103,7 +130,7 @@ def add_factor(
         multiply(dr, dj, W, B, WB)
         add_end(dr, dj, B, WB, r, data[jj:], eta[var[fac[f, at.F_J], at.V_SCALAR] :])
     if ij >= 0:
-        if fac[f, at.F_SWAPPED]:
+        if fac[f, at.F_FLAGS] & at.SWAPPED:
             add_pair(dr, dj, di, B, WA, data[ij:])
         else:
             add_pair(dr, di, dj, A, WB, data[ij:])

@@ -3,9 +3,10 @@
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.points import move_point2, move_point3
-from factorbus.solver.kernels.reach import size_of
 from factorbus.solver.kernels.se2 import move_se2
 from factorbus.solver.kernels.se3 import move_se3
+from factorbus.solver.kernels.sights import move_idp
+from factorbus.solver.kernels.sizes import size_of
 
 
 @kernel("void(int64, int64[:,::1], float64[::1], float64[::1], float64[::1])")
@@ -22,6 +23,8 @@ def move(count: int, var: I64, values: F64, step: F64, out: F64) -> None:
             move_se3(values, x, step, d, out)
         elif kind == at.POINT2:
             move_point2(values, x, step, d, out)
+        elif kind == at.IDP:
+            move_idp(values, x, step, d, out)
         else:
             move_point3(values, x, step, d, out)
 

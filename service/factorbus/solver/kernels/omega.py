@@ -14,9 +14,10 @@ import numpy as np
 from factorbus.solver.kernels import block_rows as br
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.linearise import evaluate
+from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, zero
+from factorbus.solver.kernels.sizes import information_at, residual_dim
 
 MOST_ROWS = 48  # of W at a time
 _STRIP = 96  # columns that are worked on together: with MOST_ROWS rows they fit the first level cache
@@ -36,7 +37,7 @@ def omega_update(
     Gives −1, or a position whose pivot is not a positive number.
     """
     union, spare, widths = np.empty(ld, np.int64), np.empty(ld, np.int64), np.zeros(1, np.int64)
-    rhs, r, H, C = np.empty(MOST_ROWS), np.zeros(6), np.zeros((2, 6, 6)), np.zeros((6, 6))
+    rhs, r, H, C = np.empty(MOST_ROWS), np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros((6, 6))
     f = f0
     while f < f1:
         last, rows = f, 0
@@ -52,29 +53,13 @@ def omega_update(
             zero(W, k * ld, offset)
         k = 0
         for g in range(f, last):
-            evaluate(g, var, fac, values, payload, r, H[0], H[1])
+            evaluate_apart(g, var, fac, values, payload, r, H[0], H[1])
             k = whitened(g, k, var, fac, payload, place, rec, union, r, H, C, W, ld, rhs)
         failed = sweep(rows, count, union, spare, widths, W, ld, rhs, rec, index, numbers, d, counts)
         if failed >= 0:
             return failed
         f = last
     return -1
-
-
-@inline_kernel
-def residual_dim(kind: int) -> int:
-    """Numbers in the residual of a kind of factor."""
-    if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2 or kind == at.LANDMARK_SE3 or kind == at.PRIOR_POINT3:
-        return 3
-    if kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3:
-        return 6
-    return 2
-
-
-@inline_kernel
-def information_at(kind: int) -> int:
-    """Where in a factor's payload its information starts: the size of its measurement."""
-    return 7 if kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3 else residual_dim(kind)
 
 
 @part

@@ -59,7 +59,7 @@ def connect(
         a, b = var[i, at.V_COLUMN], var[j, at.V_COLUMN]
         if a >= 0 and b >= 0:
             fac[f, at.F_IJ] = block_of(min(a, b), max(a, b), dims[a] * dims[b], table, pattern, fill)
-            fac[f, at.F_SWAPPED] = 1 if a > b else 0
+            fac[f, at.F_FLAGS] = fac[f, at.F_FLAGS] & ~at.SWAPPED | (at.SWAPPED if a > b else 0)
 
 
 @kernel("void(int64, int64[::1], int64[:,::1])")

@@ -15,6 +15,8 @@ from factorbus.solver.kernels.se2 import (
     place_landmark_se2,
 )
 from factorbus.solver.kernels.se3 import compose_inverse_se3, compose_se3, place_landmark_se3
+from factorbus.solver.kernels.sights import place_idp
+from factorbus.solver.kernels.sizes import size_of
 
 _NOTHING = -1
 _WAITS = -2
@@ -66,6 +68,8 @@ def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: 
 def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
     """The variable that factor `f` reaches now, or _NOTHING, or _WAITS: both ends are still out of reach."""
     kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
+    if kind == at.IDP_SEEN or kind == at.POINT_SEEN:  # a pixel alone places nothing
+        return _NOTHING
     has_i = i < v0 or reached[i - v0] != 0
     if j < 0:
         if has_i:
@@ -108,14 +112,8 @@ def compose_end(kind: int, forward: bool, i: int, j: int, z: int, x: F64, p: F64
         place_landmark_se3(x, i, p, z, j)
     elif kind == at.BEARING_RANGE_SE2:
         place_bearing_range_se2(x, i, p, z, j)
-
-
-@inline_kernel
-def size_of(kind: int) -> int:
-    """Numbers of a value of a kind of variable."""
-    if kind == at.SE3:
-        return 7
-    return 2 if kind == at.POINT2 else 3
+    elif kind == at.IDP_FIRST:
+        place_idp(x, i, p, z, j)
 
 
 @kernel("int64(int64, int64, int64, int64, int64[:,::1], int64[::1], int64[::1])")

@@ -8,13 +8,13 @@ import numpy as np
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, kernel, part
-from factorbus.solver.kernels.linearise import evaluate
-from factorbus.solver.kernels.omega import information_at, residual_dim
+from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.points import move_point2, move_point3
-from factorbus.solver.kernels.reach import size_of
 from factorbus.solver.kernels.se2 import move_se2
 from factorbus.solver.kernels.se3 import move_se3
-from factorbus.solver.kernels.tail import cholesky, dim_of
+from factorbus.solver.kernels.sights import move_idp
+from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim, size_of
+from factorbus.solver.kernels.tail import cholesky
 
 _ITERATIONS = 5
 
@@ -60,14 +60,14 @@ def gather_system(
     v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, M: F64, z: F64
 ) -> tuple[int, float]:
     """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their count and χ²."""
-    r, H, W = np.zeros(6), np.zeros((2, 6, 6)), np.zeros((6, 6))
+    r, H, W = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros((6, 6))
     width, count, chi2 = dim_of(var[v, at.V_KIND]), 0, 0.0
     M[:, :], z[:] = 0.0, 0.0
     for f in range(f0, f1):
         end = 0 if fac[f, at.F_I] == v else 1
         if fac[f, at.F_I + end] != v:
             continue
-        evaluate(f, var, fac, values, payload, r, H[0], H[1])
+        chi2 += evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
         dim, p = residual_dim(fac[f, at.F_KIND]), fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
         for a in range(dim):
             for b in range(a, dim):
@@ -93,5 +93,7 @@ def move_one(kind: int, values: F64, x: int, step: F64) -> None:
         move_se3(values, x, step, 0, values)
     elif kind == at.POINT2:
         move_point2(values, x, step, 0, values)
+    elif kind == at.IDP:
+        move_idp(values, x, step, 0, values)
     else:
         move_point3(values, x, step, 0, values)

@@ -10,10 +10,10 @@ import numpy as np
 from factorbus.solver.kernels import block_rows as br
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, kernel, part
-from factorbus.solver.kernels.linearise import evaluate
-from factorbus.solver.kernels.omega import information_at, residual_dim
+from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim
 
 MOST_BLOCKS = 5
 _MOST = 6 * MOST_BLOCKS
@@ -81,9 +81,15 @@ def add_omega(
     z: F64,
 ) -> None:  # fmt: skip
     """M += Ω = Σ Hᵀ Ω_k H, z += ω = −Σ Hᵀ Ω_k r; on and above the diagonal."""
-    r, H, W, WH, first = np.zeros(6), np.zeros((2, 6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.empty(2, np.int64)
+    r, H, W, WH, first = (
+        np.zeros(at.R_SIZE),
+        np.zeros((2, 6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.empty(2, np.int64),
+    )
     for f in range(f0, f1):
-        evaluate(f, var, fac, values, payload, r, H[0], H[1])
+        evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
         kind = fac[f, at.F_KIND]
         dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
         for a in range(dim):
@@ -122,14 +128,6 @@ def add_omega(
                         for a in range(dim):
                             total += H[other, a, q] * WH[a, c]
                         M[first[other] + q, first[end] + c] += total
-
-
-@part
-def dim_of(kind: int) -> int:
-    """Scalars in the tangent of a kind of variable."""
-    if kind == at.SE3:
-        return 6
-    return 2 if kind == at.POINT2 else 3
 
 
 @part

@@ -10,7 +10,12 @@ makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range
 
     bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
 
-and there both ends have to move.
+and there both ends have to move.  How a sight is bent, or a factor with a loss, which is by its weight as well, is
+computed: what the linear model misses of √w r, in standard deviations,
+
+    bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
+
+and both ends move.
 """
 
 import math
@@ -18,6 +23,7 @@ import math
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, inline_kernel
 from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.lenses.layout import FU
 
 
 @inline_kernel
@@ -59,6 +65,8 @@ def lever_of(kind: int, p: F64, k: int) -> float:
         return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1] + p[k + 2] * p[k + 2])
     if kind == at.BEARING_RANGE_SE2:
         return p[k + 1]
+    if kind >= at.IDP_FIRST:  # of a pixel: how many a radian has
+        return p[k + (4 if kind == at.IDP_FIRST else 3) + FU]
     return 0.0
 
 
@@ -71,4 +79,7 @@ def root_weight(kind: int, w: F64, d: float) -> float:
         return math.sqrt(max(w[0, 0], w[1, 1]))
     if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
         return math.sqrt(max(w[0, 0], w[1, 1], w[2, 2]))
+    if kind >= at.IDP_FIRST:
+        a = 3 if kind == at.IDP_FIRST else 0
+        return math.sqrt(max(w[a, a], w[a + 1, a + 1]))
     return 0.0

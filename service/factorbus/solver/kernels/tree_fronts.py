@@ -53,6 +53,29 @@ def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols
 
 
 @inline_kernel
+def is_root_alone(marked: I64, n: int, new: int, affected: I64, settings: F64, var: I64, clique: I64) -> bool:
+    """Whether a step only puts a variable or two to a root that stays small: a robot that drives on."""
+    if marked.size != 1 or new > 2 or clique[marked[0], tl.C_PARENT] >= 0:
+        return False
+    pivots = 0
+    for k in range(n):
+        pivots += dim_of_variable(var, affected[k])
+    return pivots <= settings[tl.P_SPLIT_PIVOTS]
+
+
+@part
+def keep_root(n: int, affected: I64, var: I64) -> tuple:
+    """As `analyze_affected`: one front of all affected variables, in the order they have."""
+    records = np.zeros((1, fr.FRONT), np.int64)
+    order, home = np.empty(n, np.int64), np.zeros(n, np.int64)
+    for k in range(n):
+        order[k] = k
+        records[0, fr.PIVOTS] += dim_of_variable(var, affected[k])
+    records[0, fr.PARENT] = records[0, fr.CHILD] = records[0, fr.SIBLING] = -1
+    return order, order, home, records, np.zeros(2, np.int64), np.empty(0, np.int64)
+
+
+@inline_kernel
 def row_layout(p: int, m: int) -> tuple:
     """(offset of the rows in their block, stride, offset of the used δ, size of the block)."""
     lead = fr.padded(p) - p

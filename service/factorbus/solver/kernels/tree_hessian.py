@@ -3,11 +3,11 @@
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.linearise import evaluate, multiply
-from factorbus.solver.kernels.omega import information_at, residual_dim
+from factorbus.solver.kernels.linearise import evaluate_apart, multiply
 from factorbus.solver.kernels.simd import put
-from factorbus.solver.kernels.tail import dim_of
+from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.kernels.tree_bend import lever_of, root_weight
+from factorbus.solver.lenses.layout import GOOD
 
 
 @inline_kernel
@@ -18,34 +18,55 @@ def hessian_size(di: int, dj: int) -> int:
 
 @part
 def linearise_factor(
-    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, r: F64, H: F64, W: F64
+    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, r: F64, H: F64, W: F64, state: I64
 ) -> None:
-    """Write the Hessian of factor f at the linearisation points.  r (6,), H (4, 6, 6), W (6, 6) are scratch."""
+    """Write the Hessian of factor f at the linearisation points.  r (7,), H (4, 6, 6), W (6, 6) are scratch."""
     kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
     p = fac[f, at.F_AT] + information_at(kind)
-    evaluate(f, var, fac, lin, payload, r, H[0], H[1])
+    more = evaluate_apart(f, var, fac, lin, payload, r, H[0], H[1])
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
-        _write(3, 3, 3, p, payload, r, H, W, h, hessian)
+        _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
-        _write(2, 3, 2, p, payload, r, H, W, h, hessian)
+        _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
     elif kind == at.BETWEEN_SE3:
-        _write(6, 6, 6, p, payload, r, H, W, h, hessian)
+        _write(6, 6, 6, p, more, payload, r, H, W, h, hessian)
     elif kind == at.LANDMARK_SE3:
-        _write(3, 6, 3, p, payload, r, H, W, h, hessian)
+        _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
     else:
-        dim = residual_dim(kind)
-        _write(dim, dim, 0, p, payload, r, H, W, h, hessian)
+        _write_other(kind, p, more, payload, r, H, W, h, hessian)
+        if kind >= at.IDP_FIRST:
+            note_sleep(f, r[at.R_STATUS] != GOOD, link, state)
 
 
 @inline_kernel
-def _write(dr: int, di: int, dj: int, p: int, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+def note_sleep(f: int, asleep: bool, link: I64, state: I64) -> None:
+    """Count a sight that has no pixel any more, or has one again."""
+    if asleep != (link[f, tl.L_KIND] == tl.ASLEEP):
+        state[tl.S_ASLEEP] += 1 if asleep else -1
+        link[f, tl.L_KIND] = tl.ASLEEP if asleep else tl.EXACT
+
+
+@part
+def _write_other(kind: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+    """Priors, and what cameras see."""
+    dim = residual_dim(kind)
+    if kind >= at.IDP_FIRST:
+        _write(dim, 6, 3 if kind == at.POINT_SEEN else 6, p, more, payload, r, H, W, h, out)
+    else:
+        _write(dim, dim, 0, p, more, payload, r, H, W, h, out)
+
+
+@inline_kernel
+def _write(
+    dr: int, di: int, dj: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64
+) -> None:
     A, B, WA, WB = H[0], H[1], H[2], H[3]
     for a in range(dr):
         for b in range(a, dr):
             W[a, b] = W[b, a] = payload[p]
             p += 1
-    chi2 = 0.0
+    chi2 = more
     for a in range(dr):
         e = 0.0
         for b in range(dr):

@@ -9,7 +9,7 @@ S, with a last column for the right-hand side and a corner for χ²,
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
 The arenas of a tree are:
-    node    (n, 10) int64     one row per variable, by its index in the graph
+    node    (n, 12) int64     one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 20) int64    records of cliques
     lists   int64            variables of cliques
@@ -38,7 +38,9 @@ N_SEEN = 6  # the last step that brought a factor of it
 N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
 N_MOVED = 8  # the last step that changed its estimate
 N_LISTED = 9  # 1: it is in `moved`
-N_WIDTH = 10
+N_COLUMN = 10  # scratch: its column in the clique at hand
+N_LINEARISED = 11  # the last step that gave it a linearisation point
+N_WIDTH = 12
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable
@@ -46,10 +48,13 @@ L_I = 1  # next incidence of the first variable
 L_J = 2  # next incidence of the second one
 L_AT = 3  # where its Hessian starts
 L_STAMP = 4  # the last sweep that linearised it
-L_KIND = 5  # as in the graph, so that one cache line has all
+L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
 L_FAR = 6  # the second variable's place in the graph's values; -1: none
 L_SECOND = 7  # the second variable; -1: none
 L_WIDTH = 8
+
+# In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
+EXACT, ASLEEP = 1000, 1001
 
 # Columns of `clique`.
 C_LIST = 0
@@ -102,14 +107,20 @@ S_TAKEN = 23  # factors that are in the tree: S_FACTORS but for those of a step 
 S_SWEEP = 24  # counts relinearisations
 S_FIRST_NEW = 25  # variables that are in the tree: S_VARIABLES but for those of a step under way
 S_MOVED = 27  # variables in `moved`
+S_EXACT = 40  # factors whose bend is computed exactly
+S_ASLEEP = 41  # sights that had no pixel where they were linearised
 S_WAIT = 26  # 1: the step under way relinearises nothing, because that failed
+S_BEGUN = 29  # 1: a step is under way; the arenas lacked room
+S_TOLD = 21  # variables whose estimate has other bits than before the step, new ones included
+S_CHECKED = 30  # 1: that everything is held has been made sure of otherwise
+S_CHANGED_BEFORE = 31  # S_CHANGED of the step before, for when this one fails
 S_CYCLES = 32  # of the phases of the last step, PHASES of them
 S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
-DONE, NO_ROOM, FAILED = 0, 1, 2
+DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
 
 # Settings of a step.
 P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again
@@ -118,7 +129,12 @@ P_BENT_NOW = 2  # or at once
 P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
 P_EVERY = 5  # so many steps apart it is looked for what is bent
-P_SIZE = 6
+P_NEGLIGIBLE = 6  # a χ² that is nothing
+P_RECENT = 7  # variables with a factor in the last so many steps go last
+P_ROUNDS = 8  # eliminations in a step, at most
+P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
+P_LOOK = 10  # and where something turned so far that it may be bent by this
+P_SIZE = 11
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

@@ -9,6 +9,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.sizes import dim_of
 
 
 @inline_kernel
@@ -75,10 +76,7 @@ def is_split(c: int, first: int, settings: F64, var: I64, clique: I64, lists: I6
 @inline_kernel
 def dim_of_variable(var: I64, v: int) -> int:
     """Scalars of variable v."""
-    kind = var[v, at.V_KIND]
-    if kind == at.SE3:
-        return 6
-    return 2 if kind == at.POINT2 else 3
+    return dim_of(var[v, at.V_KIND])
 
 
 @inline_kernel

@@ -1,8 +1,10 @@
 """What a step of the tree moved, and the way back."""
 
+import numpy as np
+
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, kernel
-from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.sizes import size_of
 
 
 @kernel("int64(int64, int64, int64[::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1])")
@@ -17,11 +19,27 @@ def list_moved(first: int, count: int, changed: I64, var: I64, lin: I64, values:
         n += 1
     for k in range(changed.size):
         v = changed[k]
-        x, moved = var[v, at.V_AT], False
-        for a in range(size_of(var[v, at.V_KIND])):
-            moved |= lin[2, x + a] != values[x + a]
-        if moved and v < first:
+        if v < first and differs_in_tree(v, var, lin, values):
             out[n] = v
+            n += 1
+    return n
+
+
+@inline_kernel
+def differs_in_tree(v: int, var: I64, lin: I64, values: I64) -> bool:
+    """Whether a value has other bits than in lin[2]."""
+    x, differs = var[v, at.V_AT], False
+    for a in range(size_of(var[v, at.V_KIND])):
+        differs |= lin[2, x + a] != values[x + a]
+    return differs
+
+
+@part
+def count_differing(first: int, count: int, changed: I64, var: I64, lin: F64, values: F64) -> int:
+    """How many `list_moved` would list."""
+    n, before, now = count - first, lin.view(np.int64), values.view(np.int64)
+    for k in range(changed.size):
+        if changed[k] < first and differs_in_tree(changed[k], var, before, now):
             n += 1
     return n
 

@@ -226,7 +226,7 @@ def add_few(a: F64, i: int, j: int, count: int) -> None:
 @part
 def update_orphans(
     orphans: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
-    state: I64, column: I64, update: I64,
+    state: I64, update: I64,
 ) -> bool:  # fmt: skip
     """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
 
@@ -248,7 +248,7 @@ def update_orphans(
             ldu, size = update_layout(m)
             u, size = take_numbers(size, numbers, state)
             update[e, 0], update[e, 1], update[e, 2] = u, ldu, size
-            split_update(c, p, m, u, ldu, column, var, fac, node, link, clique, lists, numbers, hessian)
+            split_update(c, p, m, u, ldu, var, fac, node, link, clique, lists, numbers, hessian)
     return True
 
 
@@ -271,29 +271,26 @@ def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
 
 @part
 def split_update(
-    c: int, p: int, m: int, u: int, ldu: int, column: I64,
+    c: int, p: int, m: int, u: int, ldu: int,
     var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
 ) -> None:  # fmt: skip
-    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)
-
-    column: scratch, one entry per variable
-    """
+    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)"""
     row = clique[c]
     start, kept = row[tl.C_LIST], row[tl.C_FIRST]
     width = 0
     for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
-        column[lists[s]] = width - p
+        node[lists[s], tl.N_COLUMN] = width - p
         width += dim_of_variable(var, lists[s])
     zero(numbers, u, (m + 1) * ldu)
     for s in range(start, start + kept):
         f = node[lists[s], tl.N_OWN]
         while f >= 0:
-            _add_far_end(f, lists[s], m, u, ldu, column, var, fac, link, hessian, numbers)
+            _add_far_end(f, lists[s], m, u, ldu, var, fac, node, link, hessian, numbers)
             f = link[f, tl.L_OWN]
     child = row[tl.C_CHILD]
     while child >= 0:
         if clique[child, tl.C_ABOVE] < kept:
-            _add_child(child, m, u, ldu, column, var, clique, lists, numbers)
+            _add_child(child, m, u, ldu, var, node, clique, lists, numbers)
         child = clique[child, tl.C_NEXT]
     for i in range(0, m + 1, TILE_ROWS):
         rows = min(TILE_ROWS, m + 1 - i)
@@ -302,7 +299,7 @@ def split_update(
 
 @inline_kernel
 def _add_far_end(
-    f: int, v: int, m: int, u: int, ldu: int, column: I64, var: I64, fac: I64, link: I64, hessian: F64, numbers: F64
+    f: int, v: int, m: int, u: int, ldu: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
 ) -> None:
     """What a factor owned by v adds to its other end, if that is not kept, and to the corner."""
     i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
@@ -312,9 +309,9 @@ def _add_far_end(
     corner = u + m * ldu + m
     put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
     other = j if i == v else i
-    if other < 0 or var[other, at.V_COLUMN] < 0 or column[other] < 0:
+    if other < 0 or var[other, at.V_COLUMN] < 0 or node[other, tl.N_COLUMN] < 0:
         return
-    c, d = column[other], dj if i == v else di
+    c, d = node[other, tl.N_COLUMN], dj if i == v else di
     if i == v:
         h += di * di + di * dj
         g += di
@@ -327,7 +324,7 @@ def _add_far_end(
 
 @inline_kernel
 def _add_child(
-    child: int, m: int, u: int, ldu: int, column: I64, var: I64, clique: I64, lists: I64, numbers: F64
+    child: int, m: int, u: int, ldu: int, var: I64, node: I64, clique: I64, lists: I64, numbers: F64
 ) -> None:
     """Add what a child's update matrix has in the columns of the separator and the right-hand side."""
     start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
@@ -336,7 +333,7 @@ def _add_child(
     x = 0
     for s in range(start, end):
         v = lists[s]
-        dim, into = dim_of_variable(var, v), column[v]
+        dim, into = dim_of_variable(var, v), node[v, tl.N_COLUMN]
         if into >= 0:
             for a in range(dim):
                 line, target = source + (x + a) * stride, u + (into + a) * ldu
@@ -346,7 +343,7 @@ def _add_child(
             y = x + dim
             for t in range(s + 1, end):
                 w = lists[t]
-                wide, across = dim_of_variable(var, w), column[w]
+                wide, across = dim_of_variable(var, w), node[w, tl.N_COLUMN]
                 if across >= 0:
                     for a in range(dim):
                         line = source + (x + a) * stride + y

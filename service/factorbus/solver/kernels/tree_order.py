@@ -70,19 +70,34 @@ def order_affected(
 
 
 @part
-def list_pairs(
-    n: int, label: I64, factors: I64, orphans: I64, var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64
-) -> tuple[I64, I64, I64]:
-    """Pairs (rows, cols) that have the same fill as factors and orphans; and each orphan's first variable to go.
+def find_lowest(label: I64, orphans: I64, node: I64, clique: I64, lists: I64, state: I64) -> I64:
+    """Each orphan's first variable to go, label (n,) being the place in the order."""
+    lowest = np.empty(orphans.size, np.int64)
+    for e in range(orphans.size):
+        start = clique[orphans[e], tl.C_LIST]
+        first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)
+        low = node[lists[start + first], tl.N_LOCAL]
+        for s in range(start + first + 1, start + end):
+            k = node[lists[s], tl.N_LOCAL]
+            if label[k] < label[low]:
+                low = k
+        lowest[e] = low
+    return lowest
 
-    label (n,): the place in the order.  An orphan joins the first variable of its separator to the others.
+
+@part
+def list_pairs(
+    lowest: I64, factors: I64, orphans: I64, var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64
+) -> tuple[I64, I64]:
+    """Pairs (rows, cols) that have the same fill as factors and orphans.
+
+    An orphan joins the first variable of its separator to go, `lowest`, to the others.
     """
     stamp, count = state[tl.S_STAMP], 0
     for e in range(orphans.size):
         first, end = separators_of(orphans[e], stamp, clique)
         count += end - first
     rows, cols, put = np.empty(count + factors.size, np.int64), np.empty(count + factors.size, np.int64), 0
-    lowest = np.empty(orphans.size, np.int64)
     for q in range(factors.size):
         i, j = _ends(factors[q], var, fac, node)
         if j >= 0:
@@ -91,18 +106,12 @@ def list_pairs(
     for e in range(orphans.size):
         start = clique[orphans[e], tl.C_LIST]
         first, end = separators_of(orphans[e], stamp, clique)
-        low = node[lists[start + first], tl.N_LOCAL]
-        for s in range(start + first + 1, start + end):
-            k = node[lists[s], tl.N_LOCAL]
-            if label[k] < label[low]:
-                low = k
-        lowest[e] = low
         for s in range(start + first, start + end):
             k = node[lists[s], tl.N_LOCAL]
-            if k != low:
-                rows[put], cols[put] = low, k
+            if k != lowest[e]:
+                rows[put], cols[put] = lowest[e], k
                 put += 1
-    return rows[:put], cols[:put], lowest
+    return rows[:put], cols[:put]
 
 
 @inline_kernel

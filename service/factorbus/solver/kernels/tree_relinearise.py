@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, part
-from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import linearise_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_take_in import next_incidence
@@ -56,7 +56,7 @@ def linearise_around(
     variables: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, state: I64
 ) -> None:
     """Linearise the factors of some variables, each once."""
-    r, H, W = np.zeros(6), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
     state[tl.S_SWEEP] += 1
     for k in range(variables.size):
         slot = node[variables[k], tl.N_ADJ]
@@ -64,5 +64,5 @@ def linearise_around(
             f = slot // 2
             if link[f, tl.L_STAMP] != state[tl.S_SWEEP]:
                 link[f, tl.L_STAMP] = state[tl.S_SWEEP]
-                linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W)
+                linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
             slot = next_incidence(slot, link)

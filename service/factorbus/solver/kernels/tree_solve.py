@@ -8,12 +8,14 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.points import move_point2, move_point3
-from factorbus.solver.kernels.reach import size_of
 from factorbus.solver.kernels.se2 import move_se2
 from factorbus.solver.kernels.se3 import move_se3
+from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_bend import bend_of, shift_between, turn_of
+from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
@@ -136,24 +138,30 @@ def move_frontals(
 
 @part
 def find_bent(
-    bent: float, var: I64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64, values: F64, pending: I64,
-    moved: I64, state: I64,
+    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
+    values: F64, pending: I64, moved: I64, state: I64,
 ) -> float:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
-    more than `bent`, (9.4).  Gives the largest bend, and empties `moved`.
+    more than `bent`, (9.4), and both ends of one for which that is computed, (9.11).  Gives the largest bend, and
+    empties `moved`.
     """
     most, delta = 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
         v = moved[k]
         node[v, tl.N_LISTED] = 0
         phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
-        if phi == 0.0:
+        if phi == 0.0 and state[tl.S_EXACT] == 0:
             continue
         planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
         slot = node[v, tl.N_ADJ]
         while slot >= 0:
             f = slot // 2
-            if slot % 2 == 0 and link[f, tl.L_FAR] >= 0:
+            if link[f, tl.L_KIND] >= tl.EXACT:
+                bend = exact_bend(f, var, fac, lin, values, payload, delta)
+                most = max(most, bend)
+                if bend > bent:
+                    await_ends(f, fac, var, node, pending, state)
+            elif slot % 2 == 0 and phi > 0.0 and link[f, tl.L_FAR] >= 0:
                 shift = shift_between(planar, x, link[f, tl.L_FAR], values, lin)
                 bend = bend_of(link[f, tl.L_KIND], stiff[f, 1], stiff[f, 0], phi, shift)
                 most = max(most, bend)
@@ -164,6 +172,15 @@ def find_bent(
             slot = next_incidence(slot, link)
     state[tl.S_MOVED] = 0
     return most
+
+
+@inline_kernel
+def await_ends(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
+    """The variables of factor f that are free are to be relinearised."""
+    for end in range(2):
+        v = fac[f, at.F_I + end]
+        if v >= 0 and var[v, at.V_COLUMN] >= 0:
+            await_move(v, node, pending, state)
 
 
 @inline_kernel
@@ -184,5 +201,7 @@ def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
         move_se3(lin, x, delta, d, out)
     elif kind == at.POINT2:
         move_point2(lin, x, delta, d, out)
+    elif kind == at.IDP:
+        move_idp(lin, x, delta, d, out)
     else:
         move_point3(lin, x, delta, d, out)

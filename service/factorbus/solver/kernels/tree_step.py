@@ -1,6 +1,6 @@
 """One step of the incremental solver, in one call.  MATH §9.
 
-1  take in        new variables and factors, linearised
+1  take in        new variables, at good places if they are few, and new factors, linearised
 2  relinearise    variables whose factors have bent since they were linearised
 3  touch, detach  the cliques that these and the new factors change; what hangs from them are orphans
 4  order          the affected variables, constrained approximate minimum degree
@@ -19,11 +19,19 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.cycles import cycles
+from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
-from factorbus.solver.kernels.tree_fronts import analyze_affected, give_back_fronts, place_fronts
+from factorbus.solver.kernels.tree_fronts import (
+    analyze_affected,
+    give_back_fronts,
+    is_root_alone,
+    keep_root,
+    place_fronts,
+)
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
+from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
-from factorbus.solver.kernels.tree_order import list_pairs, order_affected
+from factorbus.solver.kernels.tree_order import find_lowest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
 from factorbus.solver.kernels.tree_solve import find_bent, substitute
 from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
@@ -33,30 +41,40 @@ LEAST_CHI2 = 1e-3
 
 
 @kernel(
-    "int64(int64, int64, int64, int64, float64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1],"
-    " int64[:,::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], float64[::1], float64[:,::1],"
-    " float64[:,::1], float64[:,::1], float64[::1], int64[::1], int64[::1], int64[::1], float64[:,::1], int64[::1],"
-    " float64[::1])"
+    "int64(int64[::1], float64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[:,::1],"
+    " int64[:,::1], int64[:,::1], int64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1],"
+    " float64[:,::1], float64[::1], int64[::1], int64[::1], int64[::1], float64[:,::1], int64[::1], float64[::1])"
 )
 def tree_step(
-    v1: int, f1: int, recent: int, most_rounds: int, settings: F64, var: I64, fac: I64, values: F64, payload: F64,
-    node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64,
-    scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64, moved: I64, saved: F64, state: I64, account: F64,
+    counts: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, clique: I64,
+    lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64,
+    moved: I64, saved: F64, state: I64, account: F64,
 ) -> int:  # fmt: skip
-    """Take in the variables up to v1 and the factors up to f1, and solve.
+    """Take in what is new in the graph, and solve.
 
-    Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or FAILED: the
-    pivot of S_FAILED was not positive, and the tree is as it was before the step.
+    Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
+    the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
+    or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
+    the last two the tree is as it was before the step.
     """
     began = cycles()
+    v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
+    if state[tl.S_BEGUN] == 0:
+        status = begin(counts, settings, var, fac, values, payload, node, link, hessian, lin, scalars, saved, state)
+        if status != tl.DONE:
+            return status
+        account[tl.A_BEND] = 0.0
     unit = residual_unit(f1, account)
     scaled = settings.copy()
     scaled[tl.P_RIPPLE] *= unit
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_BENT_NOW] *= unit
-    v0 = state[tl.S_FIRST_NEW]
+    scaled[tl.P_LOOK] *= unit
+    v0 = old = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, lever, state)
-    take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state)
+    if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state):
+        undo(v0, var, fac, node, link, scalars, lever, saved, state)
+        return tl.INFINITE
     wait = state[tl.S_WAIT] != 0
     while True:
         if not wait:
@@ -64,7 +82,7 @@ def tree_step(
             relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
         lap(began, tl.LINEARISE, state)
         bow, status = eliminate_again(
-            v0, v1, f1, recent, wait, scaled, var, fac, values, node, link, clique, lists, numbers, hessian, lin,
+            v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
             scalars, stiff, lever, pending, changed, moved, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
@@ -82,17 +100,26 @@ def tree_step(
                 wait = True
                 state[tl.S_WAIT] = 1
                 continue
-            take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
-            state[tl.S_WAIT] = 0
+            undo(v0, var, fac, node, link, scalars, lever, saved, state)
             return tl.FAILED
         account[tl.A_BEND] = max(account[tl.A_BEND], bow / unit)
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        if wait or not bow > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= most_rounds:
+        if wait or not bow > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
-    state[tl.S_WAIT] = 0
+    state[tl.S_TOLD] = count_differing(old, v1, changed[: state[tl.S_CHANGED]], var, lin, values)
+    state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
     return tl.DONE
+
+
+@part
+def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, lever: F64, saved: F64, state: I64) -> None:
+    """The tree is as it was before the step."""
+    take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
+    state[tl.S_STEP] -= 1
+    state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
+    state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
 
 
 @inline_kernel
@@ -103,9 +130,9 @@ def residual_unit(factors: int, account: F64) -> float:
 
 @part
 def eliminate_again(
-    v0: int, v1: int, f1: int, recent: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64,
-    node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64,
-    scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64, moved: I64, state: I64, account: F64,
+    v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
+    link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
+    pending: I64, changed: I64, moved: I64, state: I64, account: F64,
 ) -> tuple[float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, and the status."""
     # 3
@@ -143,18 +170,23 @@ def eliminate_again(
         return 0.0, tl.DONE
     factors = gather_factors(n, affected, state[tl.S_TAKEN], f1, node, link, fac, var)
     now = lap(now, tl.MARK, state)
-    # 4
-    perm = order_affected(n, affected, factors, orphans, recent, var, fac, node, clique, lists, state)
-    label = np.empty(n, np.int64)
-    for k in range(n):
-        label[perm[k]] = k
-    now = lap(now, tl.ORDER, state)
-    # 5
-    rows, cols, lowest = list_pairs(n, label, factors, orphans, var, fac, node, clique, lists, state)
-    order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
+    # 4, 5
+    if is_root_alone(marked, n, v1 - v0, affected, settings, var, clique):
+        order, place, home, records, border_at, border_of = keep_root(n, affected, var)
+        lowest = find_lowest(place, orphans, node, clique, lists, state)
+    else:
+        perm = order_affected(
+            n, affected, factors, orphans, int(settings[tl.P_RECENT]), var, fac, node, clique, lists, state
+        )
+        label = np.empty(n, np.int64)
+        for k in range(n):
+            label[perm[k]] = k
+        now = lap(now, tl.ORDER, state)
+        lowest = find_lowest(label, orphans, node, clique, lists, state)
+        rows, cols = list_pairs(lowest, factors, orphans, var, fac, node, clique, lists, state)
+        order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
     update = np.empty((orphans.size, 3), np.int64)
-    column = np.empty(v1, np.int64)
-    if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, column, update):
+    if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
         return 0.0, tl.NO_ROOM
     ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
     if not placed:
@@ -181,6 +213,7 @@ def eliminate_again(
     if not wait:
         for k in range(state[tl.S_PENDING]):
             node[pending[k], tl.N_FLAGS] = FREE
+            node[pending[k], tl.N_LINEARISED] = state[tl.S_STEP]
         state[tl.S_PENDING] = 0
     now = lap(now, tl.COMMIT, state)
     # 8
@@ -190,8 +223,12 @@ def eliminate_again(
         state, account,
     )  # fmt: skip
     bow = 0.0
-    if state[tl.S_STEP] % settings[tl.P_EVERY] == 0 or account[tl.A_TURN] > settings[tl.P_BENT_NOW]:
-        bow = find_bent(settings[tl.P_BENT], var, node, link, stiff, lin[0], scalars, values, pending, moved, state)
+    # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
+    due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
+    if due or account[tl.A_TURN] > settings[tl.P_LOOK]:
+        bow = find_bent(
+            settings[tl.P_BENT], var, fac, payload, node, link, stiff, lin[0], scalars, values, pending, moved, state
+        )
     lap(now, tl.SUBSTITUTE, state)
     return bow, tl.DONE
 

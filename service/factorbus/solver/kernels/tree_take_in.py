@@ -1,11 +1,13 @@
 """Taking new variables and factors into the tree's arenas, and out again when their step fails.  MATH §9.2."""
 
+import math
+
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.reach import size_of
+from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import hessian_size, linearise_factor, weigh_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 
@@ -19,6 +21,7 @@ def take_in_variables(
         node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
         node[v, tl.N_PLACE] = node[v, tl.N_LOCAL] = node[v, tl.N_FLAGS] = node[v, tl.N_LISTED] = 0
         node[v, tl.N_STAMP], node[v, tl.N_SEEN], node[v, tl.N_MOVED] = -1, state[tl.S_STEP], -1
+        node[v, tl.N_LINEARISED] = state[tl.S_STEP]
         x = var[v, at.V_AT]
         for a in range(size_of(var[v, at.V_KIND])):
             lin[0, x + a] = values[x + a]
@@ -34,21 +37,25 @@ def take_in_variables(
 def take_in_factors(
     f1: int, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64, stiff: F64,
     lever: F64, saved: F64, state: I64,
-) -> None:  # fmt: skip
-    """Factors up to f1 are linearised, and join the incidences of their variables.
+) -> bool:  # fmt: skip
+    """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
-    f0 = state[tl.S_FACTORS]
-    r, H, W = np.zeros(6), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    f0, finite = state[tl.S_FACTORS], True
+    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
         link[f, tl.L_KIND], link[f, tl.L_SECOND] = fac[f, at.F_KIND], j
+        if fac[f, at.F_KIND] >= at.IDP_FIRST or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+            link[f, tl.L_KIND] = tl.EXACT
+            state[tl.S_EXACT] += 1
         link[f, tl.L_FAR] = var[j, at.V_AT] if j >= 0 else -1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
+        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1])
         _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
@@ -59,6 +66,7 @@ def take_in_factors(
             link[f, tl.L_J], node[j, tl.N_ADJ] = node[j, tl.N_ADJ], 2 * f + 1
             node[j, tl.N_SEEN] = state[tl.S_STEP]
     state[tl.S_FACTORS] = f1
+    return finite
 
 
 @part
@@ -68,6 +76,9 @@ def take_out(
     """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
     for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
+        if link[f, tl.L_KIND] >= tl.EXACT:
+            state[tl.S_EXACT] -= 1
+            state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
         if j >= 0:
             node[j, tl.N_ADJ] = link[f, tl.L_J]
             _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)

@@ -4,8 +4,8 @@ import math
 
 from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel
 from factorbus.idp.kernels.layout import BEHIND, GOOD, NOT_FINITE, OUTSIDE_IMAGE, OUTSIDE_LENS, Q, R
-from factorbus.idp.kernels.lens import project, ray
 from factorbus.idp.kernels.rays import rotation, turning
+from factorbus.solver.lenses.models import project, ray
 
 
 @kernel(

@@ -16,7 +16,7 @@ import math
 
 from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel
 from factorbus.idp.kernels.layout import NOT_FINITE, OUTSIDE_IMAGE, VERTICAL, Q, R
-from factorbus.idp.kernels.lens import ray
+from factorbus.solver.lenses.models import ray
 
 # sin of the smallest angle between a ray and the vertical axis: nearer, azimuth is noise.
 _VERTICAL = 1e-6

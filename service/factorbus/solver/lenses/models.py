@@ -1,4 +1,4 @@
-"""Lenses: from a distorted pixel to a ray, from a ray to a distorted pixel, each with its Jacobian.  MATH §2.
+"""Lenses: from a distorted pixel to a ray, from a ray to a distorted pixel, each with its Jacobian.  MATH §2 (workers).
 
 Camera axes: x right, y down, z forward.  A ray h is a direction in them; its length means nothing.  All models give
 
@@ -8,8 +8,8 @@ Camera axes: x right, y down, z forward.  A ray h is a direction in them; its le
 
 import math
 
-from factorbus.idp.kernels.compile import F64, inline_kernel
-from factorbus.idp.kernels.layout import CX, CY, FISHEYE, FU, FV, GOOD, LIMIT, MORE, OUTSIDE_LENS, RADTAN
+from factorbus.solver.lenses.compile import F64, inline_kernel
+from factorbus.solver.lenses.layout import CX, CY, FISHEYE, FU, FV, GOOD, LIMIT, MORE, OUTSIDE_LENS, RADTAN
 
 # Newton's method doubles the digits a step: from anywhere sensible, ten are plenty.
 _STEPS = 30

@@ -1,0 +1,233 @@
+"""`factorbus ask`: what a map on the bus says of its certainty, of a measurement, and of itself."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from factorbus.cli.exits import FAILED, OK, input_file
+from factorbus.cli.options import DEFAULT_ENDPOINT, file_argument, json_option, zenoh_option
+from factorbus.cli.screen import document, table
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@click.group()
+def command() -> None:
+    """Ask the map NAME on the bus. Answers are from one revision, and name it.
+
+    \b
+    factorbus ask covariance warehouse x12 x300
+    factorbus ask gate warehouse candidates.g2o
+    factorbus ask why warehouse x12
+    """
+
+
+def _asking(command: F) -> F:
+    """NAME, --connect, --timeout and --json."""
+    for option in (
+        json_option,
+        zenoh_option,
+        click.option("--timeout", "timeout_s", type=float, default=30.0, show_default=True, help="Seconds to wait."),
+        click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
+        click.argument("name"),
+    ):
+        command = option(command)
+    return command
+
+
+_probability = click.option(
+    "--probability",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.95,
+    show_default=True,
+    help="With which a right measurement passes.",
+)
+
+
+@command.command("covariance")
+@_asking
+@click.argument("keys", nargs=-1)
+@click.option("--joint", "blocks", flag_value="joint", help="Of all KEYS together, one matrix.")
+@click.option("--relative", "blocks", flag_value="relative", help="Of the second as seen from the first, pair by pair.")
+@click.option("--last", "blocks", flag_value="last", help="Of the pose that was inserted last.")
+def covariance_command(
+    name: str, keys: tuple[str, ...], blocks: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
+    """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
+
+    \b
+    factorbus ask covariance warehouse x12 l3
+    factorbus ask covariance warehouse x12 x300 --relative
+    factorbus ask covariance warehouse --last --json
+    """
+    import numpy as np
+
+    from factorbus.proto.symbols import format_symbol
+
+    if blocks in ("joint", "relative") and not keys:
+        raise click.UsageError(f"--{blocks} needs KEYS")
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
+    if found.covariance is not None:
+        names = [format_symbol(int(key)) for key in found.keys]
+        if as_json:
+            document({"revision": found.revision, "keys": names, "covariance": found.covariance.tolist()})
+        else:
+            click.echo(np.array2string(found.covariance, precision=6, suppress_small=False))
+        return OK
+    rows = [
+        (" ".join(format_symbol(int(key)) for key in np.atleast_1d(one)), group.kind, block)
+        for group in found.groups
+        for one, block in zip(group.keys, group.covariance, strict=True)
+    ]
+    if as_json:
+        content = [{"keys": keys.split(), "kind": kind, "covariance": block.tolist()} for keys, kind, block in rows]
+        document({"revision": found.revision, "blocks": content})
+    else:
+        table(
+            [(keys, "  ".join(f"{sigma:.4g}" for sigma in np.sqrt(block.diagonal()))) for keys, _, block in rows],
+            title=f"Standard deviations at revision {found.revision}",
+        )
+    return OK
+
+
+@command.command("gate")
+@_asking
+@file_argument("candidates")
+@_probability
+def gate_command(
+    name: str, candidates: Path, probability: float, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
+    """Whether the factors in the file CANDIDATES (g2o, TORO, iSAM) are plausible; the exit code is 1 when one is not.
+
+    Their keys are those of the map; vertices in the file are not looked at.
+
+    \b
+    factorbus ask gate warehouse candidates.g2o --probability 0.99
+    """
+    factors = _factors(candidates)
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.gate(factors, probability, timeout_s).result()
+    columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
+    rows = [
+        {"factor": told, "distance": distance, "threshold": allowed, "plausible": plausible}
+        for told, distance, allowed, plausible in zip(_described(factors), *columns, strict=True)
+    ]
+    if as_json:
+        document({"revision": found.revision, "candidates": rows})
+    else:
+        table(
+            [
+                (row["factor"], f"d² {row['distance']:.4g} of {row['threshold']:.4g}: {_word(row['plausible'])}")
+                for row in rows
+            ],
+            title=f"At revision {found.revision}",
+        )
+    return OK if all(row["plausible"] for row in rows) else FAILED
+
+
+@command.command("gain")
+@_asking
+@file_argument("candidates")
+def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """How much information each of the factors in the file CANDIDATES would bring by itself, in nats, the most first.
+
+    \b
+    factorbus ask gain warehouse candidates.g2o
+    """
+    factors = _factors(candidates)
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.gain(factors, timeout_s).result()
+    rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
+    if as_json:
+        content = [{"factor": told, "gain": gain} for told, gain in rows]
+        document({"revision": found.revision, "candidates": content})
+    else:
+        table([(told, f"{gain:.4g}") for told, gain in rows], title=f"Nats at revision {found.revision}")
+    return OK
+
+
+@command.command("why")
+@_asking
+@click.argument("what")
+def why_command(name: str, what: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
+
+    \b
+    factorbus ask why warehouse x12
+    factorbus ask why warehouse 17 --json
+    """
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.why(factor=int(what)) if what.isdecimal() else asked.doubt.why(what)
+    if as_json:
+        content = {"revision": found.revision, "variable": found.variable, "factor": found.factor, "step": found.step}
+        document(content)
+        return OK
+    if found.variable:
+        table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
+        table([(_told(each), _factor_line(each)) for each in found.variable["factors"]], title="Its factors")
+    else:
+        table([(_told(found.factor), _factor_line(found.factor))], title=f"At revision {found.revision}")
+    step = found.step
+    if step:
+        table([("the last step", f"{step['strategy']}, because {step['because']}")])
+    return OK
+
+
+def _variable_rows(account: Any) -> list[tuple[str, str]]:
+    steps = [(name.replace("_", " "), account[name]) for name in ("linearised_step", "changed_step", "seen_step")]
+    return [
+        ("kind", account["kind"] + (", fixed" if account["fixed"] else "")),
+        ("value", "  ".join(f"{number:.6g}" for number in account["value"])),
+        ("sigmas", "  ".join(f"{number:.4g}" for number in account["sigmas"])),
+        ("smallest pivot", f"{account['pivot']:.4g}, {account['conditioning']:.2g} of what its factors bring"),
+        *((name, str(step)) for name, step in steps if step >= 0),
+    ]
+
+
+def _factor_line(account: Any) -> str:
+    without = account["without"]
+    fall = "nothing else measures this" if without is None else f"without it χ² falls by {without:.3g}"
+    share = f"{account['influence']:.2f} of {account['dims']} known from it"
+    return f"χ² {account['chi2']:.3g}, {share}, {fall}"
+
+
+def _told(account: Any) -> str:
+    from factorbus.proto.symbols import format_symbol
+
+    ends = ", ".join(format_symbol(key) for key in account["keys"])
+    return f"{account['factor']} {account['kind']} ({ends})"
+
+
+def _word(plausible: bool) -> str:
+    return "plausible" if plausible else "not plausible"
+
+
+def _factors(path: Path) -> tuple[Any, ...]:
+    from factorbus.formats import read
+
+    with input_file(path):
+        return read(path).batch.factors
+
+
+def _described(factors: tuple[Any, ...]) -> list[str]:
+    from factorbus.proto.symbols import format_symbol
+
+    return [
+        f"{group.kind} ({', '.join(format_symbol(int(key)) for key in row)})" for group in factors for row in group.keys
+    ]
+
+
+@contextmanager
+def _map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> Iterator[Any]:
+    """The map, joined only if it is there."""
+    from factorbus.client import connect
+
+    with (
+        connect(endpoint, client="ask", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        bus.map(name, mirror=False, create=False) as joined,
+    ):
+        yield joined

@@ -1,0 +1,44 @@
+"""`factorbus gateway`: maps for browsers."""
+
+import click
+
+from factorbus.cli.children import READY
+from factorbus.cli.exits import require
+from factorbus.cli.options import DEFAULT_ENDPOINT
+
+
+@click.command()
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0: all of them.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="To listen at; 0: any free one."
+)
+@click.option(
+    "--name", "names", multiple=True, metavar="NAME", help="A name by which browsers call this machine, or '*'."
+)
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+def command(endpoint: str, host: str, port: int, names: tuple[str, ...], until_eof: bool) -> None:
+    """Serve maps to browsers: a page with the live map, and the same over HTTP and WebSocket, to read only.
+
+    Click a pose or a landmark to see what holds it where it is. Until Ctrl-C.
+
+    \b
+    factorbus gateway
+    factorbus gateway --connect tcp/robot.local:7447 --host 0.0.0.0 --name robot.local
+    curl http://127.0.0.1:8080/api/maps/warehouse/variables/x12
+    """
+    require("gateway", "factorbus gateway")
+    from factorbus.cli.exits import Stopped
+    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.client import connect
+    from factorbus.gateway import make_app
+    from factorbus.gateway.server import serving
+
+    hosts = ("127.0.0.1", "localhost", host, *names)
+    with stop_on_signals(until_eof) as stop, connect(endpoint, client="gateway") as bus:
+        try:
+            with serving(make_app(bus, hosts), host, port) as bound:
+                click.echo(f"{READY}http://{'127.0.0.1' if host == '0.0.0.0' else host}:{bound}")
+                stop.wait()
+        except OSError as error:
+            raise Stopped("port_taken", f"{host}:{port}: {error.strerror}; give another --port") from error

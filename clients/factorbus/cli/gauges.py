@@ -1,0 +1,65 @@
+"""The numbers that `factorbus top` shows: what a service counts, and by how much since the last reading."""
+
+import time
+from typing import Any
+
+from factorbus.client import Bus, Map, Problem, Unavailable
+
+_ANSWER_S = 3.0
+
+
+class Gauges:
+    """Reads a service's counters; rates are those between two readings."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._joined: dict[str, Map] = {}
+        self._before: dict[tuple[str, int], tuple[float, dict[str, Any]]] = {}
+
+    def read(self) -> dict[str, Any]:
+        """For JSON: service, version, answer_ms, maps, clients, workers; `unavailable` says why there are none."""
+        seen: dict[str, Any] = {"unavailable": "", "service": "", "version": "", "answer_ms": 0.0}
+        seen |= {"maps": [], "clients": [], "workers": []}
+        try:
+            start = time.perf_counter()
+            rows = self._bus.maps(_ANSWER_S)
+            seen["answer_ms"] = (time.perf_counter() - start) * 1e3
+            for row in rows:
+                self._read_map(row.name, seen)
+        except Unavailable as nobody:
+            seen["unavailable"] = nobody.message
+        return seen
+
+    def _read_map(self, name: str, seen: dict[str, Any]) -> None:
+        try:
+            if name not in self._joined:
+                self._joined[name] = self._bus.map(name, mirror=False, create=False)
+            stats = self._joined[name].stats(_ANSWER_S)
+        except Unavailable:
+            raise
+        except Problem:  # dropped since the list was made
+            self._joined.pop(name, None)
+            return
+        now = time.perf_counter()
+        at, before = self._before.get((name, stats["epoch"]), (now, stats))
+        self._before[name, stats["epoch"]] = now, stats
+        seconds = max(now - at, 1e-9)
+        steps = stats["steps"] - before["steps"]
+        seen["service"], seen["version"], seen["workers"] = stats["service"], stats["version"], stats["workers"]
+        taken = stats["inserts"]["accepted"] - before["inserts"]["accepted"]
+        plain = ("name", "mode", "variables", "factors", "revision", "chi2", "waiting", "parked", "epoch")
+        seen["maps"].append(
+            {key: stats[key] for key in plain}
+            | {
+                "steps_per_s": steps / seconds,
+                "inserts_per_s": taken / seconds,
+                "step_ms": (stats["solver_ms"] - before["solver_ms"]) / steps if steps else None,
+                "refused": stats["inserts"]["refused"],
+                "busy": stats["inserts"]["busy"],
+            }
+        )
+        for client, following in sorted(stats["clients"].items()):
+            fresh = following - before["clients"].get(client, 1)  # the number that it sends next begins at 1
+            seen["clients"].append(
+                {"name": client, "map": name, "inserts": following - 1, "inserts_per_s": fresh / seconds}
+            )

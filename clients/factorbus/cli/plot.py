@@ -1,0 +1,130 @@
+"""`factorbus plot`: pictures of maps, drives and systems, from files and from the bus."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from factorbus.cli.exits import require
+from factorbus.cli.options import ModeChoice, out_option
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_FROM_BUS = "SOURCE is a map of the service at ENDPOINT."
+
+
+@click.group()
+def command() -> None:
+    """Draw into a .png, .svg or .pdf file, in colours that colour-blind readers can tell apart.
+
+    SOURCE is a graph file (g2o, TORO, iSAM), the name of a data set, or with --connect the name of a map on the bus.
+
+    \b
+    factorbus plot map town.g2o --solve
+    factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --out warehouse.svg
+    factorbus plot drive town.g2o
+    factorbus plot sparsity town.g2o
+    """
+
+
+def _source(command: F) -> F:
+    return click.argument("source")(click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(command))
+
+
+def _out(what: str) -> Callable[[F], F]:
+    return out_option("--out", "out", f"The picture.  [default: SOURCE-{what}.png here]", "FILE.png")
+
+
+@command.command("map")
+@_source
+@click.option("--solve", is_flag=True, help="Draw the optimum of the graph, found here, instead of the file's values.")
+@_out("map")
+def map_command(source: str, connect: str | None, solve: bool, out: Path | None) -> None:
+    """Trajectory, landmarks, loop closures, and where odometry alone would have led.
+
+    \b
+    factorbus plot map intel --solve --out intel.pdf
+    """
+    from factorbus.cli.picture import draw
+    from factorbus.cli.plot_source import graph_of, solved
+    from factorbus.viz import Course
+
+    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = solved(drawn) if solve else drawn
+    path = drawn.file("map", out)
+    draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about)
+    click.echo(path)
+
+
+@command.command("drive")
+@click.argument("source")
+@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
+@click.option(
+    "--every",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Solve from scratch at every Nth step, to hold χ² against.  [default: ten times]",
+)
+@_out("drive")
+def drive_command(source: str, mode: str, every: int | None, out: Path | None) -> None:
+    """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
+
+    \b
+    factorbus plot drive intel --mode tree --out intel-drive.svg
+    """
+    from factorbus.cli.plot_source import file_of
+
+    require("service", "factorbus plot drive")
+    file = _ready(lambda: file_of(source), out)
+    from factorbus.cli.drive import drive
+    from factorbus.cli.local import LocalMap
+    from factorbus.cli.picture import course_of
+    from factorbus.cli.screen import progress
+    from factorbus.solver import warm
+    from factorbus.viz import drive_figure, save
+
+    warm()  # so that the first steps do not load kernels
+    target = LocalMap(mode)
+    with progress(Path(file.path).name, file.poses) as show:
+        driven = drive(target, file.steps(), max(file.poses // 10, 1) if every is None else every, show)
+    reports = [step.report for step in driven.steps]
+    name = Path(file.path).stem
+    path = out or Path(f"{name}-drive.png")
+    about = f"{driven.poses:,} poses, {driven.factors:,} factors, mode {reports[-1]['mode']}"
+    figure = drive_figure(
+        course_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
+    )
+    save(figure, path, name)
+    click.echo(path)
+
+
+@command.command("sparsity")
+@_source
+@_out("sparsity")
+def sparsity_command(source: str, connect: str | None, out: Path | None) -> None:
+    """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
+
+    \b
+    factorbus plot sparsity intel
+    """
+    from factorbus.cli.plot_source import graph_of
+
+    require("service", "factorbus plot sparsity")
+    drawn = _ready(lambda: graph_of(source, connect), out)
+    from factorbus.cli.sparsity import pattern_of
+    from factorbus.viz import save, sparsity_figure
+
+    path = drawn.file("sparsity", out)
+    save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
+    click.echo(path)
+
+
+def _ready(load: Callable[[], Any], out: Path | None) -> Any:
+    """What `load` gives, once it is known that a picture can be drawn where it is to go."""
+    require("viz", "factorbus plot")
+    from factorbus.viz import checked_ending
+
+    if out is not None:
+        checked_ending(out)
+    return load()

@@ -1,0 +1,69 @@
+"""What `factorbus plot` draws: a graph file, a data set by its name, or a map on the bus."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from factorbus.proto.messages import Batch, Variables
+
+if TYPE_CHECKING:
+    from factorbus.formats import GraphFile
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A graph with values, and what to call it."""
+
+    name: str
+    graph: Batch
+    about: str
+
+    def unsolved(self) -> Batch:
+        """The same without the values of what is estimated: what odometry alone starts from."""
+        bare = [g if g.fixed else Variables(g.kind, g.keys) for g in self.graph.variables]
+        return Batch(tuple(bare), self.graph.factors)
+
+    def file(self, what: str, out: Path | None) -> Path:
+        """Where the picture goes: `out`, or a name made from this one's in the folder we are in."""
+        return out or Path(f"{self.name}-{what}.png")
+
+
+def graph_of(source: str, connect: str | None) -> Drawn:
+    """The graph of a file, or, with an endpoint, of the map of that name.  Raises Stopped, FormatError, Problem."""
+    if connect is not None:
+        return _from_bus(source, connect)
+    file = file_of(source)
+    return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}")
+
+
+def file_of(source: str) -> "GraphFile":
+    """The file of that name, or the data set; says what was left out.  Raises Stopped, FormatError."""
+    from factorbus.cli.replay_source import source_of
+    from factorbus.cli.screen import note
+    from factorbus.formats import read
+
+    file = read(source_of(Path(source)))
+    for text in file.notes:
+        note(f"{file.path}: {text}")
+    return file
+
+
+def solved(drawn: Drawn) -> Drawn:
+    """The same graph at its optimum, found from scratch in this process.  Raises Stopped, SolverError."""
+    from factorbus.cli.exits import require
+
+    require("service", "--solve")
+    from factorbus.solver import solve_batch
+
+    result = solve_batch(drawn.graph.variables, drawn.graph.factors)
+    groups = tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in result.values)
+    about = f"χ² {result.chi2:.6g} after {result.iterations} iterations"
+    return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
+
+
+def _from_bus(name: str, endpoint: str) -> Drawn:
+    from factorbus.client import connect
+
+    with connect(endpoint, client="plot") as bus, bus.map(name, create=False, mirror=False) as joined:
+        graph, chi2 = joined.graph(), joined.chi2()
+    return Drawn(name, graph.batch, f"revision {graph.revision}, χ² {chi2.chi2:.6g}")

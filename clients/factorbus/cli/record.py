@@ -1,0 +1,59 @@
+"""`factorbus record`: a map as an MCAP file, while it is made."""
+
+from pathlib import Path
+
+import click
+
+from factorbus.cli.exits import require
+from factorbus.cli.options import DEFAULT_ENDPOINT, out_option
+
+
+@click.command()
+@click.argument("map_name", metavar="MAP")
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@out_option("--out", "out", "The recording.  [default: MAP.mcap here]", "FILE.mcap")
+@click.option(
+    "--every",
+    "every_s",
+    type=click.FloatRange(0.05, 60),
+    default=1.0,
+    show_default=True,
+    metavar="S",
+    help="Seconds between pictures of the whole map.",
+)
+@click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+def command(map_name: str, endpoint: str, out: Path | None, every_s: float, until: int | None, until_eof: bool) -> None:
+    """Record MAP into an MCAP file until Ctrl-C: every step, every estimate, every factor, and a scene to look at.
+
+    Foxglove opens it (3D panel: /map/scene and /tf; plots: /map/step.chi2), and any MCAP reader. What is in the map
+    already comes first.
+
+    \b
+    factorbus record warehouse
+    factorbus record warehouse --connect tcp/robot.local:7447 --out monday.mcap
+    """
+    require("record", "factorbus record")
+    from factorbus.cli.exits import Stopped
+    from factorbus.cli.screen import note
+    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.client import connect
+    from factorbus.viz.lookout import Lookout
+    from factorbus.viz.mcap import Recording
+
+    path = out or Path(f"{map_name}.mcap")
+    if path.exists():
+        raise Stopped("file_exists", f"{path} is there already: give another --out, or remove it", path=str(path))
+    with (
+        stop_on_signals(until_eof) as stop,
+        connect(endpoint, client="recorder") as bus,
+        bus.map(map_name, create=False) as joined,
+        Lookout(joined) as lookout,
+        Recording(path) as recording,
+    ):
+        recording.begin(lookout.last_look(joined.timeout_s))
+        click.echo(f"ready {path}")
+        while not stop.wait(every_s) and (until is None or joined.estimate.revision < until):
+            recording.take(lookout.look())
+        recording.take(lookout.last_look(joined.timeout_s))
+    note(f"{path}: {recording.deltas} deltas, {recording.factors} factors, up to revision {recording.revision}")

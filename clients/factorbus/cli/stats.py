@@ -1,0 +1,101 @@
+"""`factorbus stats`: what services count and time, asked over the bus."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import click
+
+from factorbus.cli.exits import FAILED, OK
+from factorbus.cli.options import DEFAULT_ENDPOINT, json_option, zenoh_option
+
+
+@click.command()
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@zenoh_option
+@click.option(
+    "--wait", "wait_s", type=click.FloatRange(0), default=5, show_default=True, metavar="S", help="For answers."
+)
+@json_option
+def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
+    """Show how services are, what their maps hold, and how long steps and inserts take.
+
+    At a router every service answers. Where access control is on, ask as an operator. The exit code is 1 when a
+    service says that it is not alive: one of its threads is stuck.
+
+    \b
+    factorbus stats
+    factorbus stats --connect tls/solver.local:7447 --zenoh ops.json5 --json
+    """
+    from factorbus.cli import screen
+    from factorbus.client import connect
+
+    with connect(endpoint, client="stats", zenoh=zenoh, timeout_s=wait_s) as bus:
+        services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
+    if as_json:
+        screen.document({"services": services})
+    else:
+        for each in services:
+            screen.table(_rows(each), title=f"service {each['service']}")
+    return OK if all(each["alive"] for each in services) else FAILED
+
+
+def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    state = "ready" if account["ready"] else "alive, not ready" if account["alive"] else "stuck"
+    stuck = f": {', '.join(account['stuck'])}" if account["stuck"] else ""
+    yield "state", f"{state}{stuck}, for {_span(account['uptime_s'])}, version {account['version']}"
+    memory = account["memory"]
+    yield "memory", f"{memory['resident_bytes'] >> 20} MiB of {memory['limit_bytes'] >> 20} MiB"
+    workers = account.get("workers", ())
+    told = ", ".join(f"{each['name']} ({each['in_flight']} of {each['slots']})" for each in workers)
+    yield "workers", told or "none: jobs are done in place"
+    for row in account["maps"]:
+        yield f"map {row['name']}", _map(row)
+    for name, value in account.get("journal", {}).items():
+        yield f"journal {name}", str(value)
+
+
+def _map(row: Mapping[str, Any]) -> str:
+    inserts = row["inserts"]
+    lines = [
+        f"{row['variables']} variables, {row['factors']} factors, revision {row['revision']}, {row['mode']}",
+        f"χ² {row['chi2']:.6g}; {_steps(row['strategies'])}",
+        f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
+        f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
+        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; {row['clients']} clients",
+        *(f"{name}: {value}" for name, value in row.get("journal", {}).items()),
+    ]
+    return "\n".join(lines)
+
+
+def _steps(strategies: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in strategies.items()) or "no step yet"
+
+
+def _codes(refusals: Mapping[str, int]) -> str:
+    told = ", ".join(f"{count} {code}" for code, count in refusals.items() if code != "busy")
+    return f" ({told})" if told else ""
+
+
+def _times(histogram: Mapping[str, Any]) -> str:
+    """Half and 99 of 100 of them, by the bounds between which they were counted."""
+    if not sum(histogram["counts"]):
+        return "no time yet"
+    return " and ".join(
+        f"{_below(histogram, share)} ({name})" for name, share in (("half of them", 0.5), ("99 of 100", 0.99))
+    )
+
+
+def _below(histogram: Mapping[str, Any], share: float) -> str:
+    reached, wanted = 0, share * sum(histogram["counts"])
+    for bound, count in zip(histogram["bounds_s"], histogram["counts"], strict=False):
+        reached += count
+        if reached >= wanted:
+            return f"at most {1e3 * bound:g} ms"
+    return f"more than {histogram['bounds_s'][-1]:g} s"
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"

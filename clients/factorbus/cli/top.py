@@ -1,0 +1,122 @@
+"""`factorbus top`: what goes on at a service, in the terminal."""
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from factorbus.cli.options import DEFAULT_ENDPOINT, json_option
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+@click.command()
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@click.option(
+    "--every", "every_s", type=click.FloatRange(0.1, 60), default=1.0, show_default=True, metavar="S", help="Seconds."
+)
+@click.option("--once", is_flag=True, help="Look twice, `--every` apart, print it, and end.")
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+@json_option
+def command(endpoint: str, every_s: float, once: bool, until_eof: bool, as_json: bool) -> None:
+    """Show maps, clients and workers of the service at ENDPOINT: rates, times, queues. Until Ctrl-C.
+
+    \b
+    factorbus top
+    factorbus top --connect tcp/robot.local:7447 --every 2
+    factorbus top --once --json
+
+    \b
+    In the tables:
+      steps/s    steps since the look before; inserts/s: accepted inserts
+      step ms    solver's time of a step, mean since the look before
+      waiting    inserts that are accepted by no step yet, and those parked behind a gap
+      answer ms  from asking for these numbers to having them, over the bus
+    """
+    from factorbus.cli import screen
+    from factorbus.cli.gauges import Gauges
+    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.client import connect
+
+    with stop_on_signals(until_eof) as stop, connect(endpoint, client="top") as bus:
+        gauges = Gauges(bus)
+        seen = gauges.read()
+        if once or as_json:
+            stop.wait(every_s)
+            seen = gauges.read()
+            if as_json:
+                screen.document(seen)
+            else:
+                _console().print(_view(seen, endpoint))
+            return
+        from rich.live import Live
+
+        with Live(_view(seen, endpoint), console=_console(), screen=True, auto_refresh=False) as live:
+            while not stop.wait(every_s):
+                live.update(_view(gauges.read(), endpoint), refresh=True)
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=120)
+
+
+def _view(seen: dict[str, Any], endpoint: str) -> "RenderableType":
+    from rich.console import Group
+    from rich.text import Text
+
+    head = f"factorbus top   {endpoint}   {time.strftime('%H:%M:%S')}   "
+    if seen["unavailable"]:
+        return Text(head + f"nobody answers: {seen['unavailable']}; asking again", style="bold")
+    head += f"service {seen['service']} {seen['version']}, answers in {seen['answer_ms']:.1f} ms"
+    return Group(Text(head, style="bold"), Text(), _maps(seen), _clients(seen), _workers(seen))
+
+
+def _maps(seen: dict[str, Any]) -> "RenderableType":
+    table = _table(
+        "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting", "refused"
+    )
+    for row in seen["maps"]:
+        table.add_row(
+            row["name"],
+            row["mode"],
+            f"{row['variables']:,}",
+            f"{row['factors']:,}",
+            f"{row['revision']:,}",
+            f"{row['steps_per_s']:.1f}",
+            f"{row['inserts_per_s']:.1f}",
+            "" if row["step_ms"] is None else f"{row['step_ms']:.2f}",
+            f"{row['chi2']:.6g}",
+            f"{row['waiting']}" + (f" +{row['parked']}" if row["parked"] else ""),
+            f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
+        )
+    return table
+
+
+def _clients(seen: dict[str, Any]) -> "RenderableType":
+    table = _table("client", "map", "inserts", "inserts/s")
+    for row in seen["clients"]:
+        table.add_row(row["name"], row["map"], f"{row['inserts']:,}", f"{row['inserts_per_s']:.1f}")
+    return table
+
+
+def _workers(seen: dict[str, Any]) -> "RenderableType":
+    table = _table("worker", "slots", "in flight", "trip ms")
+    for row in seen["workers"]:
+        trip = "" if row.get("trip_ms") is None else f"{row['trip_ms']:.2f}"
+        table.add_row(row["name"], str(row["slots"]), str(row["in_flight"]), trip)
+    return table
+
+
+def _table(first: str, *columns: str) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column(first, style="bold", no_wrap=True)
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("map", "mode") else "right", no_wrap=True)
+    return table

@@ -1,0 +1,69 @@
+"""What a map can be asked about its uncertainty, for asyncio; see `factorbus.client.uncertainty`."""
+
+import asyncio
+from collections.abc import Sequence
+
+from numpy.typing import ArrayLike
+
+from factorbus.client.draft import Draft, Key
+from factorbus.client.uncertainty import DoubtQuestions, asked_why, factors_of, matrix_of, sightings
+from factorbus.proto.arrays import F64
+from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
+from factorbus.proto.messages import Batch, Factors
+
+
+class Doubt:
+    """Questions and their answers, as in `factorbus.client.uncertainty.Doubt`."""
+
+    def __init__(self, ask: DoubtQuestions) -> None:
+        self._ask = ask
+
+    async def covariance(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Covariances:
+        """The covariance of each of some variables, or of all of them."""
+        return await asyncio.wrap_future(self._ask.covariance("diagonal", of, None, timeout_s))
+
+    async def last(self, timeout_s: float | None = None) -> Covariances:
+        """The covariance of the pose that was inserted last."""
+        return await asyncio.wrap_future(self._ask.covariance("last", None, None, timeout_s))
+
+    async def joint(self, of: Sequence[Key], timeout_s: float | None = None) -> F64:
+        """The joint covariance (d, d) of some variables."""
+        return matrix_of(await asyncio.wrap_future(self._ask.covariance("joint", of, None, timeout_s)))
+
+    async def cross(self, rows: Sequence[Key], columns: Sequence[Key], timeout_s: float | None = None) -> F64:
+        """The covariance (d, e) between some variables and others."""
+        return matrix_of(await asyncio.wrap_future(self._ask.covariance("cross", rows, columns, timeout_s)))
+
+    async def relative(self, pairs: Sequence[tuple[Key, Key]], timeout_s: float | None = None) -> Covariances:
+        """Of each pair, the second as seen from the first."""
+        of = [key for pair in pairs for key in pair]
+        return await asyncio.wrap_future(self._ask.covariance("relative", of, None, timeout_s))
+
+    async def gate(
+        self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
+    ) -> Gated:
+        """Which of the candidate factors are plausible."""
+        return await asyncio.wrap_future(self._ask.gate(factors_of(candidates), probability, timeout_s))
+
+    async def gain(self, candidates: Batch | Draft | Sequence[Factors], timeout_s: float | None = None) -> Gained:
+        """How many nats of information each candidate factor would bring by itself."""
+        return await asyncio.wrap_future(self._ask.gain(factors_of(candidates), timeout_s))
+
+    async def associate(
+        self,
+        pose: Key,
+        kind: str,
+        measured: ArrayLike,
+        *,
+        information: ArrayLike,
+        landmarks: Sequence[Key] | None = None,
+        probability: float = 0.95,
+        timeout_s: float | None = None,
+    ) -> Associated:
+        """Which landmark each sighting from `pose` is of, jointly."""
+        ask = sightings(pose, kind, measured, information, landmarks, probability)
+        return await asyncio.wrap_future(self._ask.associate(ask, timeout_s))
+
+    async def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
+        """What holds a variable, or what a factor does, and what the map's last step did and why."""
+        return await asyncio.wrap_future(self._ask.why(asked_why(key, factor), timeout_s))

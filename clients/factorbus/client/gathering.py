@@ -1,0 +1,29 @@
+"""A question to every service there is: at a router there may be several, each with maps of its own."""
+
+import time
+from queue import SimpleQueue
+
+from factorbus.client.link import Link
+from factorbus.client.replies import Again, Reply, Silence, judge
+from factorbus.proto import codec, keys
+from factorbus.proto.problems import Problem, Unavailable
+
+
+def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
+    """What all who answer `admin/<operation>` say; asked again until somebody does.  Raises Refused, Unavailable."""
+    end = time.monotonic() + timeout_s
+    key, payload, attempt = keys.admin_key(operation), codec.encode_map({}), 0
+    while (left := end - time.monotonic()) > 0:
+        attempt += 1
+        came: SimpleQueue[list[Reply]] = SimpleQueue()
+        link.ask_all(key, payload, left, came.put)
+        verdicts = [judge(reply, attempt) for reply in came.get() or [Silence()]]
+        if answers := [verdict for verdict in verdicts if isinstance(verdict, bytes)]:
+            return answers
+        for verdict in verdicts:
+            if isinstance(verdict, Problem):
+                raise verdict
+        pauses = [verdict.pause_s for verdict in verdicts if isinstance(verdict, Again)]
+        time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))
+    hint = "nobody replies: is it running, and may this client ask?"
+    raise Unavailable(f"the service, asked for admin/{operation},", timeout_s, hint)

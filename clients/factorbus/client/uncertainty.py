@@ -1,0 +1,196 @@
+"""What a map can be asked about its uncertainty: how sure it is of what, and what it thinks of a measurement.
+
+    with connect("tcp/127.0.0.1:7447", client="robot1") as bus, bus.map("hall") as hall:
+        hall.doubt.covariance(["x10"])["x10"]                      # 3 x 3, in the robot's own frame
+        hall.doubt.gate(Draft().between_se2("x3", "x40", (0, 0, 0), sigmas=(0.1, 0.1, 0.02))).plausible
+
+Covariances are in tangent spaces: of local increments, translation first, metres and radians.  No compiler and no scipy
+is needed here.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorbus.client.courier import Courier, Errand
+from factorbus.client.draft import Draft, Key
+from factorbus.proto import asking_codec, keys
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.asking import (
+    AskAssociate,
+    AskCovariance,
+    AskGain,
+    AskGate,
+    AskWhy,
+    Associated,
+    Covariances,
+    Gained,
+    Gated,
+    Why,
+)
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Factors
+from factorbus.proto.problems import BadShape, Unavailable
+from factorbus.proto.symbols import parse_symbol
+
+T = TypeVar("T")
+
+
+class DoubtQuestions:
+    """Each method sends a question and returns the future of its answer, Refused, or Unavailable after `timeout_s`."""
+
+    def __init__(self, courier: Courier, map_name: str, timeout_s: float) -> None:
+        self._courier, self._map, self._timeout_s = courier, map_name, timeout_s
+
+    def covariance(
+        self, blocks: str, of: Sequence[Key] | None, others: Sequence[Key] | None, timeout_s: float | None
+    ) -> Future[Covariances]:
+        """Blocks of the covariance, as in `AskCovariance`."""
+        ask = AskCovariance(blocks, None if of is None else numbers(of), None if others is None else numbers(others))
+        return self._ask(
+            "covariance", asking_codec.encode_ask_covariance(ask), asking_codec.decode_covariances, timeout_s
+        )
+
+    def gate(self, factors: tuple[Factors, ...], probability: float, timeout_s: float | None) -> Future[Gated]:
+        """Which candidates are plausible."""
+        question = asking_codec.encode_ask_gate(AskGate(factors, probability))
+        return self._ask("gate", question, asking_codec.decode_gated, timeout_s)
+
+    def gain(self, factors: tuple[Factors, ...], timeout_s: float | None) -> Future[Gained]:
+        """What candidates would tell."""
+        question = asking_codec.encode_ask_gain(AskGain(factors))
+        return self._ask("gain", question, asking_codec.decode_gained, timeout_s)
+
+    def associate(self, ask: AskAssociate, timeout_s: float | None) -> Future[Associated]:
+        """Which landmark is which."""
+        question = asking_codec.encode_ask_associate(ask)
+        return self._ask("associate", question, asking_codec.decode_associated, timeout_s)
+
+    def why(self, ask: AskWhy, timeout_s: float | None) -> Future[Why]:
+        """The account of a variable or a factor."""
+        return self._ask("why", asking_codec.encode_ask_why(ask), asking_codec.decode_why, timeout_s)
+
+    def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
+        what = f"map {self._map!r}, asked for its {question},"
+        key = keys.ask_key(self._map, question)
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
+
+
+class Doubt:
+    """The same, waiting for the answers.  All raise Refused and Unavailable; every answer names its revision."""
+
+    def __init__(self, ask: DoubtQuestions) -> None:
+        self.ask = ask
+
+    def covariance(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Covariances:
+        """The covariance of each of some variables, or of all of them: `answer[symbol("x", 3)]` is one block."""
+        return self.ask.covariance("diagonal", of, None, timeout_s).result()
+
+    def last(self, timeout_s: float | None = None) -> Covariances:
+        """The covariance of the pose that was inserted last: microseconds of the solver's time."""
+        return self.ask.covariance("last", None, None, timeout_s).result()
+
+    def joint(self, of: Sequence[Key], timeout_s: float | None = None) -> F64:
+        """The joint covariance (d, d) of some variables, their tangent spaces one after the other."""
+        return matrix_of(self.ask.covariance("joint", of, None, timeout_s).result())
+
+    def cross(self, rows: Sequence[Key], columns: Sequence[Key], timeout_s: float | None = None) -> F64:
+        """The covariance (d, e) between some variables and others."""
+        return matrix_of(self.ask.covariance("cross", rows, columns, timeout_s).result())
+
+    def relative(self, pairs: Sequence[tuple[Key, Key]], timeout_s: float | None = None) -> Covariances:
+        """Of each pair, the second as seen from the first: its value and its covariance there."""
+        return self.ask.covariance("relative", [key for pair in pairs for key in pair], None, timeout_s).result()
+
+    def gate(
+        self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
+    ) -> Gated:
+        """Which of the candidate factors are plausible, at a gate that a right one passes with `probability`."""
+        return self.ask.gate(factors_of(candidates), probability, timeout_s).result()
+
+    def gain(self, candidates: Batch | Draft | Sequence[Factors], timeout_s: float | None = None) -> Gained:
+        """How many nats of information each candidate factor would bring by itself, whatever it measures."""
+        return self.ask.gain(factors_of(candidates), timeout_s).result()
+
+    def associate(
+        self,
+        pose: Key,
+        kind: str,
+        measured: ArrayLike,
+        *,
+        information: ArrayLike,
+        landmarks: Sequence[Key] | None = None,
+        probability: float = 0.95,
+        timeout_s: float | None = None,
+    ) -> Associated:
+        """Which landmark each sighting from `pose` is of, jointly.
+
+        kind: "landmark_se2", "landmark_se3" or "bearing_range_se2".  measured (n, size).  information: as in a draft, a
+        matrix or its upper triangle, for all of them, or a row for each.  landmarks: to choose from; None: all there
+        are.  Raises BadShape.
+        """
+        ask = sightings(pose, kind, measured, information, landmarks, probability)
+        return self.ask.associate(ask, timeout_s).result()
+
+    def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
+        """What holds a variable, or what a factor (by its id) does, and what the map's last step did and why."""
+        return self.ask.why(asked_why(key, factor), timeout_s).result()
+
+
+def numbers(of: Iterable[Key]) -> I64:
+    """Keys as int64."""
+    return np.array([parse_symbol(key) if isinstance(key, str) else key for key in of], np.int64)
+
+
+def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, ...]:
+    """The factors of a draft or a batch.  Raises BadShape when there are variables in it."""
+    if isinstance(candidates, Draft):
+        candidates = candidates.batch()
+    if not isinstance(candidates, Batch):
+        return tuple(candidates)
+    if candidates.variable_count:
+        raise BadShape("candidates", f"{candidates.variable_count} variables among them", "factors only")
+    return candidates.factors
+
+
+def matrix_of(answer: Covariances) -> F64:
+    """The matrix of a joint or cross answer."""
+    if answer.covariance is None:
+        raise Unavailable("the joint covariance", 0.0, f"the service answered with blocks {answer.blocks!r}")
+    return answer.covariance
+
+
+def asked_why(key: Key | None, factor: int | None) -> AskWhy:
+    """The question.  Raises BadShape unless one of them is given."""
+    if (key is None) == (factor is None):
+        raise BadShape("why", "both or neither of a key and a factor", "one of them")
+    return AskWhy(None if key is None else int(numbers([key])[0]), factor)
+
+
+def sightings(
+    pose: Key,
+    kind: str,
+    measured: ArrayLike,
+    information: ArrayLike,
+    landmarks: Sequence[Key] | None,
+    probability: float,
+) -> AskAssociate:
+    """The question, with the information of every sighting.  Raises BadShape."""
+    known = FACTOR_KINDS.get(kind)
+    if known is None:
+        raise BadShape("kind", repr(kind), "landmark_se2, landmark_se3 or bearing_range_se2")
+    rows = np.atleast_2d(np.asarray(measured, float))
+    if rows.shape[1] != known.size:
+        raise BadShape("measured", " × ".join(map(str, rows.shape)), f"n × {known.size}")
+    weights: Any = np.asarray(information, float)
+    if weights.shape == (known.dim, known.dim):
+        weights = weights[np.triu_indices(known.dim)]
+    if weights.shape not in ((known.information_size,), (len(rows), known.information_size)):
+        raise BadShape("information", " × ".join(map(str, weights.shape)), f"{known.dim} × {known.dim}")
+    weights = np.broadcast_to(weights, (len(rows), known.information_size))
+    chosen = None if landmarks is None else numbers(landmarks)
+    return AskAssociate(int(numbers([pose])[0]), kind, rows, weights, chosen, probability)

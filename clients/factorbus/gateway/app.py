@@ -1,0 +1,147 @@
+"""The gateway's web application: which address gives what, and how problems look over HTTP.
+
+| address | |
+|---|---|
+| / | the page: the list of maps, and a map by `#name` |
+| /api/maps | the maps of the service |
+| /api/maps/NAME/estimate, /graph, /stats, /closures | JSON |
+| /api/maps/NAME/variables/KEY | what holds x12 where it is |
+| /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti` |
+| /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
+
+from factorbus.client import Bus, Problem
+from factorbus.gateway.documents import estimate, groups
+from factorbus.gateway.explain import explain
+from factorbus.gateway.live import follow
+from factorbus.gateway.maps import Maps
+from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.viz.closures import closures_of
+
+_PAGE = Path(__file__).parent / "page"
+_STATUS = {
+    "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400, "bad_name": 400, "bad_symbol": 400,
+    "unavailable": 503, "shutting_down": 503,
+}  # fmt: skip
+# Codes of a WebSocket that is closed, from the range that is the application's.
+_FOREIGN, _PROBLEM = 4403, 4404
+
+
+def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Starlette:
+    """The application, over a connection that stays the caller's.  hosts: names by which it may be called."""
+    maps = Maps(bus)
+    one = "/api/maps/{name}"
+    answers: dict[str, Callable[[Maps, Request], Awaitable[Response]]] = {
+        "/api/maps": _list,
+        f"{one}/estimate": _estimate,
+        f"{one}/graph": _graph,
+        f"{one}/closures": _closures,
+        f"{one}/stats": _stats,
+        f"{one}/export": _export,
+        f"{one}/variables/{{key}}": _variable,
+    }
+    return Starlette(
+        routes=[
+            Route("/", lambda _: FileResponse(_PAGE / "index.html")),
+            *(Route(path, partial(answer, maps)) for path, answer in answers.items()),
+            WebSocketRoute(f"{one}/live", partial(_live, maps)),
+            Mount("/page", StaticFiles(directory=_PAGE)),
+        ],
+        # A page of somebody else's that calls us by a name of its own does not get an answer.
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
+        exception_handlers={Problem: _problem},
+    )
+
+
+async def _list(maps: Maps, _: Request) -> Response:
+    rows = await asyncio.to_thread(maps.bus.maps)
+    return JSONResponse({"maps": [asdict(row) | {"epoch": str(row.epoch)} for row in rows]})
+
+
+async def _estimate(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        return JSONResponse(estimate(joined.map.estimate.snapshot()))
+
+
+async def _graph(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        graph = await maps.graph(joined)
+    factors = [
+        {
+            "kind": group.kind,
+            "keys": [[format_symbol(key) for key in row] for row in group.keys.tolist()],
+            "measured": group.measured.tolist(),
+            "information": group.information.tolist(),
+        }
+        for group in graph.batch.factors
+    ]
+    at = {"epoch": str(graph.epoch), "revision": graph.revision}
+    return JSONResponse(at | {"variables": groups(graph.batch.variables), "factors": factors})
+
+
+async def _closures(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        graph = await maps.graph(joined)
+    found = await asyncio.to_thread(closures_of, graph.batch.variables, graph.batch.factors)
+    keys = [[format_symbol(key) for key in pair] for pair in found.keys.tolist()]
+    return JSONResponse({"revision": graph.revision, "keys": keys, "misfit": found.misfit.tolist()})
+
+
+async def _stats(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        stats = await asyncio.wrap_future(joined.map.ask.stats(None))
+    return JSONResponse(stats | {"epoch": str(stats["epoch"])})
+
+
+async def _export(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        format = request.query_params.get("format", "g2o")
+        text = await asyncio.wrap_future(joined.map.ask.export(format, None))
+    name = f"{request.path_params['name']}.{format}"
+    return PlainTextResponse(text, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+async def _variable(maps: Maps, request: Request) -> Response:
+    key = parse_symbol(request.path_params["key"])
+    async with maps.using(request.path_params["name"]) as joined:
+        graph = await maps.graph(joined)
+    return JSONResponse(await asyncio.to_thread(explain, graph, key))
+
+
+async def _live(maps: Maps, socket: WebSocket) -> None:
+    """Only for pages of ours: a browser says where its page is from."""
+    origin = socket.headers.get("origin")
+    await socket.accept()
+    if origin is not None and urlsplit(origin).netloc != socket.headers.get("host"):
+        await socket.close(_FOREIGN, "this page is not from here")
+        return
+    try:
+        async with maps.using(socket.path_params["name"]) as joined:
+            await follow(socket, joined.map.estimate)
+    except Problem as problem:
+        await socket.close(_PROBLEM, problem.message[:120])
+
+
+async def _problem(_: Request, problem: Exception) -> Response:
+    code, message = getattr(problem, "code", "internal"), getattr(problem, "message", str(problem))
+    detail: Any = getattr(problem, "detail", {})
+    return JSONResponse(
+        {"problem": {"code": code, "message": message, "detail": detail}}, status_code=_STATUS.get(code, 409)
+    )

@@ -1,0 +1,33 @@
+"""Messages of the bus as JSON documents: keys as they print, values row by row."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from factorbus.client import Snapshot
+from factorbus.proto.messages import Variables
+from factorbus.proto.symbols import format_symbol
+
+
+def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:
+    """[{kind, keys, values}] of the groups that have values."""
+    return [
+        {"kind": g.kind, "keys": [format_symbol(key) for key in g.keys.tolist()], "values": g.values.tolist()}
+        for g in variables
+        if g.values is not None
+    ]
+
+
+def estimate(snapshot: Snapshot) -> dict[str, Any]:
+    """A whole estimate."""
+    variables = (Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items())
+    return {"epoch": str(snapshot.epoch), "revision": snapshot.revision, "variables": groups(variables)}
+
+
+def plain(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a step's account is words and numbers that JSON has."""
+    return {k: v for k, v in report.items() if isinstance(v, (str, bool, int)) or _is_finite(v)}
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, float) and math.isfinite(value)

@@ -1,0 +1,81 @@
+"""Steps of a map to a browser: the whole estimate first, then what changed, as fast as the browser takes it.
+
+Steps that come while a message is under way are sent together, each variable once: who is slow gets fewer messages and
+misses none of the values.
+"""
+
+import asyncio
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from factorbus.client import Mirror
+from factorbus.client.stream import DeltaStream
+from factorbus.gateway.documents import estimate, groups, plain
+from factorbus.proto.messages import Delta, Variables
+
+_LEAST_PAUSE_S = 0.05
+
+
+async def follow(socket: WebSocket, mirror: Mirror) -> None:
+    """Send until the browser leaves.  `socket` is accepted already."""
+    loop, news = asyncio.get_running_loop(), asyncio.Event()
+
+    def wake() -> None:
+        loop.call_soon_threadsafe(news.set)
+
+    stream = DeltaStream(mirror, wake)
+    leaving = asyncio.ensure_future(_leaves(socket))
+    try:
+        snapshot = mirror.snapshot()
+        await socket.send_json({"type": "estimate", **estimate(snapshot)})
+        at = (snapshot.epoch, snapshot.revision)
+        while not leaving.done():
+            waiting = asyncio.ensure_future(news.wait())
+            await asyncio.wait((waiting, leaving), return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+            news.clear()
+            deltas = [d for d in iter(stream.try_take, None) if d.epoch != at[0] or d.revision > at[1]]
+            if deltas:
+                at = (deltas[-1].epoch, deltas[-1].revision)
+                await socket.send_json(_together(deltas))
+                await asyncio.sleep(_LEAST_PAUSE_S)
+    except WebSocketDisconnect:
+        pass
+    finally:
+        leaving.cancel()
+        stream.close()
+
+
+async def _leaves(socket: WebSocket) -> None:
+    """Returns when the browser has closed the connection; whatever it says is not listened to."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+def _together(deltas: list[Delta]) -> dict[str, Any]:
+    """Deltas that follow each other as one message: from the last that brings everything on, if there is one."""
+    whole = max((i for i, delta in enumerate(deltas) if not delta.previous), default=None)
+    used = deltas if whole is None else deltas[whole:]
+    last = used[-1]
+    return {
+        "type": "delta" if whole is None else "estimate",
+        "epoch": str(last.epoch),
+        "revision": last.revision,
+        "previous": used[0].previous,
+        "steps": len(used),
+        "variables": groups(_latest(used)),
+        "report": plain(last.report),
+    }
+
+
+def _latest(deltas: Iterable[Delta]) -> list[Variables]:
+    """The last value of each variable, by kind."""
+    found: dict[str, dict[int, Any]] = {}
+    for delta in deltas:
+        for group in delta.variables:
+            if group.values is not None:
+                found.setdefault(group.kind, {}).update(zip(group.keys.tolist(), group.values, strict=True))
+    return [Variables(kind, np.array(list(rows)), np.array(list(rows.values()))) for kind, rows in found.items()]

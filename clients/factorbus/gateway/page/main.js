@@ -1,0 +1,141 @@
+// The page: which map, what is said about it, and what a click asks for.
+
+import { LiveMap } from "./map.js";
+import { View } from "./view.js";
+
+const of = (id) => document.getElementById(id);
+const view = new View(of("map"), "z");
+let map = null;
+let closures = { revision: 0, keys: [], misfit: [] };
+let drawing = false, fetching = false;
+
+// For the console, and for tests that drive the page.
+window.factorbus = {
+  get revision() { return map ? map.revision : 0; },
+  placeOf: (key) => map && map.placeOf(key),
+  pixelOf: (key) => { const place = map && map.placeOf(key); return place && view.pixelOf(place); },
+  get closures() { return closures; },
+};
+
+async function ask(path) {
+  const answer = await fetch(path);
+  const content = await answer.json();
+  if (!answer.ok) throw new Error(content.problem.message);
+  return content;
+}
+
+function changed() {
+  const { chi2, step_ms: ms, strategy } = map.report;
+  const words = [`revision ${map.revision}`, `${map.variables.size} variables`];
+  if (chi2 !== undefined) words.push(`χ² ${chi2.toPrecision(6)}`);
+  if (ms !== undefined) words.push(`step ${ms.toFixed(2)} ms ${strategy ?? ""}`);
+  of("state").textContent = map.state === "live" ? words.join(" · ") : map.state;
+  refreshClosures();
+  if (drawing) return;
+  drawing = true;
+  requestAnimationFrame(() => { drawing = false; view.draw(map, closures); });
+}
+
+// All factors have to be asked for: not more often than every two seconds.
+async function refreshClosures() {
+  if (fetching || closures.revision === map.revision) return;
+  fetching = true;
+  const name = map.name;
+  try {
+    const found = await ask(`/api/maps/${name}/closures`);
+    if (map.name === name) closures = found;
+  } catch (error) {
+    map.state = error.message;
+  }
+  setTimeout(() => { fetching = false; if (closures.revision !== map.revision) refreshClosures(); }, 2000);
+  view.draw(map, closures);
+}
+
+function show(name) {
+  if (map) map.close();
+  closures = { revision: 0, keys: [], misfit: [] };
+  view.follow = true;
+  view.chosen = null;
+  location.hash = name;
+  map = new LiveMap(name, changed);
+}
+
+function element(tag, text, ...children) {
+  const made = document.createElement(tag);
+  if (text !== null) made.textContent = text;
+  made.append(...children);
+  return made;
+}
+
+async function explain(key) {
+  view.chosen = key;
+  view.draw(map, closures);
+  const panel = of("panel");
+  try {
+    const found = await ask(`/api/maps/${map.name}/variables/${key}`);
+    const head = element("tr", null, ...["factor", "of", "χ²", "misfit"].map((name) => element("th", name)));
+    const rows = found.factors.map((f) => element("tr", null,
+      element("td", f.kind), element("td", f.keys.join(" ")),
+      element("td", f.chi2 === null ? "?" : f.chi2.toPrecision(3)), element("td", f.misfit === null ? "?" : f.misfit.toFixed(2))));
+    panel.replaceChildren(
+      element("h2", found.key),
+      element("p", found.text),
+      element("p", `${found.kind} (${found.value.map((v) => v.toFixed(3)).join(", ")}) at revision ${found.revision}`),
+      element("table", null, head, ...rows),
+    );
+  } catch (error) {
+    panel.replaceChildren(element("h2", key), element("p", error.message));
+  }
+}
+
+function hands(canvas) {
+  let from = null, moved = 0;
+  canvas.onpointerdown = (e) => { from = [e.clientX, e.clientY]; moved = 0; canvas.setPointerCapture(e.pointerId); };
+  canvas.onpointermove = (e) => {
+    if (!from || !map) return;
+    const [dx, dy] = [e.clientX - from[0], e.clientY - from[1]];
+    moved += Math.hypot(dx, dy);
+    if (moved < 4) return;
+    view.follow = false;
+    view.middle = [view.middle[0] - dx / view.scale, view.middle[1] + dy / view.scale];
+    from = [e.clientX, e.clientY];
+    view.draw(map, closures);
+  };
+  canvas.onpointerup = (e) => {
+    from = null;
+    const key = moved < 4 && map && view.nearest(map, e.offsetX, e.offsetY);
+    if (key) explain(key);
+  };
+  canvas.onwheel = (e) => {
+    e.preventDefault();
+    if (!map) return;
+    view.follow = false;
+    const by = Math.exp(-e.deltaY * 0.0015);
+    const [x, y] = [e.offsetX - canvas.clientWidth / 2, canvas.clientHeight / 2 - e.offsetY];
+    view.middle = [view.middle[0] + (x / view.scale) * (1 - 1 / by), view.middle[1] + (y / view.scale) * (1 - 1 / by)];
+    view.scale *= by;
+    view.draw(map, closures);
+  };
+}
+
+async function list() {
+  const wanted = decodeURIComponent(location.hash.slice(1));
+  try {
+    const { maps } = await ask("/api/maps");
+    of("maps").replaceChildren(...maps.map((row) => element("option", row.name)));
+    if (!maps.length) { of("state").textContent = "there is no map yet"; setTimeout(list, 1000); return; }
+    const name = maps.some((row) => row.name === wanted) ? wanted : maps[0].name;
+    of("maps").value = name;
+    show(name);
+  } catch (error) {
+    of("state").textContent = error.message;
+    setTimeout(list, 1000);
+  }
+}
+
+of("maps").onchange = (e) => show(e.target.value);
+of("plane").onchange = (e) => { view.plane = e.target.value; view.follow = true; if (map) view.draw(map, closures); };
+of("fit").onclick = () => { view.follow = true; if (map) view.draw(map, closures); };
+window.onresize = () => map && view.draw(map, closures);
+hands(of("map"));
+list();

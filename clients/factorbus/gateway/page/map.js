@@ -1,0 +1,70 @@
+// A map as the page has it: the value of each variable, kept up to date by a WebSocket that comes back by itself.
+
+const POSITION = { se2: 2, se3: 3, point2: 2, point3: 3 };
+
+export class LiveMap {
+  constructor(name, changed) {
+    this.name = name;
+    this.changed = changed;
+    this.variables = new Map(); // "x12" → { kind, value }
+    this.touched = new Set();
+    this.revision = 0;
+    this.report = {};
+    this.state = "connecting";
+    this.closed = false;
+    this.open();
+  }
+
+  open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.socket = new WebSocket(`${scheme}://${location.host}/api/maps/${this.name}/live`);
+    this.socket.onmessage = (event) => this.take(JSON.parse(event.data));
+    this.socket.onclose = (event) => {
+      if (this.closed) return;
+      this.state = event.reason || "the gateway does not answer; trying again";
+      this.changed();
+      setTimeout(() => this.closed || this.open(), 1000);
+    };
+  }
+
+  close() {
+    this.closed = true;
+    this.socket.close();
+  }
+
+  // An estimate brings everything; a delta what changed.
+  take(message) {
+    if (message.type === "estimate") this.variables.clear();
+    this.touched = new Set();
+    for (const { kind, keys, values } of message.variables) {
+      keys.forEach((key, i) => {
+        this.variables.set(key, { kind, value: values[i] });
+        if (message.type === "delta") this.touched.add(key);
+      });
+    }
+    this.revision = message.revision;
+    this.report = message.report ?? {};
+    this.state = "live";
+    this.changed();
+  }
+
+  // x, y, z of a variable; undefined for one that is not there or has no place.
+  placeOf(key) {
+    const found = this.variables.get(key);
+    const size = found && POSITION[found.kind];
+    return size && [found.value[0], found.value[1], size === 3 ? found.value[2] : 0];
+  }
+
+  // Poses by robot, in the order of their numbers: letter → [key, ...].
+  tracks() {
+    const tracks = new Map();
+    for (const [key, { kind }] of this.variables) {
+      if (!kind.startsWith("se")) continue;
+      const letter = key.replace(/\d+$/, "");
+      if (!tracks.has(letter)) tracks.set(letter, []);
+      tracks.get(letter).push(key);
+    }
+    for (const keys of tracks.values()) keys.sort((a, b) => Number(a.replace(/^\D*/, "")) - Number(b.replace(/^\D*/, "")));
+    return tracks;
+  }
+}

@@ -1,0 +1,171 @@
+"""The live view, in Rerun: the map as it moves, loop closures by how badly they fit, and plots of every step.
+
+Everything is drawn in space; a map in the plane lies at z = 0 and is looked at from above.  Timelines: `revision`, and
+`time`.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from factorbus.proto.arrays import F64
+from factorbus.proto.messages import Delta
+from factorbus.viz import style
+from factorbus.viz.closures import closures_of, colours_of
+from factorbus.viz.ellipses import Spread, outlines
+from factorbus.viz.geometry import Track, points_of, rays_of, segments_of, track_of, view_of
+from factorbus.viz.lookout import Look
+
+_LETTER_BITS = 56
+_POSITIONS_PER_S = 100_000  # what the whole map may add to a recording
+_LINE = rr.Radius.ui_points(1.2)
+_PLOTS = {
+    "chi2": ("χ²", style.ESTIMATE),
+    "step_ms": ("time of a step (ms)", style.LOOPS),
+    "eliminated": ("variables eliminated", style.POINTS),
+    "changed": ("variables changed", style.ODOMETRY),
+}
+
+
+class LiveView:
+    """A Rerun recording of a map, which goes to a file, to a viewer that is started here, or to browsers."""
+
+    def __init__(self, map_name: str) -> None:
+        self._map = map_name
+        self._to = rr.RecordingStream("factorbus", recording_id=f"{map_name}-{os.urandom(4).hex()}")
+        self._drawn_at, self._framed_m = -1e9, 0.0
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything from now on into an .rrd file."""
+        self._to.save(os.fspath(path), default_blueprint=_blueprint(self._map))
+        self._name_plots()
+
+    def spawn(self) -> None:
+        """Start the viewer on this machine's display, or use the one that runs.  Raises RuntimeError."""
+        self._to.spawn(default_blueprint=_blueprint(self._map))
+        self._name_plots()
+
+    def serve(self, web_port: int, data_port: int) -> str:
+        """Serve to browsers; gives the address of the page.  Raises RuntimeError, such as for a port that is taken."""
+        data = self._to.serve_grpc(grpc_port=data_port, default_blueprint=_blueprint(self._map))
+        rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=data)
+        self._name_plots()
+        return f"http://127.0.0.1:{web_port}/?url={data.replace(':', '%3A').replace('/', '%2F').replace('+', '%2B')}"
+
+    def show(self, look: Look, spread: Spread | None = None) -> None:
+        """Log every step, and the map as it is now, unless it is large and was drawn just before."""
+        now = time.time()
+        for delta in look.deltas:
+            self._log_step(delta, now)
+        track = track_of(look.variables)
+        size = sum(len(group.keys) for group in look.variables)
+        if now - self._drawn_at >= size / _POSITIONS_PER_S:
+            self._drawn_at = now
+            self._at(look.revision, now)
+            self._log_map(look, track, spread)
+            self._frame(track)
+
+    def close(self) -> None:
+        """Hand over what is still here."""
+        self._to.flush(timeout_sec=10.0)
+        self._to.disconnect()
+
+    def _frame(self, track: Track) -> None:
+        """Step back when the map has outgrown the picture, each time by so much that it is seldom."""
+        if len(track.keys) > 1:
+            size_m = float(np.ptp(track.places, axis=0).max())
+            if size_m > 1.4 * self._framed_m:
+                self._framed_m = size_m
+                self._to.send_blueprint(_blueprint(self._map, track.places))
+
+    def _at(self, revision: int, now: float) -> None:
+        self._to.set_time("revision", sequence=revision)
+        self._to.set_time("time", timestamp=now)
+
+    def _log_step(self, delta: Delta, now: float) -> None:
+        self._at(delta.revision, now)
+        for name in _PLOTS:
+            if name in delta.report:
+                self._to.log(f"plots/{name}", rr.Scalars(float(delta.report[name])))
+        if delta.report:
+            text = f"{delta.report.get('strategy', '')}: {delta.report.get('because', '')}"
+            self._to.log("log", rr.TextLog(text, level="INFO"))
+
+    def _log_map(self, look: Look, track: Track, spread: Spread | None) -> None:
+        letters = track.keys >> _LETTER_BITS
+        for letter in np.unique(letters).tolist():
+            places = _in_space(track.places[letters == letter])
+            name = chr(letter) if letter else "poses"
+            self._to.log(f"map/trajectory/{name}", rr.LineStrips3D([places], colors=_rgb(style.ESTIMATE), radii=_LINE))
+            robot = rr.Points3D(places[-1:], colors=_rgb(style.INK), radii=rr.Radius.ui_points(5), labels=[name])
+            self._to.log(f"map/robot/{name}", robot)
+        points = points_of(look.variables)
+        landmarks = rr.Points3D(_in_space(points.places), colors=_rgb(style.POINTS), radii=rr.Radius.ui_points(3))
+        self._to.log("map/landmarks", landmarks)
+        touched = np.isin(track.keys, look.touched())
+        last = rr.Points3D(
+            _in_space(track.places[touched]), colors=_rgb(style.ODOMETRY), radii=rr.Radius.ui_points(2.5)
+        )
+        self._to.log("map/last_step", last)
+        self._log_lines("map/rays", rays_of(look.variables).places, _rgb(style.SPREAD))
+        closures = closures_of(look.variables, look.factors)
+        colours = (255 * colours_of(closures.misfit)).astype(np.uint8)
+        known = np.isin(closures.keys, track.keys).all(axis=1)
+        self._log_lines("map/loop_closures", segments_of(track, closures.keys), colours[known])
+        if spread is not None:
+            everything = track.places if len(track.keys) else points.places
+            rings = outlines(spread, view_of(everything)) if len(spread.keys) else np.empty((0, 2, 3))
+            self._log_lines("map/where_it_may_be", rings, _rgb(style.SPREAD))
+
+    def _log_lines(self, path: str, lines: F64, colours: object) -> None:
+        """Line strips (n, corners, 2 or 3)."""
+        strips = [_in_space(line) for line in lines]
+        self._to.log(path, rr.LineStrips3D(strips, colors=colours, radii=_LINE))  # type: ignore[arg-type]
+
+    def _name_plots(self) -> None:
+        for name, (title, colour) in _PLOTS.items():
+            self._to.log(f"plots/{name}", rr.SeriesLines(colors=_rgb(colour), names=title, widths=1.5), static=True)
+
+
+def _blueprint(name: str, places: F64 | None = None) -> rrb.Blueprint:
+    """The map beside its plots; once there are places, the eye stands where it sees them."""
+    plots = [rrb.TimeSeriesView(origin=f"/plots/{each}", name=title) for each, (title, _) in _PLOTS.items()]
+    space = rrb.Spatial3DView(
+        origin="/map",
+        name=f"map {name}",
+        background=rrb.Background(color=[255, 255, 255], kind=rrb.BackgroundKind.SolidColor),
+        eye_controls=_eye(places) if places is not None else None,
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            space,
+            rrb.Vertical(
+                rrb.Grid(*plots, grid_columns=2), rrb.TextLogView(origin="/log", name="steps"), row_shares=[3, 1]
+            ),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="revision"),
+        collapse_panels=True,
+    )
+
+
+def _eye(places: F64) -> rrb.EyeControls3D:
+    """Above the middle, north up; a little from the side where the map fills space."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle = _in_space(((low + high) / 2)[None])[0]
+    far = 1.3 * float((high - low).max()) + 1.0
+    flat = not view_of(places).in_space
+    away = np.array([0.0, -0.01, 1.0]) if flat else np.array([0.5, -0.9, 0.6])
+    return rrb.EyeControls3D(position=middle + far * away, look_target=middle, eye_up=[0, 1, 0] if flat else [0, 0, 1])
+
+
+def _in_space(places: F64) -> F64:
+    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+
+
+def _rgb(colour: str) -> Sequence[int]:
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]

@@ -1,0 +1,180 @@
+"""A map as an MCAP recording that Foxglove opens: what to draw, what to plot, and every estimate and factor as numbers.
+
+| topic | schema | |
+|---|---|---|
+| /tf | foxglove.FrameTransform | map → robot: the pose with the largest key, one for each letter |
+| /map/scene | foxglove.SceneUpdate | trajectory, landmarks, loop closures coloured by how badly they fit |
+| /map/poses | foxglove.PosesInFrame | all poses |
+| /map/step | factorbus.Step, JSON | the account of each step, for plots: chi2, step_ms, eliminated, … |
+| /map/delta | factorbus.Delta, JSON | each delta, whole: variables by kind, keys and values |
+| /map/factors | factorbus.Factors, JSON | factors when they were first seen, by kind: keys, measured, information |
+"""
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import foxglove
+import numpy as np
+from foxglove import messages as fox
+from foxglove.channels import FrameTransformChannel, PosesInFrameChannel, SceneUpdateChannel
+
+from factorbus.proto.arrays import F64
+from factorbus.proto.messages import Delta, Factors, Variables
+from factorbus.proto.symbols import format_symbol, symbol_parts
+from factorbus.viz.lookout import Look
+from factorbus.viz.mcap_scene import scene_of
+
+_NUMBERS = {"type": "array", "items": {"type": "number"}}
+_ROWS = {"type": "array", "items": _NUMBERS}
+_KEYS = {"type": "array", "items": {"type": "string"}}
+_STEP = {
+    "title": "factorbus.Step",
+    "type": "object",
+    "properties": {name: {"type": "number"} for name in ("epoch", "revision", "chi2", "step_ms", "changed")}
+    | {name: {"type": "string"} for name in ("strategy", "because")},
+}
+_GROUP = {"type": "object", "properties": {"kind": {"type": "string"}, "keys": _KEYS, "values": _ROWS}}
+_DELTA = {
+    "title": "factorbus.Delta",
+    "type": "object",
+    "properties": {name: {"type": "integer"} for name in ("epoch", "revision", "previous")}
+    | {"variables": {"type": "array", "items": _GROUP}},
+}
+_FACTORS = {
+    "title": "factorbus.Factors",
+    "type": "object",
+    "properties": {
+        "epoch": {"type": "integer"},
+        "revision": {"type": "integer"},
+        "kind": {"type": "string"},
+        "keys": {"type": "array", "items": _KEYS},
+        "measured": _ROWS,
+        "information": _ROWS,
+    },
+}
+
+
+class Recording:
+    """An MCAP file that is written, look by look.  Use it in `with`.  Raises FileExistsError."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._context = context = foxglove.Context()  # channels do not keep it alive
+        self._writer = foxglove.open_mcap(os.fspath(path), context=context)
+        self._tf = FrameTransformChannel("/tf", context=context)
+        self._scene = SceneUpdateChannel("/map/scene", context=context)
+        self._poses = PosesInFrameChannel("/map/poses", context=context)
+        self._step = foxglove.Channel("/map/step", schema=_STEP, context=context)
+        self._delta = foxglove.Channel("/map/delta", schema=_DELTA, context=context)
+        self._factors = foxglove.Channel("/map/factors", schema=_FACTORS, context=context)
+        self._seen: dict[str, int] = {}
+        self._epoch = 0
+        self.deltas = self.factors = self.revision = 0
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+    def begin(self, look: Look) -> None:
+        """Write what is there before the first delta, as one that brings everything."""
+        if not look.deltas:
+            whole = Delta(look.epoch, look.revision, 0, look.variables)
+            look = replace(look, deltas=(whole,))
+        self.take(look)
+
+    def take(self, look: Look, now_ns: int | None = None) -> None:
+        """Write what is new in `look`."""
+        now_ns = time.time_ns() if now_ns is None else now_ns
+        if look.epoch != self._epoch:
+            self._seen, self._epoch = {}, look.epoch
+        self.revision = look.revision
+        for delta in look.deltas:
+            self._take_delta(delta, now_ns)
+        for group in look.factors:
+            self._take_factors(look, group, now_ns)
+        stamp = fox.Timestamp(now_ns // 10**9, now_ns % 10**9)
+        for key, value in _last_poses(look.variables):
+            name = symbol_parts(key)[0] or "robot"
+            self._tf.log(_transform(name, value, stamp), log_time=now_ns)
+        self._poses.log(_poses_in_frame(look.variables, stamp), log_time=now_ns)
+        self._scene.log(scene_of(look, stamp), log_time=now_ns)
+
+    def _take_delta(self, delta: Delta, now_ns: int) -> None:
+        at = {"epoch": delta.epoch, "revision": delta.revision}
+        numbers = {k: v for k, v in delta.report.items() if isinstance(v, (int, float, str)) and _finite(v)}
+        self._step.log(at | numbers, log_time=now_ns)
+        groups = [
+            {"kind": g.kind, "keys": [format_symbol(k) for k in g.keys.tolist()], "values": g.values.tolist()}
+            for g in delta.variables
+            if g.values is not None
+        ]
+        self._delta.log(at | {"previous": delta.previous, "variables": groups}, log_time=now_ns)
+        self.deltas += 1
+
+    def _take_factors(self, look: Look, group: Factors, now_ns: int) -> None:
+        """The factors of a kind come in the order of their ids: what is behind those seen before is new."""
+        first = self._seen.get(group.kind, 0)
+        if first >= len(group.keys):
+            return
+        self._seen[group.kind] = len(group.keys)
+        self.factors += len(group.keys) - first
+        content = {
+            "epoch": look.epoch,
+            "revision": look.factors_revision,
+            "kind": group.kind,
+            "keys": [[format_symbol(k) for k in row] for row in group.keys[first:].tolist()],
+            "measured": group.measured[first:].tolist(),
+            "information": group.information[first:].tolist(),
+        }
+        self._factors.log(content, log_time=now_ns)
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, str) or math.isfinite(value)
+
+
+def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64]]:
+    """(key, x y z qx qy qz qw) of the pose with the largest index, for each letter."""
+    last: dict[str, tuple[int, F64]] = {}
+    for group in variables:
+        if group.kind in ("se2", "se3") and group.values is not None:
+            for key, value in zip(group.keys.tolist(), group.values, strict=True):
+                letter = symbol_parts(key)[0]
+                if letter not in last or key > last[letter][0]:
+                    last[letter] = (key, value)
+    return [(key, lifted(value)) for key, value in last.values()]
+
+
+def lifted(value: F64) -> F64:
+    """A pose (3,) or (7,) as x y z qx qy qz qw."""
+    if len(value) == 7:
+        return value
+    x, y, theta = value
+    return np.array([x, y, 0.0, 0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)])
+
+
+def _transform(name: str, pose: F64, stamp: fox.Timestamp) -> fox.FrameTransform:
+    x, y, z, qx, qy, qz, qw = pose.tolist()
+    return fox.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id="map",
+        child_frame_id=name,
+        translation=fox.Vector3(x=x, y=y, z=z),
+        rotation=fox.Quaternion(x=qx, y=qy, z=qz, w=qw),
+    )
+
+
+def _poses_in_frame(variables: Sequence[Variables], stamp: fox.Timestamp) -> fox.PosesInFrame:
+    poses = []
+    for group in variables:
+        if group.kind in ("se2", "se3") and group.values is not None:
+            for value in group.values:
+                x, y, z, qx, qy, qz, qw = lifted(value).tolist()
+                here, turned = fox.Vector3(x=x, y=y, z=z), fox.Quaternion(x=qx, y=qy, z=qz, w=qw)
+                poses.append(fox.Pose(position=here, orientation=turned))
+    return fox.PosesInFrame(timestamp=stamp, frame_id="map", poses=poses)

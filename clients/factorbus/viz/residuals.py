@@ -1,0 +1,110 @@
+"""How badly each factor fits an estimate: rᵀ Ω r, by the formulas of `proto/README.md`, §3, in NumPy.
+
+For colouring what is drawn; the solver has its own, compiled, and a test holds the two together.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.messages import Factors, Variables
+
+_WIDEST = 7  # numbers of a pose in space
+
+
+def factor_chi2(group: Factors, values: "Values") -> F64:
+    """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
+    residual = _RESIDUALS.get(group.kind)
+    if residual is None or not len(group.keys):
+        return np.full(len(group.keys), np.nan)
+    r = residual(*(values.rows(column) for column in group.keys.T), group.measured)
+    omega = _full(group.information, r.shape[1])
+    return np.einsum("mi,mij,mj->m", r, omega, r)
+
+
+class Values:
+    """Values of variables of any kind, found by key."""
+
+    def __init__(self, variables: Sequence[Variables]) -> None:
+        groups = [group for group in variables if group.values is not None]
+        self._keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in groups)])
+        self._place = np.argsort(self._keys)
+        self._keys = self._keys[self._place]
+        width = max([_WIDEST, *(group.values.shape[1] for group in groups if group.values is not None)])
+        wide = [np.pad(g.values, ((0, 0), (0, width - g.values.shape[1]))) for g in groups if g.values is not None]
+        self._values = np.concatenate([np.empty((0, width)), *wide])[self._place]
+
+    def rows(self, keys: I64) -> F64:
+        """Values (m, width), of smaller kinds with zeros behind them; NaN for keys that have none."""
+        found = np.full((len(keys), self._values.shape[1]), np.nan)
+        if len(self._keys):
+            at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+            here = self._keys[at] == keys
+            found[here] = self._values[at[here]]
+        return found
+
+
+def _full(triangle: F64, dim: int) -> F64:
+    """Symmetrical matrices (m, dim, dim) of upper triangles, row by row."""
+    full = np.zeros((len(triangle), dim, dim))
+    upper = np.triu_indices(dim)
+    full[:, upper[0], upper[1]] = triangle
+    full[:, upper[1], upper[0]] = triangle
+    return full
+
+
+def _wrap(angle: F64) -> F64:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _into_plane(pose: F64, point: F64) -> F64:
+    """Rᵀ (p − t) in the plane."""
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y = (point[:, :2] - pose[:, :2]).T
+    return np.stack([c * x + s * y, c * y - s * x], axis=1)
+
+
+def _less_se2(a: F64, b: F64) -> F64:
+    """a⁻¹ ∘ b in the plane."""
+    return np.column_stack([_into_plane(a, b), _wrap(b[:, 2] - a[:, 2])])
+
+
+def _turned_back(quat: F64, v: F64) -> F64:
+    """R(q)ᵀ v."""
+    u, w = -quat[:, :3], quat[:, 3:4]
+    t = 2 * np.cross(u, v)
+    return v + w * t + np.cross(u, t)
+
+
+def _into_space(pose: F64, point: F64) -> F64:
+    """Rᵀ (p − t) in space."""
+    return _turned_back(pose[:, 3:7], point[:, :3] - pose[:, :3])
+
+
+def _less_se3(a: F64, b: F64) -> F64:
+    """a⁻¹ ∘ b in space, as x y z qx qy qz qw with qw ≥ 0."""
+    u, w = -a[:, 3:6], a[:, 6:7]
+    v, s = b[:, 3:6], b[:, 6:7]
+    vector = w * v + s * u + np.cross(u, v)
+    scalar = w * s - np.sum(u * v, axis=1, keepdims=True)
+    sign = np.where(scalar < 0, -1.0, 1.0)
+    return np.column_stack([_into_space(a, b), sign * vector, sign * scalar])
+
+
+def _bearing_range(pose: F64, point: F64, z: F64) -> F64:
+    u = _into_plane(pose, point)
+    return np.column_stack([_wrap(np.arctan2(u[:, 1], u[:, 0]) - z[:, 0]), np.hypot(*u.T) - z[:, 1]])
+
+
+_RESIDUALS: Mapping[str, Callable[..., F64]] = {
+    "prior_se2": lambda x, z: _less_se2(z, x),
+    "prior_se3": lambda x, z: _less_se3(z, x)[:, :6],
+    "prior_point2": lambda p, z: p[:, :2] - z,
+    "prior_point3": lambda p, z: p[:, :3] - z,
+    "between_se2": lambda a, b, z: _less_se2(z, _less_se2(a, b)),
+    "between_se3": lambda a, b, z: _less_se3(z, _less_se3(a, b))[:, :6],
+    "landmark_se2": lambda a, p, z: _into_plane(a, p) - z,
+    "landmark_se3": lambda a, p, z: _into_space(a, p) - z,
+    "bearing_range_se2": _bearing_range,
+}

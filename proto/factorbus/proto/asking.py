@@ -1,0 +1,160 @@
+"""Questions about uncertainty, and their answers: covariances, gates, associations, gains.  As values.
+
+`asking_codec` turns them into bytes and back, `proto/README.md` §16 explains them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.messages import Factors
+from factorbus.proto.symbols import parse_symbol
+
+BLOCKS = ("diagonal", "joint", "cross", "relative", "last")
+
+
+@dataclass(frozen=True, slots=True)
+class AskCovariance:
+    """Which blocks of the covariance.
+
+    blocks    diagonal: of each of `keys` (n,) by itself, None: of all variables   joint: of `keys` together
+              cross: between `keys` (rows) and `others` (columns)   relative: of the pairs `keys` (n, 2), the second as
+              seen from the first   last: of the pose that was inserted last
+    """
+
+    blocks: str = "diagonal"
+    keys: I64 | None = None
+    others: I64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceGroup:
+    """Variables of one kind (or pairs whose second is): keys (n,) or (n, 2), covariance (n, d, d) in the tangent space.
+
+    values: of pairs, (n, size): the second in the frame of the first.
+    """
+
+    kind: str
+    keys: I64
+    covariance: F64
+    values: F64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Covariances:
+    """The answer: `groups` for diagonal, last and relative; `keys`, `dims`, `covariance` for joint, whose rows are the
+    tangent spaces of `keys` one after the other; for cross the same and `others`, `other_dims` for the columns.
+    """
+
+    epoch: int
+    revision: int
+    blocks: str
+    groups: tuple[CovarianceGroup, ...] = ()
+    keys: I64 | None = None
+    dims: I64 | None = None
+    others: I64 | None = None
+    other_dims: I64 | None = None
+    covariance: F64 | None = None
+
+    def __getitem__(self, key: int | str) -> F64:
+        """The covariance (d, d) of one variable, such as "x12", of a diagonal.  Raises KeyError."""
+        key = parse_symbol(key) if isinstance(key, str) else key
+        for group in self.groups:
+            if group.keys.ndim == 1 and (rows := (group.keys == key).nonzero()[0]).size:
+                return group.covariance[rows[0]]
+        raise KeyError(key)
+
+
+@dataclass(frozen=True, slots=True)
+class AskGate:
+    """Candidate factors, and the probability with which a right one should pass."""
+
+    factors: tuple[Factors, ...]
+    probability: float = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Gated:
+    """For each candidate, in the order of the question: distance (n,): d², squared Mahalanobis distance; dims (n,): of
+    its residual; threshold (n,): the χ² quantile; plausible (n,) bool: d² ≤ threshold.
+    """
+
+    epoch: int
+    revision: int
+    distance: F64
+    dims: I64
+    threshold: F64
+    plausible: Any
+
+
+@dataclass(frozen=True, slots=True)
+class AskGain:
+    """Candidate factors."""
+
+    factors: tuple[Factors, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Gained:
+    """gain (n,): ½ ln det(I + Ω H Σ Hᵀ), in nats: by how much each candidate alone would lower the map's entropy."""
+
+    epoch: int
+    revision: int
+    gain: F64
+
+
+@dataclass(frozen=True, slots=True)
+class AskAssociate:
+    """Sightings from the pose `pose`, as of factors of `kind`: measured (n, size), information (n, r(r+1)/2).
+
+    landmarks (k,): keys to choose from; None: all points of the map that the kind connects.
+    """
+
+    pose: int
+    kind: str
+    measured: F64
+    information: F64
+    landmarks: I64 | None = None
+    probability: float = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Associated:
+    """Which landmark each sighting is of, in the largest set that is compatible jointly.
+
+    landmarks (n,): keys; matched (n,) bool: false: of none of them, and the key is 0.  distance: d² of the whole set,
+    dims: of how many numbers, threshold: what it was allowed.  complete: false: the search was cut short.
+    sightings, candidates, distances (p,): all pairs compatible by themselves: index, key and d², nearest first.
+    """
+
+    epoch: int
+    revision: int
+    landmarks: I64
+    matched: Any
+    distance: float
+    dims: int
+    threshold: float
+    complete: bool
+    sightings: I64
+    candidates: I64
+    distances: F64
+
+
+@dataclass(frozen=True, slots=True)
+class AskWhy:
+    """About the variable `key`, or the factor with the id `factor`; one of them."""
+
+    key: int | None = None
+    factor: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Why:
+    """variable or factor: an account of it, the other is empty; step: the report of the map's last step.  Open maps."""
+
+    epoch: int
+    revision: int
+    variable: Mapping[str, Any]
+    factor: Mapping[str, Any]
+    step: Mapping[str, Any]

@@ -1,0 +1,80 @@
+"""What can be wrong with a journal; the codes are stable and travel on the bus."""
+
+from pathlib import Path
+
+from factorbus.proto.problems import Problem
+
+
+class JournalFailed(Problem):
+    """The journal cannot be written: what came with it did not happen, and the number is not used up."""
+
+    code = "journal_failed"
+
+    def __init__(self, where: Path, reason: str, retry_after_s: float = 1.0) -> None:
+        super().__init__(
+            f"the journal {where} cannot be written ({reason}), so nothing is taken in; questions are answered. Make "
+            f"room or make it writable; send again in {retry_after_s:g} s",
+            reason=reason,
+            retry_after_s=retry_after_s,
+        )
+
+
+class JournalInUse(Problem):
+    """Another process owns the folder."""
+
+    code = "journal_in_use"
+
+    def __init__(self, where: Path, owner: str) -> None:
+        super().__init__(
+            f"{where} belongs to a service that runs ({owner or 'it has not said who it is'}): stop that one, give "
+            "this one a folder of its own, or start it with --standby to take over when the other ends",
+            owner=owner,
+        )
+
+
+class JournalDamaged(Problem):
+    """The journal is there and cannot be trusted."""
+
+    code = "journal_damaged"
+
+    def __init__(self, where: Path, what: str) -> None:
+        super().__init__(
+            f"the journal {where} is damaged: {what}; nothing was changed. `factorbus journal check` says more; "
+            "restore the folder from a copy or `factorbus import` an exported file",
+            what=what,
+        )
+
+
+class JournalVersion(Problem):
+    """The journal was written by a version whose form this one does not read."""
+
+    code = "journal_version"
+
+    def __init__(self, where: Path, seen: int, wanted: int) -> None:
+        newer = (
+            "a newer version wrote it: use that one" if seen > wanted else "export it with the version that wrote it"
+        )
+        super().__init__(f"{where} has the form {seen}, this version reads {wanted}; {newer}", seen=seen, wanted=wanted)
+
+
+class JournalDiffers(Problem):
+    """Run again, the journal gives something else than it says."""
+
+    code = "journal_differs"
+
+    def __init__(self, where: Path, what: str) -> None:
+        super().__init__(
+            f"{where}, run again, gives something else: {what}; open it with the version of factorbus that wrote it, "
+            "and report this",
+            what=what,
+        )
+
+
+class NoJournal(Problem):
+    """There is no journal where one was looked for."""
+
+    code = "no_journal"
+
+    def __init__(self, where: Path, known: tuple[str, ...] = ()) -> None:
+        there = f"; there are {', '.join(known)}" if known else ""
+        super().__init__(f"there is no journal {where}{there}", known=known)

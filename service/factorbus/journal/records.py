@@ -1,0 +1,77 @@
+"""What is written down, as values."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+# What became of an insert, and whether it goes to the solver when the journal is run again.
+ACCEPTED = 0
+REFUSED = 1  # by the solver, which may have tried: a step that failed leaves traces in how the next one is made
+UNTRIED = 2  # refused before the solver saw it
+
+
+class Entry(NamedTuple):
+    """One insert, in its place.
+
+    revision, first_factor, together: of the answer, where it was accepted; problem: the bytes of the one it was
+    refused with.  digest: of `message`.
+    """
+
+    client: str
+    sequence: int
+    digest: int
+    outcome: int
+    revision: int
+    first_factor: int
+    together: int
+    problem: bytes
+    message: bytes
+
+
+class Fold(NamedTuple):
+    """Inserts that went to the solver together, in this order, and the revision that came of it.
+
+    number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
+    ever changed, up to here
+    """
+
+    number: int
+    revision: int
+    rebuilt: bool
+    chain: bytes
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """One life of the map: its number, the fold it begins with, and why it began."""
+
+    epoch: int
+    fold: int
+    because: str
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a journal says of itself.  options: of the solver, which make the same steps of the same inserts."""
+
+    map: str
+    mode: str
+    options: Mapping[str, Any]
+    epochs: tuple[Epoch, ...]
+    durability: str
+    clean: bool
+
+    @property
+    def epoch(self) -> int:
+        """The present one."""
+        return self.epochs[-1].epoch
+
+
+@dataclass(frozen=True, slots=True)
+class Sender:
+    """A client as a journal has left it: the number that is next, and its last entries, oldest first."""
+
+    client: str
+    next: int
+    entries: tuple[Entry, ...] = field(default=())

@@ -1,0 +1,321 @@
+"""A journal's database: the one file that touches SQLite.
+
+Written by one process, and read by others at the same time (WAL).  One transaction takes in all folds that wait for it
+(group commit); it is there after a crash wholly or not at all.
+"""
+
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from factorbus.journal import chain
+from factorbus.journal.digest import digest_of
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalVersion, NoJournal
+from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
+
+NAME = "journal.db"
+FORM = 1
+_APPLICATION = 0x46427573  # "FBus"
+_SYNCHRONOUS = {"none": "OFF", "group": "FULL", "commit": "FULL"}
+_SCHEMA = """
+CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
+CREATE TABLE fold (
+    number INTEGER PRIMARY KEY, revision INTEGER NOT NULL, rebuilt INTEGER NOT NULL, chain BLOB NOT NULL
+);
+CREATE TABLE entry (
+    number INTEGER PRIMARY KEY, fold INTEGER NOT NULL, client TEXT NOT NULL, sequence INTEGER NOT NULL,
+    digest INTEGER NOT NULL, outcome INTEGER NOT NULL, revision INTEGER NOT NULL, first_factor INTEGER NOT NULL,
+    together INTEGER NOT NULL, problem BLOB NOT NULL, message BLOB NOT NULL
+);
+CREATE INDEX entry_of_client ON entry (client);
+CREATE TABLE snapshot (fold INTEGER PRIMARY KEY, fingerprint TEXT NOT NULL, bytes INTEGER NOT NULL);
+"""
+_ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, problem"
+
+
+class Saved(NamedTuple):
+    """A snapshot that was written: after which fold, by which solver, how large."""
+
+    fold: int
+    fingerprint: str
+    bytes: int
+
+
+class Last(NamedTuple):
+    """Where a journal ends."""
+
+    fold: int
+    revision: int
+    chain: bytes
+
+
+class Store:
+    """One map's database, open.  One thread at a time."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, writable: bool) -> None:
+        self.path, self.writable = path, writable
+        self._db = connection
+
+    def header(self) -> Header:
+        """What the journal says of itself.  Raises JournalDamaged."""
+        with self._reading():
+            named = dict(self._db.execute("SELECT name, value FROM header"))
+            epochs = [Epoch(*row) for row in self._db.execute("SELECT epoch, fold, because FROM epoch ORDER BY number")]
+        try:
+            return Header(
+                named["map"], named["mode"], json.loads(named["options"]), tuple(epochs), named["durability"],
+                named["clean"] == "1",
+            )  # fmt: skip
+        except (KeyError, ValueError) as missing:
+            raise JournalDamaged(self.path, f"its header lacks {missing}") from None
+
+    def last(self) -> Last:
+        """Where it ends.  Raises JournalDamaged."""
+        with self._reading():
+            row = self._db.execute("SELECT number, revision, chain FROM fold ORDER BY number DESC LIMIT 1").fetchone()
+        return Last(*row) if row else Last(0, 0, chain.START)
+
+    def at(self, fold: int) -> Last:
+        """Where it was after `fold`.  Raises JournalDamaged."""
+        with self._reading():
+            row = self._db.execute("SELECT number, revision, chain FROM fold WHERE number = ?", (fold,)).fetchone()
+        if row is None:
+            raise JournalDamaged(self.path, f"fold {fold}, which a snapshot was made after, is missing")
+        return Last(*row)
+
+    def folds(self, after: int = 0) -> Iterator[Fold]:
+        """What was folded after fold `after`, in order.  Raises JournalDamaged."""
+        with self._reading():
+            entries = self._db.execute(
+                f"SELECT fold, {_ENTRY}, message FROM entry WHERE fold > ? ORDER BY number", (after,)
+            )
+            row = entries.fetchone()
+            for fold in self._db.execute("SELECT * FROM fold WHERE number > ? ORDER BY number", (after,)):
+                number, revision, rebuilt, digest = fold
+                if number != after + 1:
+                    raise JournalDamaged(self.path, f"fold {after + 1} is missing")
+                after, taken = number, []
+                while row is not None and row[0] == number:
+                    taken.append(self._checked(Entry(*row[1:])))
+                    row = entries.fetchone()
+                if row is not None and row[0] < number:
+                    raise JournalDamaged(self.path, f"an insert of fold {row[0]} is out of order")
+                yield Fold(number, revision, bool(rebuilt), digest, tuple(taken))
+            if row is not None:
+                raise JournalDamaged(self.path, f"an insert belongs to fold {row[0]}, which is missing")
+
+    def senders(self, first_fold: int, clients: int, entries: int) -> list[Sender]:
+        """The `clients` heard last, each with up to `entries` of its last inserts.
+
+        Of the present epoch, which began with `first_fold`.  The client heard longest ago comes first.
+        """
+        with self._reading():
+            names = self._db.execute(
+                "SELECT client, MAX(number) AS heard FROM entry WHERE fold >= ? GROUP BY client "
+                "ORDER BY heard DESC LIMIT ?", (first_fold, clients),
+            ).fetchall()  # fmt: skip
+            return [self._sender(name, first_fold, entries) for name, _ in reversed(names)]
+
+    def counts(self) -> dict[str, int]:
+        """Folds, inserts, clients and bytes of all messages."""
+        with self._reading():
+            (folds,) = self._db.execute("SELECT COUNT(*) FROM fold").fetchone()
+            row = self._db.execute(
+                "SELECT COUNT(*), COUNT(DISTINCT client), SUM(LENGTH(message)) FROM entry"
+            ).fetchone()
+        return {"folds": folds, "inserts": row[0], "clients": row[1], "message_bytes": row[2] or 0}
+
+    def snapshots(self) -> list[Saved]:
+        """The snapshots that were written, newest first."""
+        with self._reading():
+            return [Saved(*row) for row in self._db.execute("SELECT * FROM snapshot ORDER BY fold DESC")]
+
+    def append(self, folds: Sequence[Fold]) -> None:
+        """Write `folds` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
+        with self._writing():
+            self._db.executemany(
+                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, f.rebuilt, f.chain) for f in folds]
+            )
+            self._db.executemany(
+                f"INSERT INTO entry (fold, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [(fold.number, *entry) for fold in folds for entry in fold.entries],
+            )
+
+    def add_snapshot(self, saved: Saved, keep: int) -> list[int]:
+        """Note a snapshot, and forget all but the last `keep`: gives the folds of those.  Raises JournalFailed."""
+        with self._writing():
+            self._db.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", saved)
+            old = self._db.execute("SELECT fold FROM snapshot ORDER BY fold DESC LIMIT -1 OFFSET ?", (keep,)).fetchall()
+            self._db.executemany("DELETE FROM snapshot WHERE fold = ?", old)
+        return [fold for (fold,) in old]
+
+    def set(self, **values: Any) -> None:
+        """Change the header.  Raises JournalFailed."""
+        with self._writing():
+            self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
+
+    def begin_epoch(self, epoch: int, because: str) -> None:
+        """From the next fold on the map is in another epoch.  Raises JournalFailed."""
+        with self._writing():
+            (fold,) = self._db.execute("SELECT COALESCE(MAX(number), 0) + 1 FROM fold").fetchone()
+            self._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)", (epoch, fold, because))
+
+    def probe(self) -> None:
+        """Can something be written again, and some room be had?  Raises JournalFailed."""
+        with self._writing():
+            self._db.execute("INSERT OR REPLACE INTO header VALUES ('probe', ?)", ("." * (256 << 10),))
+        with self._writing():
+            self._db.execute("DELETE FROM header WHERE name = 'probe'")
+
+    def check(self) -> Iterator[str]:
+        """Everything that is wrong with it: by SQLite's own check, by inserts' bytes, by clients' numbers."""
+        try:
+            for (said,) in self._db.execute("PRAGMA integrity_check(20)"):
+                if said != "ok":
+                    yield said
+            yield from self._check_sequences()
+            revision = 0
+            for fold in self.folds():
+                if fold.revision < revision:
+                    yield f"fold {fold.number} goes back from revision {revision} to {fold.revision}"
+                revision = fold.revision
+        except JournalDamaged as damaged:
+            yield str(damaged.detail["what"])
+        except sqlite3.DatabaseError as error:
+            yield str(error)
+
+    def copy_to(self, path: Path) -> None:
+        """A copy in one file, consistent also while somebody writes.  Raises JournalFailed."""
+        try:
+            self._db.execute("VACUUM INTO ?", (str(path),))
+        except sqlite3.Error as error:
+            raise JournalFailed(path, str(error)) from None
+
+    def close(self) -> None:
+        """Close it; what is in the log is moved to the database first, where that is possible."""
+        try:
+            self._db.close()
+        except sqlite3.Error as error:
+            raise JournalFailed(self.path, str(error)) from None
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """One transaction."""
+        try:
+            self._db.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._db.execute("COMMIT")
+            except BaseException:
+                if self._db.in_transaction:
+                    self._db.execute("ROLLBACK")
+                raise
+        except sqlite3.Error as error:
+            raise JournalFailed(self.path, str(error)) from None
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.DatabaseError as error:
+            raise JournalDamaged(self.path, str(error)) from None
+
+    def _checked(self, entry: Entry) -> Entry:
+        if digest_of(entry.message) != entry.digest:
+            raise JournalDamaged(
+                self.path, f"insert {entry.sequence} of client {entry.client} has other bytes than came"
+            )
+        return entry
+
+    def _sender(self, name: str, first_fold: int, most: int) -> Sender:
+        rows = self._db.execute(
+            f"SELECT {_ENTRY}, message FROM entry WHERE client = ? AND fold >= ? ORDER BY number DESC LIMIT ?",
+            (name, first_fold, most),
+        )
+        entries: list[Entry] = []
+        for row in rows:
+            entry = Entry(*row)
+            if entries and entry.sequence != entries[-1].sequence - 1:
+                break  # a name that was forgotten and used again began at 1
+            entries.append(entry)
+        return Sender(name, entries[0].sequence + 1, tuple(reversed(entries)))
+
+    def _check_sequences(self) -> Iterator[str]:
+        """Each client's numbers are 1, 2, 3, ... in every epoch."""
+        begins = [fold for (fold,) in self._db.execute("SELECT fold FROM epoch ORDER BY number")]
+        for first, end in zip(begins, [*begins[1:], 1 << 62], strict=True):
+            rows = self._db.execute(
+                "SELECT client, sequence, sequence - LAG(sequence, 1, 0) OVER (PARTITION BY client ORDER BY number) "
+                "FROM entry WHERE fold >= ? AND fold < ?", (first, end),
+            )  # fmt: skip
+            for client, sequence, by in rows:
+                if by != 1 and sequence != 1:
+                    yield f"client {client} has number {sequence} after {sequence - by}"
+
+
+def create(folder: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> Store:
+    """A new journal in `folder`, which is made.  Raises JournalFailed."""
+    path = folder / NAME
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        store = Store(path, _connect(path, "rwc", durability), True)
+        with store._writing():
+            for statement in _SCHEMA.split(";"):
+                store._db.execute(statement)
+            store._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, 1, 'created')", (epoch,))
+            values = {"map": name, "mode": mode, "options": json.dumps(options), "durability": durability, "clean": "0"}
+            store._db.executemany("INSERT INTO header VALUES (?, ?)", list(values.items()))
+            store._db.execute(f"PRAGMA application_id = {_APPLICATION}")
+            store._db.execute(f"PRAGMA user_version = {FORM}")
+    except (OSError, sqlite3.Error) as error:
+        raise JournalFailed(path, str(error)) from None
+    return store
+
+
+def open_store(folder: Path, durability: str = "commit", read_only: bool = False) -> Store:
+    """The journal in `folder`.  One that cannot be written is opened for reading: `writable` says so.
+
+    Raises NoJournal, JournalDamaged, JournalVersion.
+    """
+    path = folder / NAME
+    if not path.is_file():
+        raise NoJournal(path)
+    try:
+        connection = _connect(path, "ro" if read_only else "rw", durability)
+        _check_form(path, connection)
+        writable = not read_only and _is_writable(connection)
+    except sqlite3.DatabaseError as error:
+        raise JournalDamaged(path, str(error)) from None
+    return Store(path, connection, writable)
+
+
+def _connect(path: Path, mode: str, durability: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False, timeout=10.0
+    )
+    if mode != "ro":
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute(f"PRAGMA synchronous = {_SYNCHRONOUS[durability]}")
+    return connection
+
+
+def _check_form(path: Path, connection: sqlite3.Connection) -> None:
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (form,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != _APPLICATION:
+        raise JournalDamaged(path, "it is a database of something else, or was never finished")
+    if form != FORM:
+        raise JournalVersion(path, form, FORM)
+
+
+def _is_writable(connection: sqlite3.Connection) -> bool:
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("ROLLBACK")
+    except sqlite3.OperationalError:
+        return False
+    return True

@@ -1,0 +1,175 @@
+"""The folder of a service's journals: which maps are there, made, opened, and brought to where they were."""
+
+import logging
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from factorbus.journal.lock import Owned, own
+from factorbus.journal.problems import JournalFailed
+from factorbus.journal.records import Header
+from factorbus.journal.snapshots import remove_strangers
+from factorbus.journal.store import NAME, Last, Store, create, open_store
+from factorbus.service.config import Config, Limits
+from factorbus.service.core import MapCore, Restored
+from factorbus.service.fold import Folder
+from factorbus.service.keeping import Keeper, Listener
+from factorbus.service.recovery import Recovered, answers, recover
+
+log = logging.getLogger(__name__)
+
+
+def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> Folder:
+    """A new folder with a solver in `mode`, and the other settings as `options` has them."""
+    from factorbus.solver import Options, Solver
+
+    known = {field.name for field in fields(Options)}
+    chosen = {name: value for name, value in options.items() if name in known}
+    settings = Options(**{**chosen, "mode": mode, "clock": time.perf_counter})
+    return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
+
+
+def log_owner(owner: str) -> None:
+    """Say who is waited for."""
+    log.info("standing by: the journal belongs to %s", owner or "a service that has not said who it is")
+
+
+class Library:
+    """A folder of journals that this process owns."""
+
+    def __init__(self, owned: Owned, config: Config) -> None:
+        self._owned, self._config = owned, config
+
+    def names(self) -> list[str]:
+        """The maps that there are."""
+        return sorted(path.parent.name for path in self._owned.folder.glob(f"*/{NAME}") if path.is_file())
+
+    def has(self, name: str) -> bool:
+        """Whether there is a map of this name."""
+        return (self._owned.folder / name / NAME).is_file()
+
+    def mode(self, name: str) -> str:
+        """The mode that map `name` was made in.  Raises JournalDamaged, JournalVersion."""
+        store = open_store(self._owned.folder / name, read_only=True)
+        try:
+            return store.header().mode
+        finally:
+            store.close()
+
+    def make(self, name: str, mode: str, limits: Limits) -> "Kept":
+        """A new map, and its journal.  Raises JournalFailed."""
+        where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
+        remove_strangers(where, set())
+        folder = make_folder(mode, {}, epoch, limits)
+        store = create(where, name, mode, folder.options(), epoch, self._config.durability)
+        return Kept(store, store.header(), folder, Recovered(store.last(), True, 0, 0), self._config)
+
+    def open(self, name: str, limits: Limits) -> "Kept":
+        """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
+        store = open_store(self._owned.folder / name, self._config.durability)
+        try:
+            return _reopened(store, limits, self._config)
+        except BaseException:
+            store.close()
+            raise
+
+    def remove(self, name: str) -> None:
+        """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises JournalFailed."""
+        path = self._owned.folder / name
+        gone = self._owned.folder / f".dropped-{name}-{secrets.token_hex(4)}"
+        try:
+            path.rename(gone)
+            shutil.rmtree(gone)
+        except OSError as error:
+            raise JournalFailed(path, str(error)) from None
+
+    def say(self, text: str) -> None:
+        """Tell whoever else wants the folder who has it."""
+        self._owned.say(text)
+
+    def close(self) -> None:
+        """Let others own the folder."""
+        self._owned.release()
+
+
+class Kept:
+    """A map with its journal, open: what a host and its core are to begin with."""
+
+    def __init__(self, store: Store, header: Header, folder: Folder, recovered: Recovered, config: Config) -> None:
+        self.store, self.header, self.folder, self.recovered = store, header, folder, recovered
+        self._config = config
+
+    def restore(self, core: MapCore) -> None:
+        """Tell `core` how the map is."""
+        limits, epoch = self._config.limits, self.header.epochs[-1]
+        senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
+        core.restore(
+            [(sender.client, sender.next, answers(sender, epoch.epoch)) for sender in senders],
+            Restored(self.folder.revision, *self.folder.size, self.folder.chi2() if self.folder.revision else 0.0),
+        )
+
+    def keeper(self, listener: Listener) -> Keeper:
+        """As `keeping.Keeping`."""
+        from factorbus.solver import fingerprint
+
+        config = self._config
+        return Keeper(
+            self.store, self.recovered.last, listener, config.durability, config.group_s, config.snapshot_s,
+            fingerprint(),
+        )  # fmt: skip
+
+    def reload(self, folder: Folder) -> Last:
+        """As `keeping.Keeping`."""
+        from factorbus.solver import fingerprint
+
+        store = open_store(self.store.path.parent, read_only=True)
+        try:
+            return recover(store, folder, fingerprint()).last
+        finally:
+            store.close()
+
+
+def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> Library | None:
+    """The library that `config` names, owned by this process; None if `stop` was set while standing by.
+
+    Raises JournalInUse, JournalFailed.
+    """
+    folder = Path(config.journal)
+    try:
+        owned = own(folder, stop if config.standby else None, waiting)
+    except OSError as error:
+        raise JournalFailed(folder, str(error)) from None
+    return Library(owned, config) if owned is not None else None
+
+
+def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
+    from factorbus.solver import fingerprint
+
+    started, header = time.perf_counter(), store.header()
+    folder = make_folder(header.mode, header.options, header.epoch, limits)
+    recovered = recover(store, folder, fingerprint())
+    remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
+    if store.writable:
+        for because in _reasons_for_an_epoch(header, recovered):
+            store.begin_epoch(secrets.randbits(62) | 1, because)
+            log.warning("%s: a new epoch, because %s", store.path, because)
+        store.set(clean="0", durability=config.durability)
+        header = store.header()
+        folder.enter(header.epoch)
+    log.info(
+        "map %s is back at revision %d in %.2f s: snapshot %d and %d folds after it", header.map,
+        recovered.last.revision, time.perf_counter() - started, recovered.from_fold, recovered.folds,
+    )  # fmt: skip
+    return Kept(store, header, folder, recovered, config)
+
+
+def _reasons_for_an_epoch(header: Header, recovered: Recovered) -> Iterator[str]:
+    """Clients must not go on from what is not there any more."""
+    if header.durability != "commit" and not header.clean:
+        yield f"it was not closed in order, and durability {header.durability} does not keep what was answered last"
+    elif not recovered.same:
+        yield "values have other bits than they had: another version or machine made them"

@@ -1,0 +1,122 @@
+"""A map as its journal has it: from the newest good snapshot and what came after it, or from the very beginning.
+
+Folded again in the same groups by the same solver, the inserts give the same revisions to the bit; the chain of digests
+proves it.  A snapshot counts only for the solver that wrote it (`fingerprint`): another one begins at the beginning.
+"""
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from factorbus.journal import chain
+from factorbus.journal.problems import JournalDiffers
+from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold, Sender
+from factorbus.journal.snapshots import file_of, read_snapshot
+from factorbus.journal.store import Last, Store
+from factorbus.proto import codec
+from factorbus.proto.messages import Accepted
+from factorbus.service.arrival import read_again
+from factorbus.service.events import Judged, Stepped, Waiting
+from factorbus.service.fold import Folder
+
+log = logging.getLogger(__name__)
+
+
+class Recovered(NamedTuple):
+    """Where a folder is now.  same: every value has the bits it had; from_fold: the snapshot it began with, or 0."""
+
+    last: Last
+    same: bool
+    from_fold: int
+    folds: int
+
+
+def recover(store: Store, folder: Folder, fingerprint: str) -> Recovered:
+    """Bring `folder` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
+    begin = _from_snapshot(store, folder, fingerprint)
+    last, same, folds = begin, True, 0
+    for fold in store.folds(begin.fold):
+        last = Last(fold.number, fold.revision, again(store, folder, fold, last.chain))
+        if same and last.chain != fold.chain:
+            log.warning("%s: from revision %d on, values have other bits than they had", store.path, fold.revision)
+            same = False
+        folds += 1
+    return Recovered(last, same, begin.fold, folds)
+
+
+def verify(store: Store, folder: Folder) -> Iterator[tuple[Fold, bool]]:
+    """Fold everything again from the beginning; gives each fold and whether all bits up to there are the same.
+
+    Raises JournalDamaged, JournalDiffers.
+    """
+    folder.load(None)
+    present = chain.START
+    for fold in store.folds():
+        present = again(store, folder, fold, present)
+        yield fold, present == fold.chain
+
+
+def again(
+    store: Store, folder: Folder, fold: Fold, present: bytes, told: Callable[[Stepped], None] | None = None
+) -> bytes:
+    """Fold `fold` in again; gives the chain of digests after it.  told: gets every step.  Raises JournalDiffers."""
+    inserts = [_waiting(entry) for entry in fold.entries if entry.outcome != UNTRIED]
+    outcomes: dict[tuple[str, int], int] = {}
+    for event in folder.fold_again(inserts, fold.rebuilt):
+        if isinstance(event, Judged):
+            for outcome in event.outcomes:
+                done = ACCEPTED if isinstance(outcome.answer, bytes) else REFUSED
+                outcomes[outcome.insert.client, outcome.insert.sequence] = done
+                if not isinstance(outcome.answer, bytes):
+                    log.debug("refused again: %s", outcome.answer)
+        else:
+            present = chain.follow(present, event.delta)
+            if told is not None:
+                told(event)
+    for entry in fold.entries:
+        if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
+            was, now = ("accepted", "refused") if entry.outcome == ACCEPTED else ("refused", "accepted")
+            raise JournalDiffers(
+                store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
+            )
+    if folder.revision != fold.revision:
+        raise JournalDiffers(
+            store.path, f"fold {fold.number} led to revision {fold.revision}, and leads to {folder.revision}"
+        )
+    return present
+
+
+def answers(sender: Sender, epoch: int) -> Iterator[tuple[int, int, object]]:
+    """What a client was answered: (sequence, digest, answer).  The step's account of work is not among what is kept."""
+    for entry in sender.entries:
+        yield entry.sequence, read_again(entry.message)[0], _answer(entry, epoch)
+
+
+def _answer(entry: Entry, epoch: int) -> object:
+    if entry.outcome == ACCEPTED:
+        return codec.encode_accepted(
+            Accepted(entry.sequence, epoch, entry.revision, entry.first_factor, entry.together)
+        )
+    return codec.decode_problem(entry.problem)
+
+
+def _from_snapshot(store: Store, folder: Folder, fingerprint: str) -> Last:
+    """Begin with the newest snapshot that can be used, or with nothing."""
+    for saved in store.snapshots():
+        path = file_of(store.path.parent, saved.fold)
+        if saved.fingerprint != fingerprint:
+            log.info("%s is of another solver or machine: not used", path)
+            continue
+        try:
+            folder.load(read_snapshot(path))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            log.warning("%s cannot be used: %s", path, error)
+            continue
+        return store.at(saved.fold)
+    folder.load(None)
+    return Last(0, 0, chain.START)
+
+
+def _waiting(entry: Entry) -> Waiting:
+    digest, content = read_again(entry.message)
+    return Waiting(entry.client, entry.sequence, len(entry.message), digest, content, [], entry.message)

@@ -1,0 +1,204 @@
+"""Questions about uncertainty, answered from R at one revision: covariances, gates, associations, gains, and why.
+
+A few variables are looked up in R where it lies, between two steps: a path to the root, microseconds.  For more R is
+copied there, and the answer computed on the thread that sends it.  One copy serves all questions about its revision.
+"""
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from factorbus.proto import asking, asking_codec
+from factorbus.proto.arrays import I64
+from factorbus.proto.asking import Associated, CovarianceGroup, Covariances, Gained, Gated, Why
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.limits import ANSWER_LIMITS
+from factorbus.proto.messages import Factors
+from factorbus.proto.problems import TooLarge
+from factorbus.service.lacking import NoPose, NotInMap
+from factorbus.solver.covariance.association import associate
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.factored import Factored
+from factorbus.solver.covariance.gates import threshold
+from factorbus.solver.covariance.relative import relative
+from factorbus.solver.covariance.why import why_factor, why_variable
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+
+# Measured on city10000: a path to the root takes 0.1 ms, a copy of R 5 ms.
+_NEAR = 8  # variables of a question that is answered from R where it lies
+_MOST = 100_000  # candidates, or pairs of sighting and landmark, in one question: some 100 MB of Jacobians
+
+DECODE: Mapping[str, Callable[[bytes], Any]] = {
+    "covariance": asking_codec.decode_ask_covariance,
+    "gate": asking_codec.decode_ask_gate,
+    "gain": asking_codec.decode_ask_gain,
+    "associate": asking_codec.decode_ask_associate,
+    "why": asking_codec.decode_ask_why,
+}
+
+
+def is_near(ask: Any) -> bool:
+    """Whether the answer is sooner made between two steps than R is copied there."""
+    if isinstance(ask, asking.AskCovariance):
+        named = [0 if keys is None else keys.size for keys in (ask.keys, ask.others)]
+        return ask.blocks == "last" or 0 < sum(named) <= _NEAR
+    if isinstance(ask, asking.AskGate | asking.AskGain):
+        return sum(len(group.keys) for group in ask.factors) <= _NEAR // 2
+    return isinstance(ask, asking.AskWhy) and ask.factor is not None
+
+
+class Uncertain:
+    """R at one revision.  Threads take turns: candidates are put into the graph, and taken out again.
+
+    keeps_steps: the solver notes when each variable moved.  account: of the last step.
+    """
+
+    def __init__(
+        self, factored: Factored, epoch: int, revision: int, keeps_steps: bool, account: Mapping[str, Any]
+    ) -> None:
+        self._blocks, self._graph = Blocks(factored), factored.graph
+        self._when = epoch, revision
+        self._keeps_steps, self._account = keeps_steps, account
+        self._turn = threading.Lock()
+
+    def answer(self, ask: Any) -> bytes:
+        """The bytes of the answer.  Raises Problem, SolverError."""
+        with self._turn:
+            return _ANSWER[type(ask)](self, ask)
+
+    def covariance(self, ask: asking.AskCovariance) -> bytes:
+        """ask/covariance"""
+        if ask.blocks == "diagonal":
+            every = np.arange(self._blocks.factored.count) if ask.keys is None else self._find(ask.keys)
+            return self._grouped("diagonal", every)
+        if ask.blocks == "last":
+            return self._grouped("last", self._last_pose())
+        keys = np.empty(0, np.int64) if ask.keys is None else ask.keys
+        if ask.blocks == "relative":
+            first, second = self._find(keys.reshape(-1)).reshape(-1, 2).T
+            found = relative(self._blocks, np.ascontiguousarray(first), np.ascontiguousarray(second))
+            groups = [CovarianceGroup(each.kind, keys[each.rows], each.covariance, each.values) for each in found]
+            return asking_codec.encode_covariances(Covariances(*self._when, "relative", tuple(groups)))
+        return self._together(ask.blocks, keys, ask.others)
+
+    def gate(self, ask: asking.AskGate) -> bytes:
+        """ask/gate"""
+        found = judge_candidates(self._blocks, _checked(ask.factors))
+        allowed = threshold(found.dims, ask.probability)
+        plausible = found.distance <= allowed
+        return asking_codec.encode_gated(Gated(*self._when, found.distance, found.dims, allowed, plausible))
+
+    def gain(self, ask: asking.AskGain) -> bytes:
+        """ask/gain"""
+        found = judge_candidates(self._blocks, _checked(ask.factors))
+        return asking_codec.encode_gained(Gained(*self._when, found.gain))
+
+    def associate(self, ask: asking.AskAssociate) -> bytes:
+        """ask/associate"""
+        pose = int(self._find(np.array([ask.pose]))[0])
+        landmarks = self._landmarks(ask.kind) if ask.landmarks is None else self._find(np.unique(ask.landmarks))
+        _check_size("the question", len(ask.measured) * landmarks.size, "pairs of sighting and landmark")
+        found = associate(
+            self._blocks, ask.kind, pose, ask.measured, ask.information, landmarks, ask.probability
+        )  # fmt: skip
+        matched = found.landmark >= 0
+        allowed = float(threshold(np.array([found.dims]), ask.probability)[0]) if found.dims else 0.0
+        return asking_codec.encode_associated(
+            Associated(
+                *self._when,
+                np.where(matched, self._graph.keys[found.landmark], 0),
+                matched,
+                found.distance,
+                found.dims,
+                allowed,
+                found.complete,
+                found.sightings,
+                self._graph.keys[found.landmarks],
+                found.distances,
+            )
+        )
+
+    def why(self, ask: asking.AskWhy) -> bytes:
+        """ask/why"""
+        variable: dict[str, Any] = {}
+        factor: dict[str, Any] = {}
+        if ask.key is not None:
+            index = int(self._find(np.array([ask.key]))[0])
+            variable = why_variable(self._blocks, index, self._keeps_steps).as_dict()
+        elif ask.factor is not None:
+            factor = why_factor(self._blocks, ask.factor).as_dict()
+        return asking_codec.encode_why(Why(*self._when, variable, factor, self._account))
+
+    def _grouped(self, blocks: str, variables: I64) -> bytes:
+        """Blocks of single variables, by kind."""
+        found, graph, groups = self._blocks.of(variables), self._graph, []
+        codes = graph.var[variables, at.V_KIND]
+        for code in np.unique(codes).tolist():
+            rows, kind = np.flatnonzero(codes == code), VARIABLE_KIND_OF_CODE[code]
+            covariance = found[rows, : kind.dim, : kind.dim]
+            groups.append(CovarianceGroup(kind.name, graph.keys[variables[rows]], covariance))
+        return asking_codec.encode_covariances(Covariances(*self._when, blocks, tuple(groups)))
+
+    def _together(self, blocks: str, keys: I64, others: I64 | None) -> bytes:
+        """One matrix: of all keys, or between keys and others."""
+        rows = self._find(keys)
+        columns = rows if others is None or blocks == "joint" else self._find(others)
+        dims, other_dims = self._blocks.factored.dims[rows], self._blocks.factored.dims[columns]
+        every = np.unique(np.concatenate([rows, columns]))
+        size = 8 * int(self._blocks.factored.dims[every].sum()) ** 2
+        if size > ANSWER_LIMITS.max_bytes:
+            raise TooLarge("the joint covariance", size, ANSWER_LIMITS.max_bytes, "bytes")
+        if blocks == "joint":
+            covariance = self._blocks.joint(rows)
+            return asking_codec.encode_covariances(
+                Covariances(*self._when, blocks, (), keys, dims, covariance=covariance)
+            )
+        both = self._blocks.joint(np.concatenate([rows, columns]))
+        split = int(dims.sum())
+        return asking_codec.encode_covariances(
+            Covariances(*self._when, blocks, (), keys, dims, others, other_dims, both[:split, split:])
+        )
+
+    def _find(self, keys: I64) -> I64:
+        """Indices of variables.  Raises NotInMap."""
+        found = np.array([self._graph.find(int(key)) for key in keys], np.int64)
+        if (found < 0).any():
+            raise NotInMap(np.unique(keys[found < 0]).tolist())
+        return found
+
+    def _last_pose(self) -> I64:
+        """Raises NoPose."""
+        poses = [VARIABLE_KINDS[name].code for name in ("se2", "se3")]
+        kinds = self._graph.var[: self._blocks.factored.count, at.V_KIND]
+        for v in range(kinds.size - 1, -1, -1):
+            if kinds[v] in poses:
+                return np.array([v])
+        raise NoPose
+
+    def _landmarks(self, kind: str) -> I64:
+        code = VARIABLE_KINDS[FACTOR_KINDS[kind].connects[1]].code
+        return np.flatnonzero(self._graph.var[: self._blocks.factored.count, at.V_KIND] == code)
+
+
+def _checked(groups: Sequence[Factors]) -> Sequence[Factors]:
+    """Without their losses: a gate is to judge the measurement as it is."""
+    _check_size("the question", sum(len(group.keys) for group in groups), "candidates")
+    return [Factors(group.kind, group.keys, group.measured, group.information) for group in groups]
+
+
+def _check_size(what: str, count: int, unit: str) -> None:
+    if count > _MOST:
+        raise TooLarge(what, count, _MOST, unit)
+
+
+_ANSWER: Mapping[type, Callable[[Uncertain, Any], bytes]] = {
+    asking.AskCovariance: Uncertain.covariance,
+    asking.AskGate: Uncertain.gate,
+    asking.AskGain: Uncertain.gain,
+    asking.AskAssociate: Uncertain.associate,
+    asking.AskWhy: Uncertain.why,
+}

@@ -1,0 +1,114 @@
+"""Which landmark each of a robot's sightings is of: compatible one by one, and all together.  MATH §10.4."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.candidates import admitted, judge_candidates, linearised
+from factorbus.solver.covariance.gates import threshold
+from factorbus.solver.covariance.kernels.compatible import search
+from factorbus.solver.errors import BadOption, KindMismatch, printed
+from factorbus.solver.factors import FACTOR_KINDS
+from factorbus.solver.groups import FactorGroup
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+
+_BUDGET = 200_000  # pairs tried: some seconds at the very worst
+_MOST_PAIRS = 2000  # compatible ones: their joint covariance has that many rows, times two or three
+
+
+@dataclass(frozen=True, slots=True)
+class Association:
+    """What was found.
+
+    landmark (n,): the variable that each sighting is of in the best joint hypothesis, −1: none of those there are
+    distance: its joint d², dims: of how many numbers   complete: the search was not cut short
+    sightings, landmarks, distances (pairs,): all that are compatible one by one, by sighting, the nearest first
+    """
+
+    landmark: I64
+    distance: float
+    dims: int
+    complete: bool
+    sightings: I64
+    landmarks: I64
+    distances: F64
+
+
+def associate(
+    blocks: Blocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float
+) -> Association:
+    """Sightings (rows of `measured` and `information`, as of a factor of `kind`) from variable `pose`.
+
+    landmarks: variables to choose from.  Raises KindMismatch, BadOption, and what `admit` raises for bad rows.
+    """
+    graph, n, L = blocks.factored.graph, len(measured), landmarks.size
+    _check(blocks, kind, pose, landmarks)
+    keys = np.column_stack([np.full(n * L, graph.keys[pose]), np.tile(graph.keys[landmarks], n)])
+    every = FactorGroup(kind, keys, np.repeat(measured, L, axis=0), np.repeat(information, L, axis=0))
+    dim = FACTOR_KINDS[kind].dim
+    found = judge_candidates(blocks, [every] if n * L else [])
+    distance = found.distance.reshape(n, L)
+    near = distance <= threshold(np.array([dim]), probability)[0]
+    sightings, columns = np.nonzero(near)
+    order = np.lexsort((distance[sightings, columns], sightings))
+    sightings, columns = sightings[order], columns[order]
+    if sightings.size > _MOST_PAIRS:
+        raise BadOption(
+            "landmarks", f"{sightings.size} compatible pairs", f"at most {_MOST_PAIRS}: fewer landmarks or sightings"
+        )
+    chosen = sightings * L + columns
+    pairs = FactorGroup(kind, every.keys[chosen], every.measured[chosen], every.information[chosen])
+    best, joint, complete = _search(blocks, pairs, dim, n, sightings, columns, L, probability)
+    landmark = np.full(n, -1)
+    landmark[best >= 0] = landmarks[columns[best[best >= 0]]]
+    dims = dim * int((best >= 0).sum())
+    return Association(landmark, joint, dims, complete, sightings, landmarks[columns], distance[sightings, columns])
+
+
+def _search(
+    blocks: Blocks, pairs: FactorGroup, dim: int, n: int, sightings: I64, columns: I64, L: int, probability: float
+) -> tuple[I64, float, bool]:
+    """(pair of each sighting, joint d², whether it is surely the best)."""
+    S, r = _joint_innovations(blocks, pairs, dim)
+    begin = np.searchsorted(sightings, np.arange(n + 1))
+    gates = np.concatenate([[0.0], threshold(dim * np.arange(1, n + 1), probability)])
+    best, count = np.empty(n, np.int64), np.zeros(2, np.int64)
+    complete = search(dim, L, begin, columns, S, r, gates, _BUDGET, best, count) == 1
+    rows = (best[best >= 0, None] * dim + np.arange(dim)).reshape(-1)
+    joint = float(r[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], r[rows])) if rows.size else 0.0
+    return best, joint, complete
+
+
+def _joint_innovations(blocks: Blocks, pairs: FactorGroup, dim: int) -> tuple[F64, F64]:
+    """Covariance and values of all pairs' innovations together: S = H Σ Hᵀ + diag Ω⁻¹."""
+    graph = blocks.factored.graph
+    mark, k = graph.mark(), len(pairs.keys)
+    if not k:
+        return np.zeros((0, 0)), np.zeros(0)
+    with admitted(graph, [pairs]):
+        linear = linearised(graph, mark[at.FACTORS], mark[at.FACTORS] + k)
+    variables = np.unique(linear.ends)
+    dims = blocks.factored.dims[variables]
+    starts = dict(zip(variables.tolist(), (np.cumsum(dims) - dims).tolist(), strict=True))
+    H = np.zeros((k * dim, int(dims.sum())))
+    for q in range(k):
+        for end, J in ((0, linear.A), (1, linear.B)):
+            start, width = starts[int(linear.ends[q, end])], int(linear.sizes[q, 1 + end])
+            H[q * dim : (q + 1) * dim, start : start + width] = J[q, :dim, :width]
+    S = H @ blocks.joint(variables) @ H.T
+    for q in range(k):
+        rows = slice(q * dim, (q + 1) * dim)
+        S[rows, rows] += np.linalg.inv(linear.W[q, :dim, :dim])
+    return S, np.ascontiguousarray(linear.r[:, :dim]).reshape(-1)
+
+
+def _check(blocks: Blocks, kind: str, pose: int, landmarks: I64) -> None:
+    graph, wanted = blocks.factored.graph, FACTOR_KINDS[kind].connects
+    for variable, end in ((pose, wanted[0]), *((int(v), wanted[1]) for v in landmarks)):
+        if graph.var[variable, at.V_KIND] != end.code:
+            seen = VARIABLE_KIND_OF_CODE[int(graph.var[variable, at.V_KIND])].name
+            key = int(graph.keys[variable])
+            raise KindMismatch(key, f"{kind} to {printed(key)}", seen, end.name)

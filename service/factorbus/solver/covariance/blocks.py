@@ -1,0 +1,104 @@
+"""Blocks of the covariance of a map: of one variable, of several together, between two.  MATH §10.1, §10.2.
+
+A block is in the tangent spaces of its variables: local increments, translation first (`factorbus.solver.variables`).
+Fixed variables have covariance zero.
+"""
+
+import numpy as np
+
+from factorbus.solver.covariance.factored import DIMS, Factored
+from factorbus.solver.covariance.kernels.columns import cross_blocks
+from factorbus.solver.covariance.kernels.paths import joint_block
+from factorbus.solver.covariance.kernels.recursion import diagonal_blocks
+from factorbus.solver.kernels._jit import F64, I64
+
+# For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
+_FEW = 1 / 64
+_FEW_PAIRS = 4
+
+
+class Blocks:
+    """Covariances of one factored map, computed when they are asked for.  For one thread at a time.
+
+    width: d of the largest variable there is; blocks of smaller ones are in the upper left corners.
+    """
+
+    def __init__(self, factored: Factored) -> None:
+        self.factored = factored
+        self.width = int(factored.dims.max(initial=1))
+        self._diagonal: F64 | None = None
+
+    def diagonal(self) -> F64:
+        """(n, width, width): of every variable, in the upper left corners."""
+        if self._diagonal is None:
+            f = self.factored
+            self._diagonal = np.zeros((f.count, self.width, self.width))
+            diagonal_blocks(f.order, f.clique, f.lists, f.numbers, f.dims, self._diagonal)
+        return self._diagonal
+
+    def of(self, variables: I64) -> F64:
+        """(k, width, width): of some variables, each by itself."""
+        if self.prefers_all(variables.size):
+            return self.diagonal()[variables]
+        out = np.zeros((variables.size, self.width, self.width))
+        for k, v in enumerate(variables.tolist()):
+            d = int(self.factored.dims[v])
+            out[k, :d, :d] = self.joint(variables[k : k + 1])
+        return out
+
+    def prefers_all(self, count: int) -> bool:
+        """Whether so many variables are sooner looked up among all than computed by themselves."""
+        whole = self.factored.order.size > 0
+        return self._diagonal is not None or (whole and count > _FEW * self.factored.count)
+
+    def joint(self, variables: I64) -> F64:
+        """(d, d): of several variables together, in their order; a variable may come twice."""
+        f = self.factored
+        different, which = np.unique(variables, return_inverse=True)
+        free = different[f.scalar[different] >= 0]
+        inner = np.zeros((int(f.dims[free].sum()),) * 2)
+        joint_block(free, f.graph.var, DIMS, f.node, f.clique, f.lists, f.numbers, inner)
+        # Where the scalars of `variables` are in `inner`; the last row and column of zeros serve the fixed ones.
+        starts = np.full(different.size, -1)
+        starts[f.scalar[different] >= 0] = np.cumsum(f.dims[free]) - f.dims[free]
+        places = np.concatenate(
+            [
+                start + np.arange(dim) if start >= 0 else np.full(dim, -1)
+                for start, dim in zip(starts[which].tolist(), f.dims[variables].tolist(), strict=True)
+            ]
+            or [np.empty(0, np.int64)]
+        )
+        padded = np.zeros((len(inner) + 1,) * 2)
+        padded[:-1, :-1] = inner
+        return padded[np.ix_(places, places)]
+
+    def pairs(self, first: I64, second: I64) -> F64:
+        """(k, width, width): between first[k] (rows) and second[k] (columns), each in the upper left corner."""
+        f = self.factored
+        if first.size <= _FEW_PAIRS or f.order.size == 0:
+            return self._single_pairs(first, second)
+        free_first, free_second = (np.where(f.scalar[ends] >= 0, ends, -1) for ends in (first, second))
+        turned = _changes(free_second) < _changes(free_first)
+        hubs, partners = (free_second, free_first) if turned else (free_first, free_second)
+        order = np.argsort(hubs, kind="stable") if _changes(hubs) else np.arange(hubs.size)
+        sorted_blocks = np.zeros((first.size, self.width, self.width))
+        cross_blocks(
+            np.ascontiguousarray(hubs[order]), np.ascontiguousarray(partners[order]), f.order, f.scalar, f.node,
+            f.clique, f.lists, f.numbers, f.dims, sorted_blocks,
+        )  # fmt: skip
+        blocks = np.empty_like(sorted_blocks)
+        blocks[order] = sorted_blocks
+        return blocks.transpose(0, 2, 1) if turned else blocks
+
+    def _single_pairs(self, first: I64, second: I64) -> F64:
+        """The same, each from the paths of its two ends."""
+        out = np.zeros((first.size, self.width, self.width))
+        for k, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+            d, e = int(self.factored.dims[i]), int(self.factored.dims[j])
+            out[k, :d, :e] = self.joint(np.array([i, j]))[:d, d:]
+        return out
+
+
+def _changes(ends: I64) -> int:
+    """How often another end follows: about how many different ones there are."""
+    return int(np.count_nonzero(ends[1:] != ends[:-1]))

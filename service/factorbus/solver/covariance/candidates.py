@@ -1,0 +1,129 @@
+"""Factors that a map has not taken in, held against it: how far off, and what they would tell.  MATH §10.3."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.admission import admit
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.factored import LARGEST
+from factorbus.solver.covariance.kernels.judge import judge
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph import Graph
+from factorbus.solver.groups import FactorsLike
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.candidates import evaluate_factors
+
+_CHUNK = 512  # factors whose Jacobians stay in the cache between two kernels
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Factors k, in the order they were given.
+
+    ends (n, 2): variables, −1: none   dims (n,): of the residuals   distance (n,): d²   gain (n,): nats
+    predicted (n, d, d): T = H Σ Hᵀ, upper left corners
+    """
+
+    ends: I64
+    dims: I64
+    distance: F64
+    gain: F64
+    predicted: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """Factors linearised at the estimate: r (n, 6), A, B, W (n, 6, 6), sizes (n, 3) of residual and ends."""
+
+    ends: I64
+    sizes: I64
+    r: F64
+    A: F64
+    B: F64
+    W: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    variables: tuple[()]
+    factors: tuple[FactorsLike, ...]
+
+
+def judge_candidates(blocks: Blocks, groups: Sequence[FactorsLike]) -> Candidates:
+    """What the map expects of `groups`.  Raises what `admission.admit` raises for factors that it would refuse."""
+    graph = blocks.factored.graph
+    first = int(graph.counts[at.FACTORS])
+    with admitted(graph, groups):
+        return judge_rows(blocks, first, int(graph.counts[at.FACTORS]))
+
+
+@contextmanager
+def admitted(graph: Graph, groups: Sequence[FactorsLike]) -> Iterator[None]:
+    """`groups` are the last factors of `graph` for a while.  Raises as `judge_candidates`."""
+    mark = graph.mark()
+    try:
+        admit(graph, _Batch((), tuple(groups)))
+        yield
+    finally:
+        graph.forget(mark)
+
+
+def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
+    """The same for the factors first .. last−1 of the graph."""
+    graph, n = blocks.factored.graph, last - first
+    ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
+    both = np.flatnonzero(ends[:, 1] >= 0)
+    cross = np.zeros((n, blocks.width, blocks.width))
+    if both.size:
+        cross[both] = blocks.pairs(ends[both, 0], ends[both, 1])
+    diagonal, places = _diagonal(blocks, ends)
+    dims = _SIZES[graph.fac[first:last, at.F_KIND], 0]
+    widest = int(dims.max(initial=1))
+    distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, widest, widest))
+    for start in range(0, n, _CHUNK):
+        stop = min(start + _CHUNK, n)
+        linear = linearised(graph, first + start, first + stop)
+        rows = slice(start, stop)
+        judge(
+            places[rows], linear.sizes, linear.r, linear.A, linear.B, linear.W, diagonal, cross[rows],
+            predicted[rows], distance[rows], gain[rows],
+        )  # fmt: skip
+    if not np.isfinite(distance).all():
+        raise errors.NotFinite("the distance of a candidate")
+    return Candidates(ends, dims, distance, gain, predicted)
+
+
+def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
+    """Covariances of the variables that occur, and where those of `ends` are among them; −1 stays."""
+    if blocks.prefers_all(ends.size):
+        return blocks.diagonal(), ends
+    different, which = np.unique(ends, return_inverse=True)
+    known = different >= 0
+    diagonal = np.zeros((different.size, blocks.width, blocks.width))
+    diagonal[known] = blocks.of(different[known])
+    return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
+
+
+def linearised(graph: Graph, first: int, last: int) -> Linear:
+    """The factors first .. last−1 at the estimate."""
+    n = last - first
+    r, A, B, W = np.zeros((n, LARGEST)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
+    evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    fac = graph.fac[first:last]
+    ends = np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1])
+    return Linear(ends, _SIZES[fac[:, at.F_KIND]], r, A, B, W)
+
+
+def _sizes() -> I64:
+    sizes = np.zeros((1 + max(FACTOR_KIND_OF_CODE), 3), np.int64)
+    for code, kind in FACTOR_KIND_OF_CODE.items():
+        sizes[code] = kind.dim, kind.connects[0].dim, kind.connects[1].dim if len(kind.connects) > 1 else 0
+    return sizes
+
+
+_SIZES = _sizes()

@@ -1,0 +1,91 @@
+"""R of a map at one moment, copied: what covariances are computed from while the map goes on.  MATH §10."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.covariance.kernels.recursion import list_cliques
+from factorbus.solver.covariance.kernels.rows import copy_rows, rows_size
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.options import Options
+from factorbus.solver.tree import Tree
+from factorbus.solver.variables import VARIABLE_KINDS
+
+DIMS = np.zeros(1 + max(kind.code for kind in VARIABLE_KINDS.values()), np.int64)
+for _kind in VARIABLE_KINDS.values():
+    DIMS[_kind.code] = _kind.dim
+LARGEST = int(DIMS.max())
+
+
+@dataclass(frozen=True, slots=True)
+class Factored:
+    """R by cliques and the graph it is of; arrays as in `kernels/tree_layout.py`.
+
+    dims (n,): of every variable   scalar (n,): where it starts in a column of Σ; −1: fixed
+    order (c,): the cliques, depth first from the roots; none in a view   stamp: of the last elimination
+    """
+
+    graph: Graph
+    node: I64
+    clique: I64
+    lists: I64
+    numbers: F64
+    dims: I64
+    scalar: I64
+    order: I64
+    stamp: int
+
+    @property
+    def count(self) -> int:
+        """Variables, fixed ones included."""
+        return len(self.node)
+
+
+def factored(graph: Graph, tree: Tree) -> Factored:
+    """A copy of what `tree` has of `graph`, as of its last step."""
+    return _copied(graph.copied(), tree)
+
+
+def viewed(graph: Graph, tree: Tree) -> Factored:
+    """The same in place, until the next step: for what goes up from a few variables."""
+    count = int(graph.counts[at.VARIABLES])
+    return Factored(
+        graph, tree.node[:count], tree.clique, tree.lists, tree.numbers, dims_of(graph.var[:count]),
+        np.ascontiguousarray(graph.var[:count, at.V_SCALAR]), np.empty(0, np.int64), int(tree.state[tl.S_STAMP]),
+    )  # fmt: skip
+
+
+def factored_anew(graph: Graph) -> Factored:
+    """The same for a graph that is solved in another way: factorised here at its values.  Raises Underconstrained."""
+    copy = graph.copied()
+    values = copy.values.copy()
+    # The graph is solved, so all of it is held; and the linearisation points are the estimate.
+    tree = Tree(copy, Options(mode="tree", place_new=False))
+    if tree.step(sure=True) == tl.FAILED:
+        key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
+        raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")
+    copy.values = values
+    return _copied(copy, tree)
+
+
+def dims_of(var: I64) -> I64:
+    """The dimension of the tangent space of every variable in `var`."""
+    return DIMS[var[:, at.V_KIND]]
+
+
+def _copied(graph: Graph, tree: Tree) -> Factored:
+    count, state = int(graph.counts[at.VARIABLES]), tree.state
+    node, clique = tree.node[:count].copy(), tree.clique[: state[tl.S_CLIQUES]].copy()
+    order = np.empty(int(state[tl.S_ALIVE]), np.int64)
+    order = order[: list_cliques(node, clique, order)]
+    numbers = np.zeros(rows_size(order, clique))
+    copy_rows(order, clique, tree.numbers, numbers)
+    scalar = np.ascontiguousarray(graph.var[:count, at.V_SCALAR])
+    lists = tree.lists[: state[tl.S_LISTS]].copy()
+    return Factored(
+        graph, node, clique, lists, numbers, dims_of(graph.var[:count]), scalar, order, int(state[tl.S_STAMP])
+    )

@@ -1,0 +1,1 @@
+"""Compiled kernels of covariances; they read the tree of cliques and know nothing of how it is made."""

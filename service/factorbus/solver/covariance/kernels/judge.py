@@ -1,0 +1,105 @@
+"""What a map expects of a factor that it has not taken in.  MATH §10.3.
+
+T = H Σ Hᵀ,   S = T + Ω⁻¹,   d² = rᵀ S⁻¹ r,   gain = ½ ln det S + ½ ln det Ω               (10.5)
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel
+
+_DIM = 6
+
+
+@kernel(
+    "void(int64[:,::1], int64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1],"
+    " float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], float64[::1], float64[::1])"
+)
+def judge(
+    ends: I64, sizes: I64, r: F64, A: F64, B: F64, W: F64, diagonal: F64, cross: F64, T: F64, distance: F64, gain: F64
+) -> None:
+    """Factors between ends[k, 0] and ends[k, 1] (−1: none).
+
+    in   sizes (n, 3): of the residual and of the ends   r (n, 6)  A, B, W (n, 6, 6)
+         diagonal (variables, d, d)  cross (n, d, d): Σ between the ends
+    out  T (n, e, e)   distance (n,): d²   gain (n,): nats
+    """
+    G, S, y = np.empty((_DIM, _DIM)), np.empty((_DIM, _DIM)), np.empty(_DIM)
+    for k in range(len(ends)):
+        dr, di, dj = sizes[k, 0], sizes[k, 1], sizes[k, 2]
+        T[k] = 0.0
+        spread(dr, di, di, A[k], diagonal[ends[k, 0]], A[k], G, T[k])
+        if dj > 0:
+            spread(dr, dj, dj, B[k], diagonal[ends[k, 1]], B[k], G, T[k])
+            S[:, :] = 0.0
+            spread(dr, di, dj, A[k], cross[k], B[k], G, S)
+            for a in range(dr):
+                for b in range(dr):
+                    T[k, a, b] += S[a, b] + S[b, a]
+        invert(dr, W[k], G, S)
+        log_det = 0.0
+        for a in range(dr):
+            log_det += math.log(G[a, a])
+        for a in range(dr):
+            for b in range(dr):
+                S[a, b] += T[k, a, b]
+        lower(dr, S)
+        total = 0.0
+        for a in range(dr):
+            value = r[k, a]
+            for b in range(a):
+                value -= S[a, b] * y[b]
+            y[a] = value / S[a, a]
+            total += y[a] * y[a]
+            log_det += math.log(S[a, a])
+        distance[k], gain[k] = total, log_det
+
+
+@inline_kernel
+def spread(dr: int, di: int, dj: int, A: F64, sigma: F64, B: F64, G: F64, out: F64) -> None:
+    """out += A Σ Bᵀ"""
+    for a in range(dr):
+        for j in range(dj):
+            total = 0.0
+            for i in range(di):
+                total += A[a, i] * sigma[i, j]
+            G[a, j] = total
+    for a in range(dr):
+        for b in range(dr):
+            total = 0.0
+            for j in range(dj):
+                total += G[a, j] * B[b, j]
+            out[a, b] += total
+
+
+@inline_kernel
+def lower(n: int, S: F64) -> None:
+    """S := L of S = L Lᵀ, in its lower triangle."""
+    for a in range(n):
+        for b in range(a + 1):
+            total = S[a, b]
+            for k in range(b):
+                total -= S[a, k] * S[b, k]
+            S[a, b] = math.sqrt(total) if a == b else total / S[b, b]
+
+
+@inline_kernel
+def invert(n: int, W: F64, L: F64, out: F64) -> None:
+    """out = W⁻¹, and L the Cholesky factor of W."""
+    for a in range(n):
+        for b in range(n):
+            L[a, b] = W[a, b]
+    lower(n, L)
+    for c in range(n):
+        # L z = e_c, then Lᵀ x = z: x is column c.
+        for a in range(n):
+            value = 1.0 if a == c else 0.0
+            for b in range(a):
+                value -= L[a, b] * out[b, c]
+            out[a, c] = value / L[a, a]
+        for a in range(n - 1, -1, -1):
+            value = out[a, c]
+            for b in range(a + 1, n):
+                value -= L[b, a] * out[b, c]
+            out[a, c] = value / L[a, a]

@@ -1,0 +1,154 @@
+"""What holds a variable, and what a factor does: the numbers behind an estimate.  MATH §10.5."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.candidates import Linear, judge_rows, linearised
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+
+_NOTHING = 1e-9
+_STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)
+
+
+class UnknownFactor(errors.SolverError):
+    """A factor that the map does not have."""
+
+    code = "unknown_factor"
+
+    def __init__(self, factor: int, count: int) -> None:
+        super().__init__(
+            f"there is no factor {factor}; the map has {count}, from 0 on, in the order they were accepted",
+            factor=factor,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FactorAccount:
+    """One factor at the estimate.
+
+    residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: rᵀ Ω r
+    influence: tr(Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
+    without: rᵀ (Ω⁻¹ − H Σ Hᵀ)⁻¹ r, by how much χ² would fall without it; None: nothing else measures what it does
+    """
+
+    factor: int
+    kind: str
+    keys: tuple[int, ...]
+    residual: F64
+    weighted: F64
+    chi2: float
+    dims: int
+    influence: float
+    without: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain types."""
+        plain = {name: getattr(self, name) for name in self.__slots__}
+        return plain | {"keys": list(self.keys), "residual": self.residual.tolist(), "weighted": self.weighted.tolist()}
+
+
+@dataclass(frozen=True, slots=True)
+class VariableAccount:
+    """One variable.
+
+    sigmas (d,): standard deviations in its tangent space; zero where it is fixed   covariance (d, d)
+    pivot: the smallest of its pivots of R, 1/σ of it given all that is eliminated later; conditioning: that squared
+    over the diagonal of Λ there, 1: no other variable takes anything from it, near 0: almost nothing holds it
+    linearised_step, changed_step, seen_step: the steps that moved its linearisation point last, changed its estimate,
+    brought a factor of it; −1: none, or the solver's mode keeps no such record
+    """
+
+    key: int
+    kind: str
+    fixed: bool
+    value: F64
+    sigmas: F64
+    covariance: F64
+    pivot: float
+    conditioning: float
+    linearised_step: int
+    changed_step: int
+    seen_step: int
+    factors: list[FactorAccount] = field(default_factory=list)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same as plain types."""
+        plain = {name: getattr(self, name) for name in self.__slots__}
+        arrays = {name: plain[name].tolist() for name in ("value", "sigmas", "covariance")}
+        return plain | arrays | {"factors": [each.as_dict() for each in self.factors]}
+
+
+def why_factor(blocks: Blocks, factor: int) -> FactorAccount:
+    """Raises UnknownFactor."""
+    graph = blocks.factored.graph
+    count = int(graph.counts[at.FACTORS])
+    if not 0 <= factor < count:
+        raise UnknownFactor(factor, count)
+    T = judge_rows(blocks, factor, factor + 1).predicted[0]
+    return _account(blocks, factor, linearised(graph, factor, factor + 1), T)
+
+
+def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAccount:
+    """Of the variable with this index.  keeps_steps: the record is that of the map's own tree."""
+    f = blocks.factored
+    graph, node = f.graph, f.node[variable]
+    row = graph.var[variable]
+    kind = VARIABLE_KIND_OF_CODE[int(row[at.V_KIND])]
+    fixed = bool(row[at.V_COLUMN] < 0)
+    covariance = blocks.of(np.array([variable]))[0, : kind.dim, : kind.dim]
+    fac = graph.fac[: graph.counts[at.FACTORS]]
+    ids = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)).tolist()
+    factors = [why_factor(blocks, factor) for factor in ids]
+    pivot, conditioning = (0.0, 1.0) if fixed else _pivot(blocks, variable, ids)
+    linearised_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
+    value = graph.values[row[at.V_AT] : row[at.V_AT] + kind.size].copy()
+    sigmas = np.sqrt(np.diag(covariance))
+    return VariableAccount(
+        int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearised_step,
+        changed, seen, factors,
+    )  # fmt: skip
+
+
+def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, float]:
+    """The smallest pivot of a free variable, and the smallest share of Λ's diagonal that is left in one, (10.9)."""
+    f = blocks.factored
+    row = f.clique[f.node[variable, tl.N_CLIQUE]]
+    before = f.lists[row[tl.C_LIST] : row[tl.C_LIST] + f.node[variable, tl.N_PLACE]]
+    first, d = int(f.dims[before].sum()), int(f.dims[variable])
+    pivots = np.array([f.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
+    diagonal = np.zeros(d)
+    for factor in factors:
+        linear = linearised(f.graph, factor, factor + 1)
+        dim = int(linear.sizes[0, 0])
+        for end, J in ((0, linear.A), (1, linear.B)):
+            if linear.ends[0, end] == variable:
+                H = J[0, :dim, :d]
+                diagonal += np.einsum("ai,ab,bi->i", H, linear.W[0, :dim, :dim], H)
+    return float(pivots.min()), float((pivots**2 / diagonal).min())
+
+
+def _account(blocks: Blocks, factor: int, linear: Linear, T: F64) -> FactorAccount:
+    graph = blocks.factored.graph
+    row = graph.fac[factor]
+    kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
+    d = kind.dim
+    r, W, T = linear.r[0, :d].copy(), linear.W[0, :d, :d], T[:d, :d]
+    keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
+    L = np.linalg.cholesky(W)
+    # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
+    left = np.linalg.eigvalsh(np.eye(d) - L.T @ T @ L)
+    weighted = L.T @ r
+    without = None
+    if left[0] > _NOTHING:
+        without = float(weighted @ np.linalg.solve(np.eye(d) - L.T @ T @ L, weighted))
+    return FactorAccount(
+        factor, kind.name, keys, r, weighted, float(weighted @ weighted), d, float(np.trace(W @ T)), without
+    )

@@ -1,0 +1,149 @@
+"""Admission of columns that lie in the bytes of a message: one call for all of a small batch.
+
+It takes what is in order and fits into the room there is.  Anything else it leaves as it was: the usual way of
+admission then says what is wrong, or makes room.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.admit import (
+    append_factor,
+    append_variable,
+    check_numbers,
+    check_value,
+    find_ends,
+    remove_keys,
+    slot_of,
+)
+
+
+@kernel(
+    "int64(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], int64[::1], int64[::1], int64[:,::1], float64[::1],"
+    " int64[::1], int64[:,::1], float64[::1], int64[::1])"
+)
+def admit_bytes(
+    raw: bytes,
+    groups: I64,
+    table: I64,
+    keys: I64,
+    var: I64,
+    values: F64,
+    dims: I64,
+    fac: I64,
+    payload: F64,
+    counts: I64,
+) -> int:
+    """Append the groups of variables and factors in `raw`.
+
+    Gives how many of the variables still need a value, or −1: nothing changed.
+    """
+    before = counts.copy()
+    if take_groups(raw, groups, table, keys, var, values, dims, fac, payload, counts):
+        return count_missing(groups)
+    remove_keys(before[at.VARIABLES], counts[at.VARIABLES], table, keys)
+    counts[:] = before
+    return -1
+
+
+@inline_kernel
+def take_groups(
+    raw: bytes,
+    groups: I64,
+    table: I64,
+    keys: I64,
+    var: I64,
+    values: F64,
+    dims: I64,
+    fac: I64,
+    payload: F64,
+    counts: I64,
+) -> bool:
+    """Append group after group; False: one of them is not in order, or there is no room."""
+    scratch = np.empty((6, 6))
+    end = 0
+    while groups[end, at.G_KIND] != at.END:
+        end += 1
+    for g in range(end):
+        if groups[g, at.G_FACTORS] == 0:
+            count, size = groups[g, at.G_COUNT], groups[g, at.G_SIZE]
+            entries = counts[at.VARIABLES] + count
+            if entries > keys.size or 2 * entries > table.size or counts[at.VALUES] + count * size > values.size:
+                return False
+            for n in range(count):
+                if not take_variable(raw, groups[g], n, table, keys, var, values, dims, counts):
+                    return False
+    for g in range(end):
+        if groups[g, at.G_FACTORS] != 0:
+            count = groups[g, at.G_COUNT]
+            numbers = count * (groups[g, at.G_SIZE] + groups[g, at.G_TRIANGLE])
+            if counts[at.FACTORS] + count > fac.shape[0] or counts[at.PAYLOAD] + numbers > payload.size:
+                return False
+            for n in range(count):
+                if not take_factor(raw, groups[g], n, table, keys, var, fac, payload, counts, scratch):
+                    return False
+    return True
+
+
+@part
+def take_variable(
+    raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
+) -> bool:
+    """Append the n-th variable of a group, if it is in order."""
+    kind, size, x = group[at.G_KIND], group[at.G_SIZE], counts[at.VALUES]
+    key = word(raw, group[at.G_KEYS] + 8 * n)
+    slot = slot_of(key, table, keys)
+    if table[slot] != 0:
+        return False
+    if group[at.G_NUMBERS] >= 0:
+        copy_numbers(raw, group[at.G_NUMBERS] + 8 * n * size, size, values, x)
+        if check_value(kind, x, size, values) != at.GOOD:
+            return False
+    append_variable(kind, group[at.G_FIXED] != 0, key, slot, size, table, keys, var, dims, counts)
+    return True
+
+
+@part
+def take_factor(
+    raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, fac: I64, payload: F64, counts: I64, scratch: F64
+) -> bool:
+    """Append the n-th factor of a group, if it is in order."""
+    kind, size, triangle, arity = group[at.G_KIND], group[at.G_SIZE], group[at.G_TRIANGLE], group[at.G_ARITY]
+    p, first = counts[at.PAYLOAD], group[at.G_KEYS] + 8 * n * arity
+    i, j, wrong = find_ends(kind, word(raw, first), word(raw, first + 8 * (arity - 1)), table, keys, var)
+    if wrong != at.GOOD:
+        return False
+    copy_numbers(raw, group[at.G_NUMBERS] + 8 * n * size, size, payload, p)
+    copy_numbers(raw, group[at.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
+    if check_numbers(kind, p, size, triangle, payload, scratch) != at.GOOD:
+        return False
+    append_factor(kind, at.NO_LOSS, i, j, size + triangle, var, fac, counts)
+    return True
+
+
+@inline_kernel
+def count_missing(groups: I64) -> int:
+    """New variables that came without values."""
+    g, missing = 0, 0
+    while groups[g, at.G_KIND] != at.END:
+        if groups[g, at.G_FACTORS] == 0 and groups[g, at.G_NUMBERS] < 0:
+            missing += groups[g, at.G_COUNT]
+        g += 1
+    return missing
+
+
+@part
+def copy_numbers(raw: bytes, start: int, count: int, out: F64, to: int) -> None:
+    """The doubles in raw[start:] to out[to:]."""
+    for c in range(count):
+        out[to + c] = np.int64(word(raw, start + 8 * c)).view(np.float64)
+
+
+@part
+def word(raw: bytes, start: int) -> int:
+    """The little-endian int64 in raw[start : start + 8]."""
+    bits = np.int64(0)
+    for k in range(8):
+        bits |= np.int64(raw[start + k]) << np.int64(8 * k)
+    return bits  # type: ignore[return-value]

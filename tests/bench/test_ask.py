@@ -1,0 +1,39 @@
+"""The bench of covariances: its numbers hang together, and GTSAM's Marginals agree at the data sets' ends."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench import ask
+from bench.replays.problems import SIMULATED, Problem
+
+from factorbus.solver import Options, Solver, solve_batch
+from factorbus.solver.covariance.blocks import Blocks
+
+
+def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ask, "_problem", lambda name, poses: SIMULATED[0].shortened(120))
+    monkeypatch.setattr(ask, "_CANDIDATES", 200)
+    found = ask.run(120)
+    assert len(found["targets"]) == 5
+    assert found["every_step"]["worst_difference_to_recursion"] < 1e-8
+    assert all(target["seen"] > 0 for target in found["targets"])
+    assert found["large"]["worst_difference_to_gtsam"] < 0.05
+    assert "manhattan" in ask.report(found).lower()
+
+
+@pytest.mark.data
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", ["intel", "manhattan3500", "city10000"])
+def test_blocks_are_gtsam_s_at_the_end_of_a_data_set(datasets: Path, name: str) -> None:
+    """At the batch optimum, where both are linearised."""
+    assert datasets.is_dir()
+    graph = Solver(Options(mode="all-batch"))
+    problem: Problem = ask._problem(name, 0)
+    for batch in ask.load(problem):
+        graph.stage(batch)
+    graph.step(settle=True)
+    assert solve_batch(*graph.graph()).chi2 == pytest.approx(graph.chi2(), rel=1e-9)
+    _, worst = ask._gtsam(graph, Blocks(graph.factored()).diagonal())
+    assert worst < 1e-5
+    assert np.isfinite(worst)

@@ -1,0 +1,64 @@
+"""Every code that the source can give has a page."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from factorbus.cli.exits import OK, USAGE
+from factorbus.cli.explain import read_pages
+from factorbus.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
+# Bases of a tree of errors: never raised themselves.
+BASES = {"problem", "solver_error", "dataset"}
+
+
+def codes() -> set[str]:
+    """From the source: `code = "..."` in a class, and the first word of `Stopped(...)` and `Refused(...)`."""
+    found = set()
+    for root in ("proto", "service", "workers", "clients"):
+        for path in (ROOT / root / "factorbus").rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    found |= {
+                        each.value.value
+                        for each in node.body
+                        if isinstance(each, ast.Assign)
+                        and [t.id for t in each.targets if isinstance(t, ast.Name)] == ["code"]
+                        and isinstance(each.value, ast.Constant)
+                        and isinstance(each.value.value, str)
+                    }
+                if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Stopped", "Refused") and node.args:
+                    first = node.args[0]
+                    if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                        found.add(first.value)
+    return found
+
+
+def test_every_code_has_a_page() -> None:
+    pages, given = read_pages(), codes() - BASES
+    assert given - set(pages) == set(), "write what these mean, and what to do, into clients/factorbus/cli/codes.md"
+    assert "failed" in pages  # what an error without a code is shown as
+    assert list(pages) == sorted(pages)
+    assert all(len(text) > 40 for text in pages.values())
+
+
+def test_codes_of_the_wire_contract_have_pages() -> None:
+    import re
+
+    text = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
+    section = text[text.index("## 11. Problems") : text.index("## 12.")]
+    told = {code for row in re.findall(r"^\| (`.*?) \|", section, re.M) for code in re.findall(r"`([a-z_]+)`", row)}
+    assert len(told) > 20
+    assert told <= set(read_pages())
+
+
+def test_explain_says_it_and_guesses(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "[underconstrained]"]) == OK
+    said = capsys.readouterr().out
+    assert said.startswith("underconstrained\n\nThe factors leave a variable free to move")
+    assert main(["explain", "underconstraind"]) == USAGE
+    assert "did you mean underconstrained" in capsys.readouterr().err
+    assert main(["explain"]) == OK
+    assert len(capsys.readouterr().out.splitlines()) == len(read_pages())

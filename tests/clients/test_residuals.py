@@ -1,0 +1,50 @@
+"""Residuals for colouring: those of the dense twins, and in sum those of the solver."""
+
+import numpy as np
+import pytest
+from naive.dense_factors import residual
+from naive.random_graphs import random_steps
+
+from factorbus.cli.columns import merged
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.messages import Factors, Variables
+from factorbus.solver import Options, Solver
+from factorbus.viz.residuals import Values, factor_chi2
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(seed: int) -> None:
+    graph = merged(random_steps(seed))
+    solver = Solver(Options())
+    solver.stage(graph)
+    report = solver.step(settle=True)
+    variables = [Variables(g.kind, g.keys, g.values) for g in solver.estimate()]
+    size = {g.kind: VARIABLE_KINDS[g.kind].size for g in variables}
+    known = {k: v[: size[g.kind]] for g in variables for k, v in zip(g.keys.tolist(), g.values, strict=True)}
+    values, total = Values(variables), 0.0
+    for group in graph.factors:
+        found = factor_chi2(group, values)
+        assert np.isfinite(found).all(), group.kind
+        total += float(found.sum())
+        for keys, z, triangle, chi2 in zip(
+            group.keys.tolist(), group.measured, group.information, found.tolist(), strict=True
+        ):
+            r = residual(group.kind, [known[key] for key in keys], z)
+            omega = np.zeros((len(r), len(r)))
+            omega[np.triu_indices(len(r))] = triangle
+            omega = omega + np.triu(omega, 1).T
+            assert chi2 == pytest.approx(r @ omega @ r, rel=1e-9, abs=1e-12)
+    assert total == pytest.approx(report.chi2, rel=1e-9)
+
+
+def test_the_graphs_above_have_every_kind_but_sights() -> None:
+    kinds = {group.kind for seed in (1, 2, 3) for step in random_steps(seed) for group in step.factors}
+    assert kinds == set(FACTOR_KINDS) - {"idp_first", "idp_seen", "point_seen"}  # a lens is more than colours need
+
+
+def test_what_has_no_value_or_an_unknown_kind_is_nan_and_not_an_error() -> None:
+    values = Values([Variables("se2", np.array([7]), np.zeros((1, 3)))])
+    missing = Factors("prior_se2", np.array([[7], [8]]), np.ones((2, 3)), np.tile([1.0, 0, 0, 1, 0, 1], (2, 1)))
+    assert np.isnan(factor_chi2(missing, values)).tolist() == [False, True]
+    assert np.isnan(factor_chi2(missing._replace(kind="of_tomorrow"), values)).all()
+    assert np.isnan(factor_chi2(missing, Values([]))).all()

@@ -1,0 +1,192 @@
+"""`factorbus gateway`: what HTTP says is what the map has, and the page works in a real browser."""
+
+import json
+import signal
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import free_port, needs_browser, page_of, picture_of, share_of
+from processes import Process
+
+from factorbus.cli.exits import FAILED, OK
+from factorbus.cli.main import main
+from factorbus.client import Draft, connect
+from factorbus.proto.symbols import format_symbol
+from factorbus.simulate import city_trees, manhattan
+from factorbus.viz import style
+
+pytest.importorskip("starlette")
+
+
+@pytest.fixture
+def gateway(endpoint: str, spawn: Callable[..., Process]) -> str:
+    """The address of one."""
+    (address,) = spawn("-m", "factorbus.cli", "gateway", "--connect", endpoint, "--port", "0").ready()
+    return address
+
+
+def get(address: str, **headers: str) -> Any:
+    with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=60) as answer:
+        content = answer.read().decode()
+        return json.loads(content) if answer.headers["Content-Type"].startswith("application/json") else content
+
+
+def refusal(address: str, **headers: str) -> tuple[int, str]:
+    with pytest.raises(urllib.error.HTTPError) as raised:
+        get(address, **headers)
+    with raised.value as answer:
+        text = answer.read().decode()
+    return raised.value.code, json.loads(text)["problem"]["code"] if text.startswith("{") else text
+
+
+def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None:
+    with connect(endpoint, client="robot") as bus, bus.map("asked") as joined:
+        for step in city_trees(poses=80, seed=3):
+            joined.insert(step.batch)
+        snapshot, graph = joined.estimate.snapshot(), joined.graph().batch
+        root = f"{gateway}/api/maps/asked"
+        assert "asked" in [row["name"] for row in get(f"{gateway}/api/maps")["maps"]]
+        found = get(f"{root}/estimate")
+        assert (found["revision"], found["epoch"]) == (snapshot.revision, str(snapshot.epoch))
+        for group in found["variables"]:
+            keys, values = snapshot.columns[group["kind"]]
+            assert group["keys"] == [format_symbol(key) for key in keys.tolist()]
+            np.testing.assert_array_equal(group["values"], values)
+        assert sum(len(group["keys"]) for group in get(f"{root}/graph")["factors"]) == graph.factor_count
+        assert get(f"{root}/stats")["factors"] == graph.factor_count
+        assert get(f"{root}/export?format=kitti") == joined.export("kitti")
+        # Each factor is counted with each of its variables: the sum over variables is arity times χ².
+        explained = [
+            get(f"{root}/variables/{format_symbol(key)}")
+            for keys, _ in snapshot.columns.values()
+            for key in keys.tolist()
+        ]
+        assert sum(each["chi2"] for each in explained) == pytest.approx(2 * joined.chi2().chi2, rel=1e-9)
+
+
+def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:
+    """A wrong loop closure among good odometry: the variable's page says which factor misses."""
+    draft = Draft().se2("x0", (0, 0, 0), fixed=True)
+    for i in range(4):
+        draft.se2(f"x{i + 1}").between_se2(f"x{i}", f"x{i + 1}", (1.0, 0, 0), sigmas=(0.1, 0.1, 0.05))
+    draft.between_se2("x0", "x4", (2.0, 0, 0), sigmas=(0.3, 0.3, 0.1))
+    with connect(endpoint, client="robot") as bus, bus.map("wrong") as joined:
+        joined.insert(draft, settle=True)
+    said = get(f"{gateway}/api/maps/wrong/variables/x4")
+    assert said["factors"][0]["keys"] == ["x0", "x4"]
+    assert "between_se2 (x0, x4) contradicts the rest" in said["text"]
+    assert "fixed" in get(f"{gateway}/api/maps/wrong/variables/x0")["text"]
+
+
+def test_problems_have_their_codes(endpoint: str, gateway: str) -> None:
+    with connect(endpoint, client="robot") as bus, bus.map("small") as joined:
+        joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+    root = f"{gateway}/api/maps"
+    assert refusal(f"{root}/nowhere/estimate") == (404, "unknown_map")
+    assert refusal(f"{root}/not%20a%20name/estimate")[1] in ("bad_name", "unknown_map")
+    assert refusal(f"{root}/small/variables/x9") == (404, "unknown_variable")
+    assert refusal(f"{root}/small/variables/12x") == (400, "bad_symbol")
+    assert refusal(f"{root}/small/export?format=png") == (400, "unknown_question")
+    assert refusal(f"{root}/small/estimate", Host="evil.example")[0] == 400
+
+
+def test_a_page_from_elsewhere_gets_no_map(endpoint: str, gateway: str) -> None:
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect as dial
+
+    with connect(endpoint, client="robot") as bus, bus.map("guarded") as joined:
+        joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+    live = f"{gateway.replace('http', 'ws')}/api/maps/guarded/live"
+    with dial(live, origin="http://evil.example") as socket, pytest.raises(ConnectionClosed) as closed:  # type: ignore[arg-type]
+        socket.recv(timeout=30)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 4403
+    with dial(live) as socket:
+        assert json.loads(socket.recv(timeout=30))["variables"][0]["keys"] == ["x0"]
+
+
+def test_a_slow_browser_misses_no_value(endpoint: str, gateway: str) -> None:
+    """Everything that a WebSocket sends, applied in order, is the estimate, bit for bit."""
+    from websockets.sync.client import connect as dial
+
+    steps = list(manhattan(poses=150, seed=4))
+    with connect(endpoint, client="robot") as bus, bus.map("streamed") as joined:
+        for step in steps[:30]:
+            joined.insert(step.batch)
+        with dial(f"{gateway.replace('http', 'ws')}/api/maps/streamed/live", max_size=None) as socket:
+            for step in steps[30:]:
+                joined.insert(step.batch)
+            values, revision = {}, 0
+            while revision < joined.estimate.revision:
+                message = json.loads(socket.recv(timeout=30))
+                assert message["type"] == "estimate" or message["previous"] == revision
+                revision = message["revision"]
+                for group in message["variables"]:
+                    values |= dict(zip(group["keys"], group["values"], strict=True))
+        keys, wanted = joined.estimate.columns("se2")
+        assert values == dict(zip(map(format_symbol, keys.tolist()), wanted.tolist(), strict=True))
+
+
+@needs_browser
+def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> None:
+    """It loads, poses move, and a variable that is clicked is explained."""
+    steps = list(city_trees(poses=120, seed=2))
+    with connect(endpoint, client="robot") as bus, bus.map("town") as joined:
+        for step in steps[:60]:
+            joined.insert(step.batch)
+        with page_of(f"{gateway}/#town") as page:
+            failures: list[str] = []
+            page.on("pageerror", lambda error: failures.append(str(error)))
+            page.wait_for_function("window.factorbus.revision === 60", timeout=60_000)
+            before, where = picture_of(page), page.evaluate("window.factorbus.placeOf('x40')")
+            for step in steps[60:]:
+                joined.insert(step.batch)
+            joined.settle()
+            page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
+            assert page.evaluate("window.factorbus.placeOf('x40')")[:2] == joined.estimate["x40"][:2].tolist()
+            assert where != page.evaluate("window.factorbus.placeOf('x40')")
+            page.wait_for_function(f"window.factorbus.closures.revision === {joined.estimate.revision}", timeout=60_000)
+            after = picture_of(page)
+            assert (before != after).any(axis=2).mean() > 0.005
+            assert share_of(after, style.ESTIMATE) > 3e-4
+            assert share_of(after, style.POINTS) > 5e-5
+            x, y = page.evaluate("window.factorbus.pixelOf('x40')")
+            box = page.locator("#map").bounding_box()
+            page.mouse.click(box["x"] + x, box["y"] + y)
+            page.wait_for_selector("#panel h2")
+            name = page.inner_text("#panel h2")
+            assert np.hypot(*(joined.estimate[name][:2] - joined.estimate["x40"][:2])) < 1.0
+            assert f"{name} is a pose in the plane, held by" in page.inner_text("#panel")
+            factors = sum(int((g.keys == keys_of(name)).any(axis=1).sum()) for g in joined.graph().batch.factors)
+            assert page.locator("#panel tr").count() == factors + 1
+            page.screenshot(path=tmp_path / "page.png")  # for whoever wants to look
+            assert failures == []
+
+
+def keys_of(name: str) -> int:
+    from factorbus.proto.symbols import parse_symbol
+
+    return parse_symbol(name)
+
+
+def test_it_stops_with_browsers_connected_and_says_when_a_port_is_taken(
+    endpoint: str, spawn: Callable[..., Process], capsys
+) -> None:
+    from websockets.sync.client import connect as dial
+
+    with connect(endpoint, client="robot") as bus, bus.map("left") as joined:
+        joined.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        port = str(free_port())
+        process = spawn("-m", "factorbus.cli", "gateway", "--connect", endpoint, "--port", port)
+        (address,) = process.ready()
+        assert main(["gateway", "--connect", endpoint, "--port", port]) == FAILED
+        assert "[port_taken]" in capsys.readouterr().err
+        with dial(f"{address.replace('http', 'ws')}/api/maps/left/live") as socket:
+            socket.recv(timeout=30)
+            process.signal(signal.SIGTERM)
+            assert process.wait() == OK

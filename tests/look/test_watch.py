@@ -1,0 +1,93 @@
+"""`factorbus watch`: the recording holds what the map had, and the served page shows it in a real browser."""
+
+import signal
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import free_port, needs_browser, page_of, picture_of, share_of
+from processes import Process
+
+from factorbus.cli.exits import OK, REFUSED
+from factorbus.cli.main import main
+from factorbus.client import connect
+from factorbus.proto.messages import Variables
+from factorbus.simulate import city_trees, manhattan
+from factorbus.viz import style
+from factorbus.viz.geometry import rays_of
+
+pytest.importorskip("rerun")
+
+
+def rows(path: Path) -> dict[str, dict[int, dict[str, Any]]]:
+    """entity → revision → component → value, of an .rrd file."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, dict[int, dict[str, Any]]] = defaultdict(lambda: defaultdict(dict))
+    for chunk in RrdReader(str(path)).stream().to_chunks():
+        if chunk.is_static or "revision" not in chunk.timeline_names:
+            continue
+        for row in chunk.to_record_batch().to_pylist():
+            found[chunk.entity_path][row["revision"]] |= {k: v for k, v in row.items() if v is not None}
+    return found
+
+
+def test_the_recording_has_every_step_and_the_map_at_the_end(
+    endpoint: str, spawn: Callable[..., Process], tmp_path: Path
+) -> None:
+    steps = list(city_trees(poses=200, seed=2))
+    path = tmp_path / "town.rrd"
+    with connect(endpoint, client="robot") as bus, bus.map("watched") as joined:
+        for step in steps[:50]:
+            joined.insert(step.batch)
+        watcher = spawn("-m", "factorbus.cli", "watch", "watched", "--connect", endpoint, "--save", str(path))
+        assert watcher.ready() == [str(path)]
+        reports = [joined.insert(step.batch).report for step in steps[50:]]
+        last = joined.estimate.snapshot()
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+    found = rows(path)
+    chi2 = {revision: row["Scalars:scalars"] for revision, row in found["/plots/chi2"].items()}
+    assert [chi2[revision][0] for revision in range(51, 201)] == [report["chi2"] for report in reports]
+    strip = np.array(found["/map/trajectory/x"][200]["LineStrips3D:strips"][0])
+    np.testing.assert_allclose(strip[:, :2], last.columns["se2"][1][:, :2], rtol=1e-6, atol=1e-6)
+    trees = np.array(found["/map/landmarks"][200]["Points3D:positions"])
+    np.testing.assert_allclose(trees[:, :2], last.columns["point2"][1], rtol=1e-6, atol=1e-6)
+    assert reports[-1]["because"] in found["/log"][200]["TextLog:text"][0]
+
+
+@needs_browser
+def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Process]) -> None:
+    ports = ["--web-port", str(free_port()), "--data-port", str(free_port())]
+    with connect(endpoint, client="robot") as bus, bus.map("served") as joined:
+        for step in manhattan(poses=150, seed=2):
+            joined.insert(step.batch)
+        watcher = spawn("-m", "factorbus.cli", "watch", "served", "--connect", endpoint, "--serve", *ports)
+        (url,) = watcher.ready()
+        with page_of(url) as page:
+            end = time.monotonic() + 90
+            while share_of(picture_of(page), style.ESTIMATE) < 5e-4 and time.monotonic() < end:
+                page.wait_for_timeout(500)  # the viewer draws into a canvas: there is nothing else to wait on
+            assert share_of(picture_of(page), style.ESTIMATE) >= 5e-4
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+
+
+def test_rays_point_where_the_features_angles_say_and_end_at_the_horizon() -> None:
+    features = Variables("idp", np.array([1, 2]), np.array([[1.0, 2, 3, 0.3, -0.2, 0.25], [0, 0, 0, 0, 0, 1e-9]]))
+    rays = rays_of([features], horizon_m=30.0).places
+    np.testing.assert_array_equal(rays[0, 0], [1, 2, 3])
+    h = rays[0, 1] - rays[0, 0]
+    assert np.linalg.norm(h) == pytest.approx(4.0)
+    assert np.arctan2(h[0], h[2]) == pytest.approx(0.3)
+    assert np.arctan2(-h[1], np.hypot(h[0], h[2])) == pytest.approx(-0.2)
+    np.testing.assert_allclose(rays[1, 1], [0, 0, 30])
+
+
+def test_a_map_that_is_not_there_is_refused(endpoint: str, tmp_path: Path, capsys) -> None:
+    assert main(["watch", "nowhere", "--connect", endpoint, "--save", str(tmp_path / "a.rrd")]) == REFUSED
+    assert "[unknown_map]" in capsys.readouterr().err

@@ -1,0 +1,210 @@
+"""Journals on disk: what is written is read, what is wrong is found, and a folder has one owner."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factorbus.journal import chain
+from factorbus.journal.bundle import export_map, import_map
+from factorbus.journal.digest import digest_of
+from factorbus.journal.lock import own
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, NoJournal
+from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Fold
+from factorbus.journal.snapshots import file_of, read_snapshot, remove_strangers, write_snapshot
+from factorbus.journal.store import FORM, NAME, Saved, Store, create, open_store
+
+
+def entry(client: str, sequence: int, message: bytes = b"hello") -> Entry:
+    return Entry(client, sequence, digest_of(message), ACCEPTED, sequence, 10 * sequence, 1, b"", message)
+
+
+def fold(number: int, *entries: Entry) -> Fold:
+    return Fold(number, number, False, bytes([number]) * 16, entries)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    made = create(tmp_path / "m", "m", "inc-l", {"mode": "inc-l", "tol": 1e-3}, 77, "commit")
+    made.append([fold(1, entry("a", 1), entry("b", 1)), fold(2, entry("a", 2, b"more"))])
+    made.append([fold(3, entry("a", 3)._replace(outcome=REFUSED, problem=b"why"), entry("b", 2))])
+    return made
+
+
+def test_what_was_written_is_there_when_it_is_opened_again(store: Store) -> None:
+    store.close()
+    again = open_store(store.path.parent)
+    header = again.header()
+    assert (header.map, header.mode, header.options["tol"], header.epoch) == ("m", "inc-l", 1e-3, 77)
+    assert [(f.number, [(e.client, e.sequence) for e in f.entries]) for f in again.folds(1)] == [
+        (2, [("a", 2)]),
+        (3, [("a", 3), ("b", 2)]),
+    ]
+    assert again.last() == (3, 3, b"\x03" * 16)
+    assert again.at(2).chain == b"\x02" * 16
+    assert list(again.check()) == []
+    assert again.counts() == {"folds": 3, "inserts": 5, "clients": 2, "message_bytes": 24}
+
+
+def test_clients_are_where_they_were_and_the_one_heard_last_comes_last(store: Store) -> None:
+    assert [(s.client, s.next, [e.sequence for e in s.entries]) for s in store.senders(1, 10, 2)] == [
+        ("a", 4, [2, 3]),
+        ("b", 3, [1, 2]),
+    ]
+    assert [s.client for s in store.senders(1, 1, 5)] == ["b"]
+    store.begin_epoch(78, "a test")
+    assert store.senders(store.header().epochs[-1].fold, 10, 10) == []
+    store.append([fold(4, entry("a", 1))])
+    assert [(s.client, s.next) for s in store.senders(4, 10, 10)] == [("a", 2)]
+    assert list(store.check()) == [], "numbers begin anew in another epoch"
+
+
+def test_a_transaction_is_there_wholly_or_not_at_all(store: Store) -> None:
+    with pytest.raises(JournalFailed, match="UNIQUE"):
+        store.append([fold(4, entry("a", 4)), fold(3)])
+    assert store.last().fold == 3
+    assert len(list(store.folds())) == 3
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("UPDATE entry SET message = x'00' WHERE number = 3", "insert 2 of client a has other bytes"),
+        ("DELETE FROM fold WHERE number = 2", "fold 2 is missing"),
+        ("DELETE FROM entry WHERE number = 3", "client a has number 3 after 1"),
+        ("UPDATE entry SET fold = 9 WHERE number = 5", "fold 9, which is missing"),
+        ("UPDATE fold SET revision = 0 WHERE number = 3", "goes back from revision 2 to 0"),
+    ],
+)
+def test_check_finds_what_is_wrong(store: Store, damage: str, said: str) -> None:
+    store.close()
+    with sqlite3.connect(store.path) as database:
+        database.execute(damage)
+    database.close()
+    assert any(said in each for each in open_store(store.path.parent).check())
+
+
+def test_a_page_of_nonsense_is_damage_and_not_a_map(store: Store) -> None:
+    store.close()
+    size = store.path.stat().st_size
+    with store.path.open("r+b") as file:
+        for page in range(1, size // 4096):
+            file.seek(4096 * page)
+            file.write(os.urandom(4096))
+    again = open_store(store.path.parent)
+    with pytest.raises(JournalDamaged):
+        again.header()
+    with pytest.raises(JournalDamaged):
+        list(again.folds())
+    assert list(again.check())
+
+
+def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path) -> None:
+    store.close()
+    with sqlite3.connect(store.path) as database:
+        database.execute(f"PRAGMA user_version = {FORM + 1}")
+    database.close()
+    with pytest.raises(JournalVersion, match="a newer version wrote it") as caught:
+        open_store(store.path.parent)
+    assert caught.value.code == "journal_version"
+    store.path.write_bytes(b"not a database" * 100)
+    with pytest.raises(JournalDamaged):
+        open_store(store.path.parent)
+    with pytest.raises(NoJournal):
+        open_store(tmp_path / "nothing")
+
+
+def test_a_snapshot_comes_back_to_the_bit_or_not_at_all(tmp_path: Path) -> None:
+    state = {
+        "numbers": np.array([[1.5, -0.0], [np.nan, 0.0]]),
+        "none": np.zeros((0, 3)),
+        "many": np.arange(7),
+        "inner": {"list": [1, "two", None], "zero": np.zeros(5, np.int64)},
+    }
+    path = file_of(tmp_path, 12)
+    assert write_snapshot(path, state) == path.stat().st_size
+    back = read_snapshot(path)
+    assert back["inner"]["list"] == [1, "two", None]
+    for one, other in ((state["numbers"], back["numbers"]), (state["many"], back["many"])):
+        assert one.tobytes() == other.tobytes()  # type: ignore[attr-defined]
+    assert back["none"].shape == (0, 3)
+    content = bytearray(path.read_bytes())
+    for at in range(0, len(content), 7):
+        content[at] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="damaged or incomplete"):
+            read_snapshot(path)
+        content[at] ^= 1
+    path.write_bytes(content[:-1])
+    with pytest.raises(ValueError, match="damaged or incomplete"):
+        read_snapshot(path)
+
+
+def test_snapshots_that_nobody_noted_go(store: Store) -> None:
+    folder = store.path.parent
+    for number in (1, 2, 3):
+        write_snapshot(file_of(folder, number), {"n": number})
+        assert store.add_snapshot(Saved(number, "here", 10), 2) == ([1] if number == 3 else [])
+    (folder / "snapshot-4.part").write_bytes(b"begun")
+    remove_strangers(folder, {saved.fold for saved in store.snapshots()})
+    assert sorted(p.name for p in folder.glob("snapshot*")) == ["snapshot-2.fbs", "snapshot-3.fbs"]
+
+
+def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
+    write_snapshot(file_of(store.path.parent, 3), {"state": np.arange(5)})
+    store.add_snapshot(Saved(3, "here", 1), 2)
+    export_map(store.path.parent, tmp_path / "m.fbmap")  # while it is open for writing
+    import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
+    again = open_store(tmp_path / "other" / "n")
+    assert list(again.folds()) == list(store.folds())
+    assert (again.header().map, again.header().epoch) == ("n", 77)
+    assert read_snapshot(file_of(tmp_path / "other" / "n", 3))["state"].tolist() == [0, 1, 2, 3, 4]
+    with pytest.raises(JournalFailed, match="there is a map of that name"):
+        import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
+    (tmp_path / "broken").write_bytes((tmp_path / "m.fbmap").read_bytes()[:5000])
+    with pytest.raises(JournalDamaged):
+        import_map(tmp_path / "broken", tmp_path / "other" / "b")
+    assert sorted(p.name for p in (tmp_path / "other").iterdir()) == ["n"], "nothing half done is left"
+
+
+def test_one_owner_until_it_ends_however_it_ends(tmp_path: Path) -> None:
+    program = (
+        "import sys, pathlib; from factorbus.journal.lock import own; o = own(pathlib.Path(sys.argv[1]));"
+        "o.say('process 17 on mars'); print('mine', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as owner:
+        assert owner.stdout is not None
+        assert owner.stdout.readline() == "mine\n"
+        with pytest.raises(JournalInUse, match="process 17 on mars"):
+            own(tmp_path)
+        stop, told = threading.Event(), []
+        stop.set()
+        assert own(tmp_path, stop, told.append) is None
+        assert told == ["process 17 on mars"]
+        owner.send_signal(signal.SIGKILL)
+        taken = own(tmp_path, threading.Event())
+        assert taken is not None
+        taken.release()
+
+
+def test_the_chain_follows_values_and_not_accounts() -> None:
+    from factorbus.proto import codec
+    from factorbus.proto.messages import Delta, Variables
+
+    def delta(value: float, ms: float) -> bytes:
+        rows = (Variables("se2", np.array([1]), np.array([[value, 0.0, 0.0]])),)
+        return codec.encode_delta(Delta(1, 2, 1, rows, {"step_ms": ms}))
+
+    one = chain.follow(chain.START, delta(1.0, 3.0))
+    assert one == chain.follow(chain.START, delta(1.0, 4.0))
+    assert one != chain.follow(chain.START, delta(np.nextafter(1.0, 2.0), 3.0))
+    assert one != chain.follow(one, delta(1.0, 3.0))
+    assert NAME == "journal.db"

@@ -1,0 +1,324 @@
+"""Covariances from the tree of cliques, against dense inverses."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from naive.dense_covariances import DenseCovariance
+from naive.dense_least_squares import DenseGraph
+from naive.random_graphs import random_steps
+from naive.tree_records import tree_of
+
+from factorbus.simulate import city_trees, manhattan
+from factorbus.solver import FactorGroup, Group, Options, Solver, errors
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.relative import relative
+from factorbus.solver.covariance.why import UnknownFactor, why_factor, why_variable
+from factorbus.solver.factors import FACTOR_KINDS
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+
+MODES = ("tree", "inc-l", "all-batch")
+DIM = {name: kind.dim for name, kind in VARIABLE_KINDS.items()}
+
+
+def solved(seed: int, mode: str, steps: int = 6) -> Solver:
+    solver = Solver(Options(mode=mode))
+    for batch in random_steps(seed, steps=steps):
+        solver.stage(batch)
+        solver.step()
+    return solver
+
+
+def dense(solver: Solver, at_linearisation: bool = True) -> DenseCovariance:
+    """The twin, linearised where the solver's R is."""
+    graph = DenseGraph()
+    variables, factors = solver.graph()
+    graph.add(_Whole(variables, factors))
+    graph.kinds = dict.fromkeys(solver._graph.keys[: solver.variable_count].tolist(), "")  # in insertion order
+    for v, key in enumerate(graph.kinds):
+        kind = VARIABLE_KIND_OF_CODE[int(solver._graph.var[v, at.V_KIND])]
+        x = int(solver._graph.var[v, at.V_AT])
+        values = tree_of(solver).lin[0] if solver._tree and at_linearisation else solver._graph.values
+        graph.kinds[key], graph.values[key] = kind.name, values[x : x + kind.size].copy()
+    return DenseCovariance(graph)
+
+
+class _Whole:
+    def __init__(self, variables, factors) -> None:
+        self.variables, self.factors = variables, factors
+
+
+def close(found: np.ndarray, wanted: np.ndarray, tell: float = 1e-8) -> None:
+    """To a share `tell` of the largest entry."""
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=tell * max(np.abs(wanted).max(initial=0.0), 1e-12))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(MODES))
+def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
+    solver = solved(seed, mode)
+    twin, blocks = dense(solver), Blocks(solver.factored())
+    keys = solver._graph.keys[: solver.variable_count].tolist()
+    for v, found in enumerate(blocks.diagonal()):
+        d = DIM[twin.graph.kinds[keys[v]]]
+        close(found[:d, :d], twin.joint([keys[v]]), twin.tell)
+    rng = np.random.default_rng(seed)
+    some = rng.integers(0, len(keys), 5)
+    close(blocks.joint(some), twin.joint([keys[v] for v in some]), twin.tell)
+    first, second = rng.integers(0, len(keys), (2, 12))
+    for a, b, found in zip(first, second, blocks.pairs(first, second), strict=True):
+        da, db = (DIM[twin.graph.kinds[keys[v]]] for v in (a, b))
+        scale = np.sqrt(np.outer(*(np.diag(twin.joint([keys[v]])).max(initial=1e-12, keepdims=True) for v in (a, b))))
+        wanted = twin.joint([keys[a], keys[b]])[:da, da:]
+        np.testing.assert_allclose(found[:da, :db], wanted, rtol=0, atol=twin.tell * scale[0, 0])
+
+
+@pytest.mark.parametrize("ends", [(5, 1), (1, 5)])
+def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, int]) -> None:
+    solver = solved(3, "tree")
+    blocks, n = Blocks(solver.factored()), solver.variable_count
+    first, second = np.arange(0, 10) % min(ends[0], n), np.arange(0, 10) % min(ends[1], n)
+    dims = blocks.factored.dims
+    for a, b, found in zip(first, second, blocks.pairs(first, second), strict=True):
+        whole = blocks.joint(np.array([a, b]))
+        np.testing.assert_allclose(found[: dims[a], : dims[b]], whole[: dims[a], dims[a] :], rtol=1e-9, atol=1e-14)
+
+
+def test_in_place_is_what_the_copy_says() -> None:
+    solver = Solver(Options(mode="tree"))
+    for step in manhattan(200, 4):
+        solver.stage(step.batch)
+        solver.step()
+        last = solver.variable_count - 1
+        if last > 2:
+            some = np.array([last, last // 2 + 1])
+            found, blocks = solver.try_joint(some), Blocks(solver.factored())
+            assert found is not None
+            np.testing.assert_allclose(found, blocks.joint(some), rtol=1e-12, atol=0)
+            np.testing.assert_allclose(found[:3, :3], blocks.diagonal()[last, :3, :3], rtol=1e-9, atol=0)
+    assert Solver(Options(mode="inc-l")).try_joint(np.array([0])) is None
+
+
+def test_a_copy_stays_as_it_is_while_the_map_goes_on() -> None:
+    steps = [step.batch for step in manhattan(150, 2)]
+    solver = Solver(Options(mode="tree"))
+    for batch in steps[:100]:
+        solver.stage(batch)
+        solver.step()
+    early = Blocks(solver.factored())
+    before = Blocks(solver.factored()).diagonal().copy()
+    for batch in steps[100:]:
+        solver.stage(batch)
+        solver.step()
+    assert early.diagonal().tobytes() == before.tobytes()
+
+
+def test_making_r_anew_moves_nothing() -> None:
+    solver = solved(5, "inc-l")
+    before = solver._graph.values[: solver._graph.counts[at.VALUES]].tobytes()
+    copy = solver.factored()
+    assert solver._graph.values[: solver._graph.counts[at.VALUES]].tobytes() == before
+    assert copy.graph.values.tobytes() == before
+
+
+def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
+    """A few of every kind between variables of the map, off by some."""
+    rng, groups = np.random.default_rng(seed), []
+    of_kind: dict[str, list[np.ndarray]] = {}
+    for group in solver.estimate():
+        of_kind.setdefault(group.kind, []).append(group.keys)
+    for kind in FACTOR_KINDS.values():
+        if kind.code >= at.IDP_FIRST:  # what a camera sees is not drawn by chance
+            continue
+        ends = [np.concatenate(of_kind[end.name]) for end in kind.connects]
+        keys = np.array([[rng.choice(end) for end in ends] for _ in range(3)])
+        keys = keys[[len(set(row)) == len(row) for row in keys.tolist()]]
+        measured = rng.normal(0, 2, (len(keys), kind.size))
+        if kind.size == 7:
+            measured[:, 3:] /= np.linalg.norm(measured[:, 3:], axis=1, keepdims=True)
+        measured = np.abs(measured) if kind.name == "bearing_range_se2" else measured
+        J = rng.normal(size=(len(keys), kind.dim, kind.dim))
+        information = (J @ J.transpose(0, 2, 1) + np.eye(kind.dim))[:, *np.triu_indices(kind.dim)]
+        groups.append(FactorGroup(kind.name, keys, measured, information))
+    return groups
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_candidates_of_every_kind(seed: int) -> None:
+    solver = solved(seed, "all-batch")
+    twin, blocks = dense(solver), Blocks(solver.factored())
+    groups, k = candidates(solver, seed), 0
+    marks = blocks.factored.graph.mark()
+    found = judge_candidates(blocks, groups)
+    assert blocks.factored.graph.mark() == marks
+    for group in groups:
+        for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True):
+            r, T, noise = twin.innovation(group.kind, keys, z, upper)
+            d = len(r)
+            assert found.dims[k] == d
+            close(found.predicted[k, :d, :d], T, 1e-6)
+            np.testing.assert_allclose(found.distance[k], r @ np.linalg.solve(T + noise, r), rtol=1e-5)
+            gain = 0.5 * (np.linalg.slogdet(T + noise)[1] - np.linalg.slogdet(noise)[1])
+            np.testing.assert_allclose(found.gain[k], gain, rtol=1e-6, atol=1e-8)
+            k += 1
+    assert k == len(found.distance)
+
+
+def test_candidates_that_no_insert_could_bring_are_refused() -> None:
+    solver = solved(1, "tree")
+    blocks = Blocks(solver.factored())
+    group = candidates(solver, 1)[4]
+    marks = blocks.factored.graph.mark()
+    unknown = FactorGroup(group.kind, group.keys + 1000, group.measured, group.information)
+    with pytest.raises(errors.UnknownVariable):
+        judge_candidates(blocks, [group, unknown])
+    with pytest.raises(errors.NotPositiveDefinite):
+        judge_candidates(blocks, [FactorGroup(group.kind, group.keys, group.measured, -group.information)])
+    assert blocks.factored.graph.mark() == marks
+    assert judge_candidates(blocks, []).distance.size == 0
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
+    """Against differences of x_i⁻¹ x_j in its own tangent space, and the dense joint covariance."""
+    from naive.dense_factors import boxplus, pose_matrix, pose_vector
+
+    solver = solved(seed, "all-batch")
+    twin, blocks = dense(solver), Blocks(solver.factored())
+    rng = np.random.default_rng(seed)
+    keys, kinds = solver._graph.keys[: solver.variable_count].tolist(), twin.graph.kinds
+    poses = [v for v, key in enumerate(keys) if kinds[key] in ("se2", "se3")]
+    pairs = []
+    for _ in range(6):
+        i = int(rng.choice(poses))
+        fits = {"se2": ("se2", "point2"), "se3": ("se3", "point3")}[kinds[keys[i]]]
+        pairs.append((i, int(rng.choice([v for v in range(len(keys)) if kinds[keys[v]] in fits and v != i]))))
+    first, second = np.array(pairs).T
+
+    def seen(x: np.ndarray, kind: str, y: np.ndarray) -> np.ndarray:
+        if kind.startswith("se"):
+            return pose_vector(np.linalg.inv(pose_matrix(x)) @ pose_matrix(y))
+        return (np.linalg.inv(pose_matrix(x)) @ np.append(y, 1.0))[:-1]
+
+    def change(kind: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """δ with a ⊞ δ = b, to first order."""
+        if not kind.startswith("se"):
+            return b - a
+        E = pose_vector(np.linalg.inv(pose_matrix(a)) @ pose_matrix(b))
+        return E if len(E) == 3 else np.concatenate([E[:3], 2 * E[3:6]])
+
+    for group in relative(blocks, first, second):
+        for row, value, covariance in zip(group.rows, group.values, group.covariance, strict=True):
+            i, j = keys[first[row]], keys[second[row]]
+            x, y, kind = twin.graph.values[i], twin.graph.values[j], kinds[j]
+            z, h, columns = seen(x, kind, y), 1e-6, []
+            moved = [(kinds[i], x, True, c) for c in range(DIM[kinds[i]])] + [
+                (kind, y, False, c) for c in range(DIM[kind])
+            ]
+            for which, value_of, is_first, c in moved:
+                step = np.zeros(DIM[which])
+                step[c] = h
+                there, back = boxplus(which, value_of, step), boxplus(which, value_of, -step)
+                up = seen(there, kind, y) if is_first else seen(x, kind, there)
+                down = seen(back, kind, y) if is_first else seen(x, kind, back)
+                columns.append((change(kind, z, up) - change(kind, z, down)) / (2 * h))
+            H = np.column_stack(columns)
+            wanted = H @ twin.joint([i, j]) @ H.T
+            np.testing.assert_allclose(covariance, wanted, rtol=0, atol=1e-6 * np.abs(wanted).max() + 1e-12)
+            assert np.abs(change(kind, z, value)).max() < 1e-9
+
+
+def test_relative_to_a_point_is_refused() -> None:
+    solver = solved(2, "tree")
+    blocks, graph = Blocks(solver.factored()), solver._graph
+    point = next(v for v in range(solver.variable_count) if graph.var[v, at.V_KIND] == at.POINT2)
+    with pytest.raises(errors.KindMismatch):
+        relative(blocks, np.array([point]), np.array([0]))
+    with pytest.raises(errors.SelfLoop):
+        relative(blocks, np.array([0]), np.array([0]))
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_why_a_factor(seed: int) -> None:
+    """χ² without a factor, and how much of it is known from it, by solving without it."""
+    solver = solved(seed, "all-batch", steps=4)
+    twin, blocks = dense(solver), Blocks(solver.factored())
+    influence = 0.0
+    for factor in range(solver.factor_count):
+        account = why_factor(blocks, factor)
+        keys = list(account.keys)
+        kind, _, z, W = next(each for each in twin.graph.factors if each[0] == account.kind and each[1] == keys)
+        r, T, noise = twin.innovation(kind, keys, z, W[np.triu_indices(len(W))])
+        np.testing.assert_allclose(account.chi2, r @ W @ r, rtol=1e-7, atol=1e-12)
+        np.testing.assert_allclose(account.influence, np.trace(W @ T), rtol=1e-6, atol=1e-8)
+        influence += account.influence
+        if account.without is not None:
+            np.testing.assert_allclose(account.without, r @ np.linalg.solve(noise - T, r), rtol=1e-4, atol=1e-9)
+    # All factors together know as much as there is to know.
+    assert influence == pytest.approx(len(twin.sigma), rel=1e-8)
+    with pytest.raises(UnknownFactor):
+        why_factor(blocks, solver.factor_count)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_why_a_variable(mode: str) -> None:
+    solver = solved(7, mode, steps=8)
+    twin, blocks = dense(solver), Blocks(solver.factored())
+    for v in range(solver.variable_count):
+        account = why_variable(blocks, v, keeps_steps=mode == "tree")
+        assert account.fixed == (solver._graph.var[v, at.V_COLUMN] < 0)
+        assert [each.factor for each in account.factors] == sorted(each.factor for each in account.factors)
+        assert len(account.factors) == len(solver._graph.factors_of(v))
+        if account.fixed:
+            assert not account.sigmas.any()
+            continue
+        close(account.sigmas**2, np.diag(twin.joint([account.key])), twin.tell)
+        assert 0 < account.conditioning <= 1 + 1e-3
+        assert account.pivot >= 1 / account.sigmas.max() * (1 - 1e-9)
+        assert (account.linearised_step >= 1) == (mode == "tree")
+        assert account.as_dict()["factors"][0]["keys"]
+
+
+def kept_up(solver: Solver, batches) -> float:
+    """Follow a drive; the largest difference of a block to that from the whole recursion, after any step."""
+    upkeep, worst = solver.try_upkeep(), 0.0
+    assert upkeep is not None
+    for batch in batches:
+        solver.stage(batch)
+        solver.step()
+        upkeep.update()
+        wanted = Blocks(solver.factored()).diagonal()
+        width = wanted.shape[1]
+        scale = np.abs(wanted).max(axis=(1, 2), initial=1e-300)[:, None, None]
+        worst = max(worst, float((np.abs(upkeep.diagonal()[:, :width, :width] - wanted) / scale).max()))
+    assert upkeep.anew < solver.variable_count
+    return worst
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_blocks_kept_up_are_those_computed_anew_after_every_step(seed: int) -> None:
+    assert kept_up(Solver(Options(mode="tree")), [step.batch for step in manhattan(400, seed)]) < 1e-8
+    assert kept_up(Solver(Options(mode="tree")), [step.batch for step in city_trees(150, seed)]) < 1e-8
+
+
+def test_blocks_are_kept_up_over_steps_that_were_missed_or_refused() -> None:
+    steps = [step.batch for step in manhattan(120, 8)]
+    solver = Solver(Options(mode="tree"))
+    upkeep = solver.try_upkeep()
+    assert upkeep is not None
+    for n, batch in enumerate(steps):
+        solver.stage(batch)
+        solver.step()
+        if n % 7 == 3:
+            solver.stage(_Whole((Group("point2", np.array([-5]), np.zeros((1, 2))),), ()))
+            with pytest.raises(errors.Underconstrained):
+                solver.step()
+        if n % 3 == 0:
+            upkeep.update()
+            wanted = Blocks(solver.factored()).diagonal()
+            np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)

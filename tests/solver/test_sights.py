@@ -1,0 +1,384 @@
+"""What cameras in a map see: against dense twins and GTSAM, in every mode; what cannot be seen; losses."""
+
+import gtsam
+import numpy as np
+import pytest
+from naive import dense_idp
+from naive.dense_factors import boxplus, camera_of
+from naive.dense_least_squares import DenseGraph, distance, rho, weight
+from naive.random_graphs import camera_steps
+from naive.random_sightings import CAMERAS
+from naive.random_sights import SIGHTS, measurement, random_sight, state_of
+
+from factorbus.proto.camera import Camera
+from factorbus.proto.kinds import LOSSES
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.factors import FACTOR_KINDS
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.linearise import evaluate_one
+from factorbus.solver.kernels.sights import ASLEEP
+
+X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
+LEVEL = np.array([0.0, 0, 0, 0, 0, 0, 1])
+PINHOLE = CAMERAS["pinhole"]
+TIGHT = {"tolerance": 0.0, "tol": 0.0, "negligible": 1e-20, "max_iterations": 200}
+
+
+def unit(dim: int) -> np.ndarray:
+    return np.eye(dim)[np.triu_indices(dim)][None]
+
+
+def sight_map(
+    kind: str, pose: np.ndarray, end: np.ndarray, z: np.ndarray, loss: str = "", scale: float = 1.0
+) -> Solver:
+    """A map of one camera, one thing that it sees, and priors on all."""
+    seen = "point3" if kind == "point_seen" else "idp"
+    loose = Factors(kind, np.array([[X, F]]), z[None], unit(6 if kind == "idp_first" else 2))
+    factors = [loose._replace(loss=loss, scale=np.array([scale]) if loss else None)]
+    factors.append(Factors("prior_se3", np.array([[X]]), pose[None], unit(6)))
+    if kind == "point_seen":
+        factors.append(Factors("prior_point3", np.array([[F]]), end[None], unit(3)))
+    if kind == "idp_seen":
+        first = measurement("idp_first", camera_of(z[2:]), z[:2])
+        factors.append(Factors("idp_first", np.array([[X, F]]), first[None], unit(6)))
+    solver = Solver(Options(mode="all-batch"))
+    variables = Variables("se3", np.array([X]), pose[None]), Variables(seen, np.array([F]), end[None])
+    solver.stage(Batch(variables, tuple(factors)))
+    return solver
+
+
+def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """r, A, B, whole."""
+    graph = solver._graph
+    r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
+    evaluate_one(factor, graph.var, graph.fac, graph.values, graph.payload, r, A, B)
+    return r, A, B
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("kind", SIGHTS)
+def test_every_lens_gives_the_residual_of_the_dense_twin(kind: str, name: str) -> None:
+    for seed in range(4):
+        camera, (pose, end), z = random_sight(kind, np.random.default_rng(seed), name)
+        r, _, _ = evaluated(sight_map(kind, pose, end, z))
+        if kind == "point_seen":
+            pixel = dense_idp.pixel(camera, dense_idp.matrix(pose[[6, 3, 4, 5]]).T @ (end - pose[:3]))
+        else:
+            pixel = dense_idp.observed(camera, state_of(pose), end)
+        row = 3 if kind == "idp_first" else 0
+        np.testing.assert_allclose(r[row : row + 2], pixel - z[:2], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("seed", range(2))
+def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
+    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "look_every": 1, "rounds": 40} if mode == "tree" else {}
+    solver, twin = Solver(Options(mode=mode, **TIGHT, **tree)), DenseGraph()
+    for batch in camera_steps(seed):
+        solver.stage(batch)
+        report = solver.step()
+        twin.add(batch)
+        twin.put(solver.estimate())
+        assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-7)
+        assert twin.gauss_newton(iterations=2) < 1e-7
+        assert report.asleep == 0
+        for group in solver.estimate():
+            for key, value in zip(group.keys.tolist(), group.values, strict=True):
+                assert distance(group.kind, value, twin.values[key]) < 1e-6
+
+
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_robust_estimates_are_where_the_twins_gradient_is_zero(loss: str, mode: str) -> None:
+    solver, twin = Solver(Options(mode=mode)), DenseGraph()
+    for batch in camera_steps(3, loss=loss):
+        solver.stage(batch)
+        twin.add(batch)
+        solver.step()
+    report = solver.step(settle=True)
+    twin.put(solver.estimate())
+    assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
+    assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-9)
+    information, eta = twin.system()
+    assert np.abs(eta / np.sqrt(np.diag(information))).max() < 1e-3
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("kind", [*SIGHTS, "between_se3"])
+def test_a_loss_weighs_residual_and_jacobians_by_its_slope(kind: str, loss: str) -> None:
+    rng = np.random.default_rng(5)
+    for shift in (0.1, 1.0, 3.0, 60.0):
+        if kind == "between_se3":
+            poses = [LEVEL, boxplus("se3", LEVEL, 0.1 * rng.normal(size=6))]
+            z = boxplus("se3", poses[1], np.array([shift, 0, 0, 0, 0, 0]))[None]
+            maps = []
+            for name in ("", loss):
+                factor = Factors("between_se3", np.array([[0, 1]]), z, unit(6), name, np.array([2.0]) if name else None)
+                maps.append(Solver())
+                maps[-1].stage(Batch((Variables("se3", np.array([0, 1]), np.array(poses)),), (factor,)))
+        else:
+            _, (pose, end), z = random_sight(kind, rng, "radtan")
+            z[0] += shift
+            maps = [sight_map(kind, pose, end, z), sight_map(kind, pose, end, z, loss, 2.0)]
+        (r, A, B), (r_w, A_w, B_w) = map(evaluated, maps)
+        dim = FACTOR_KINDS[kind].dim
+        s = r[:dim] @ r[:dim]
+        root = np.sqrt(weight(loss, 2.0, s))
+        for plain, soft in ((r[:dim], r_w[:dim]), (A[:dim], A_w[:dim]), (B[:dim], B_w[:dim])):
+            np.testing.assert_allclose(soft, root * plain, rtol=1e-4, atol=1e-9)
+        for solver in maps:
+            for group in solver.graph()[1]:
+                assert (group.loss, group.scale) == ("", None) or (group.loss, *group.scale) == (loss, 2.0)
+        if kind == "between_se3" or root == 0.0:  # with no weight at all a feature is not held
+            continue
+        priors = maps[0].step().chi2_before - s
+        assert maps[1].step().chi2_before == pytest.approx(rho(loss, 2.0, s) + priors, rel=1e-9)
+
+
+def test_a_feature_without_a_value_is_where_its_first_sight_has_no_residual() -> None:
+    for name, camera in CAMERAS.items():
+        _, (pose, _), z = random_sight("idp_first", np.random.default_rng(7), name)
+        solver = Solver()
+        solver.stage(
+            Batch(
+                (Variables("se3", np.array([X]), pose[None], True), Variables("idp", np.array([F]))),
+                (Factors("idp_first", np.array([[X, F]]), z[None], unit(6)),),
+            )
+        )
+        np.testing.assert_allclose(evaluated(solver)[0][:6], 0.0, atol=1e-9)
+        y = solver.graph()[0][1].values[0]
+        np.testing.assert_allclose(y, dense_idp.feature(camera, state_of(pose), z[:2], z[2]), atol=1e-9)
+        assert solver.step().chi2 == pytest.approx(0.0, abs=1e-15)
+
+
+BEHIND, FOLDING = np.array([0.0, 0, -2]), Camera("radtan", (400.0, 400, 320, 240, -0.3, 0, 0, 0))
+CENTRE = np.array([320.0, 240.0])
+
+
+def point_batch(z: np.ndarray, place: np.ndarray = np.array([0.0, 0, 2])) -> Batch:  # noqa: B008
+    variables = Variables("se3", np.array([X]), LEVEL[None], True), Variables("point3", np.array([P]), place[None])
+    prior = Factors("prior_point3", np.array([[P]]), place[None], unit(3))
+    return Batch(variables, (prior, Factors("point_seen", np.array([[X, P]]), z[None], unit(2))))
+
+
+def lens(index: int, value: float) -> np.ndarray:
+    z = measurement("point_seen", PINHOLE, CENTRE)
+    z[2 + index] = value
+    return z
+
+
+def downwards(z: np.ndarray) -> Batch:
+    down = np.array([0.0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    variables = Variables("se3", np.array([X]), down[None], True), Variables("idp", np.array([F]))
+    return Batch(variables, (Factors("idp_first", np.array([[X, F]]), z[None], unit(6)),))
+
+
+REFUSED = {
+    "behind": ("bad_sight", "behind", point_batch(measurement("point_seen", PINHOLE, CENTRE), BEHIND)),
+    "no ray": ("bad_sight", "one to one", point_batch(measurement("point_seen", FOLDING, np.array([900.0, 240])))),
+    "vertical": ("bad_sight", "azimuth", downwards(measurement("idp_first", PINHOLE, CENTRE))),
+    "model": ("bad_lens", "model 7", point_batch(lens(0, 7.0))),
+    "focal length": ("bad_lens", "focal", point_batch(lens(1, 0.0))),
+    "limit": ("bad_lens", "limit", point_batch(lens(5, -1.0))),
+    "NaN": ("not_finite", "point_seen", point_batch(lens(6, np.nan))),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_no_camera_can_see_is_refused_with_the_reason(name: str) -> None:
+    code, says, batch = REFUSED[name]
+    solver = Solver()
+    with pytest.raises(errors.SolverError, match=says) as caught:
+        solver.stage(batch)
+    assert caught.value.code == code
+    assert (solver.variable_count, solver.factor_count) == (0, 0)
+
+
+@pytest.mark.parametrize(("loss", "scale"), [("welsch", np.ones(1)), ("huber", None), ("huber", np.zeros(1))])
+def test_losses_that_are_none_are_refused(loss: str, scale: np.ndarray | None) -> None:
+    batch = point_batch(measurement("point_seen", PINHOLE, CENTRE))
+    bad = Batch(batch.variables, (batch.factors[0], batch.factors[1]._replace(loss=loss, scale=scale)))
+    with pytest.raises(errors.BadLoss):
+        Solver().stage(bad)
+
+
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> None:
+    """A strong prior pulls a point behind the camera that saw it."""
+    solver = Solver(Options(mode=mode))
+    solver.stage(point_batch(measurement("point_seen", PINHOLE, CENTRE)))
+    assert solver.step(settle=True).asleep == 0
+    assert solver.asleep() == []
+    solver.stage(Batch((), (Factors("prior_point3", np.array([[P]]), BEHIND[None], 1e6 * unit(3)),)))
+    solver.step()
+    report = solver.step(settle=True)
+    assert report.asleep == 1
+    [(factor, text, why)] = solver.asleep()
+    assert (factor, text) == (1, "point_seen (x0, p0)")
+    assert "behind" in why
+    weak, strong = np.array([0.0, 0, 2]), BEHIND
+    place = (weak + 1e6 * strong) / (1e6 + 1)
+    np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
+    assert solver.chi2() == pytest.approx(ASLEEP + 16.0, rel=1e-3)
+
+
+def test_a_point_by_two_pixels_and_a_camera_by_its_points_are_held() -> None:
+    """None of them has anything else that holds it; nothing is factorised to find that out."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-1, -1, 4), (1, 1, 6), (6, 3))
+    cameras = [boxplus("se3", LEVEL, np.array([0.4 * n, 0, 0, 0, 0.02 * n, 0])) for n in range(3)]
+
+    def seen(n: int) -> Factors:
+        R, t = dense_idp.matrix(cameras[n][[6, 3, 4, 5]]), cameras[n][:3]
+        z = [measurement("point_seen", PINHOLE, dense_idp.pixel(PINHOLE, R.T @ (p - t))) for p in points]
+        keys = [[symbol("x", n), symbol("p", k)] for k in range(6)]
+        return Factors("point_seen", np.array(keys), np.array(z), np.repeat(unit(2), 6, 0))
+
+    for mode in ("inc-l", "tree"):
+        solver = Solver(Options(mode=mode))
+        keys = np.array([symbol("x", 0), symbol("x", 1)])
+        fixed = Variables("se3", keys, np.array(cameras[:2]), fixed=True)
+        new = Variables("point3", np.array([symbol("p", k) for k in range(6)]), points + 0.05 * rng.normal(size=(6, 3)))
+        solver.stage(Batch((fixed, new), (seen(0), seen(1))))
+        assert "together" not in solver.step().because
+        third = Variables(
+            "se3", np.array([symbol("x", 2)]), boxplus("se3", cameras[2], 0.02 * rng.normal(size=6))[None]
+        )
+        solver.stage(Batch((third,), (seen(2),)))
+        assert "together" not in solver.step().because
+        assert solver.step(settle=True).chi2 < 1e-12
+
+
+def test_the_optimum_is_gtsams() -> None:
+    """Points seen by cameras through a distorting lens: GTSAM's Cal3DS2 has the same pixels, so the same optimum."""
+    camera, rng = CAMERAS["radtan"], np.random.default_rng(4)
+    fx, fy, cx, cy, k1, k2, p1, p2, _ = camera.numbers
+    camera = Camera("radtan", (fx, fy, cx, cy, k1, k2, p1, p2))
+    calibration = gtsam.Cal3DS2(fx, fy, 0.0, cx, cy, k1, k2, p1, p2)
+    points = rng.uniform((-1.5, -1, 4), (1.5, 1, 7), (12, 3))
+    cameras = [boxplus("se3", LEVEL, np.array([0.3 * n, 0.1 * n, 0, 0, 0.03 * n, 0.01])) for n in range(5)]
+    theirs, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pixel_noise = gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
+    keys, measured = [], []
+    for n, pose in enumerate(cameras):
+        R = gtsam.Rot3.Quaternion(pose[6], *pose[3:6])
+        guess = boxplus("se3", pose, 0.02 * rng.normal(size=6)) if n else pose
+        start.insert(n, gtsam.Pose3(gtsam.Rot3.Quaternion(guess[6], *guess[3:6]), guess[:3]))
+        if n < 2:
+            tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+            theirs.add(gtsam.PriorFactorPose3(n, gtsam.Pose3(R, pose[:3]), tight))
+        for k, p in enumerate(points):
+            pixel = dense_idp.pixel(camera, dense_idp.matrix(pose[[6, 3, 4, 5]]).T @ (p - pose[:3])) + rng.normal(
+                size=2
+            )
+            factor = gtsam.GenericProjectionFactorCal3DS2(pixel, pixel_noise, n, 100 + k, calibration)
+            theirs.add(factor)
+            keys.append([n, 100 + k])
+            measured.append(measurement("point_seen", camera, pixel))
+        cameras[n] = guess if n > 1 else pose
+    for k, p in enumerate(points):
+        start.insert(100 + k, p)
+    solver = Solver()
+    fixed = Variables("se3", np.array([0, 1]), np.array(cameras[:2]), fixed=True)
+    free = Variables("se3", np.array([2, 3, 4]), np.array(cameras[2:]))
+    factors = Factors("point_seen", np.array(keys), np.array(measured), np.repeat(unit(2), len(keys), 0))
+    solver.stage(Batch((fixed, free, Variables("point3", np.arange(100, 112), points)), (factors,)))
+    report = solver.step(settle=True)
+    optimum = gtsam.LevenbergMarquardtOptimizer(theirs, start).optimize()
+    assert report.chi2 == pytest.approx(2 * theirs.error(optimum), rel=1e-4)
+    found = {
+        key: value for group in solver.estimate() for key, value in zip(group.keys.tolist(), group.values, strict=True)
+    }
+    for k in range(12):
+        np.testing.assert_allclose(found[100 + k], optimum.atPoint3(100 + k), atol=2e-3)
+
+
+def drive_past(solver: Solver, frames: int = 8, features: int = 12, noise: float = 0.5) -> Camera:
+    """Features ahead of a camera that goes sideways, its first two poses known."""
+    rng, camera = np.random.default_rng(9), CAMERAS["radtan"]
+    truth = rng.uniform((-0.5, -1, 4), (3.0, 1, 9), (features, 3))
+    for n in range(frames):
+        pose = boxplus("se3", LEVEL, np.array([0.35 * n, 0, 0, 0, 0.02 * n, 0]))
+        R = dense_idp.matrix(pose[[6, 3, 4, 5]])
+        variables, factors = [Variables("se3", np.array([symbol("x", n)]), pose[None], fixed=n < 2)], []
+        if n >= 2:
+            prior = Factors("prior_se3", np.array([[symbol("x", n)]]), pose[None], 1e2 * unit(6))
+            factors.append(prior)
+        for k, p in enumerate(truth):
+            pixel = dense_idp.pixel(camera, R.T @ (p - pose[:3])) + noise * rng.normal(size=2)
+            keys = np.array([[symbol("x", n), symbol("f", k)]])
+            if n == 0:
+                variables.append(Variables("idp", np.array([symbol("f", k)])))
+                info = np.diag([1e8, 1e8, 1e8, 4, 4, 1 / 0.25**2])[np.triu_indices(6)][None]
+                z = measurement("idp_first", camera, pixel, 0.2)
+                factors.append(Factors("idp_first", keys, z[None], info, "huber", np.array([2.0])))
+            else:
+                z = measurement("idp_seen", camera, pixel)
+                factors.append(Factors("idp_seen", keys, z[None], 4 * unit(2), "huber", np.array([2.0])))
+        solver.stage(Batch(tuple(variables), tuple(factors)))
+        solver.step()
+    return camera
+
+
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
+    solver = Solver(Options(mode=mode))
+    drive_past(solver)
+    before = solver.step(settle=True)
+    features = next(group for group in solver.estimate() if group.kind == "idp")
+    ripe = solver.ripe(0.1)
+    assert ripe.size > 0
+    assert set(ripe.tolist()) <= set(features.keys.tolist())
+    assert solver.ripe(1e9).size == 12
+    assert solver.ripe(0.0).size == 0
+    made, report = solver.with_points(features.keys)
+    settled = made.step(settle=True)
+    assert (made.variable_count, made.factor_count) == (solver.variable_count, solver.factor_count)
+    assert settled.chi2 == pytest.approx(before.chi2, rel=0.05)
+    assert report.chi2 <= report.chi2_before
+    kinds = {group.kind for group in made.estimate()}
+    assert kinds == {"se3", "point3"}
+    points = next(group for group in made.estimate() if group.kind == "point3")
+    np.testing.assert_array_equal(points.keys, features.keys)
+    for y, p in zip(features.values, points.values, strict=True):
+        assert np.linalg.norm(dense_idp.point(y) - p) < 0.01 * np.linalg.norm(p)
+    poses = [next(g for g in s.estimate() if g.kind == "se3" and not g.fixed).values for s in (solver, made)]
+    np.testing.assert_allclose(poses[0], poses[1], atol=2e-3)
+    # What comes later may still be sent as sights of features.
+    camera, key, p = CAMERAS["radtan"], int(points.keys[0]), points.values[0]
+    pose = boxplus("se3", LEVEL, np.array([2.9, 0, 0, 0, 0.16, 0]))
+    z = measurement(
+        "idp_seen", camera, dense_idp.pixel(camera, dense_idp.matrix(pose[[6, 3, 4, 5]]).T @ (p - pose[:3]))
+    )
+    again = Factors("idp_seen", np.array([[symbol("x", 20), key]]), z[None], unit(2))
+    held = Variables("se3", np.array([symbol("x", 20)]), pose[None], fixed=True)
+    made.stage(Batch((held,), (again,)))
+    assert made.step().chi2 == pytest.approx(settled.chi2, rel=1e-3)
+    counts = {(group.kind, group.loss): len(group.keys) for group in made.graph()[1]}
+    assert counts == {("point_seen", ""): 1, ("point_seen", "huber"): 12 * 8, ("prior_se3", ""): 6}
+    with pytest.raises(errors.KindMismatch, match="idp"):
+        made.with_points(points.keys)
+    with pytest.raises(errors.UnknownVariable):
+        solver.with_points(np.array([symbol("f", 99)]))
+
+
+def test_the_linearity_index_is_the_papers() -> None:
+    """σ_ρ by the dense inverse of the feature's own information, cameras held."""
+    solver, twin = Solver(Options(mode="all-batch")), DenseGraph()
+    drive_past(solver)
+    solver.step(settle=True)
+    variables, factors = solver.graph()
+    twin.add(Batch(tuple(variables), tuple(factors)))
+    twin.put(variables)
+    twin.fixed |= {key for key, kind in twin.kinds.items() if kind == "se3"}
+    covariance = np.linalg.inv(twin.system()[0])
+    last = twin.values[symbol("x", 7)][:3]
+    for key, start in twin.starts().items():
+        y = twin.values[key]
+        p, sigma = dense_idp.point(y), np.sqrt(covariance[start + 5, start + 5])
+        cosine = (p - last) @ dense_idp.direction(y) / np.linalg.norm(p - last)
+        index = 4 * sigma / y[5] ** 2 * abs(cosine) / np.linalg.norm(p - last)
+        assert key in solver.ripe(index * 1.001).tolist()
+        assert key not in solver.ripe(index * 0.999).tolist()

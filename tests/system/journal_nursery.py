@@ -1,0 +1,54 @@
+"""A process that has everything imported and compiled, and forks services: so that many can be killed in a short time.
+
+    python journal_nursery.py FOLDER [SETTING=VALUE ...]     reads `start ENDPOINT`; prints `born PID`, `ready ENDPOINT`
+
+It forks before anything of Zenoh is there; the children are services like any other, with a journal in FOLDER.
+"""
+
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+
+from factorbus import idp, solver
+from factorbus.proto.problems import Problem
+from factorbus.service.app import serve
+from factorbus.service.config import Config, checked
+
+
+def main() -> None:
+    """Fork a service for every line, until there are no more."""
+    folder, *settings = sys.argv[1:]
+    given = {name: json.loads(value) for name, _, value in (text.partition("=") for text in settings)}
+    logging.basicConfig(level=logging.INFO, format="%(process)d %(message)s")
+    solver.warm()
+    idp.warm()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    print("nursery", flush=True)
+    for line in sys.stdin:
+        endpoint = line.split()[1]
+        pid = os.fork()
+        if pid == 0:
+            os.close(0)
+            run(checked(Config(listen=(endpoint,), journal=folder, warm=False, create=("m",), **given)))
+        print("born", pid, flush=True)
+
+
+def run(config: Config) -> None:
+    """Serve until SIGTERM; never returns."""
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    code = 0
+    try:
+        serve(config, lambda endpoints: print("ready", *endpoints, flush=True), stop)
+    except Problem as problem:
+        print("cannot", problem.code, flush=True)
+        logging.error("%s", problem)
+        code = 2
+    os._exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""What a stuck or hostile client costs the others: inserts of an honest one are timed before and while it is there."""
+
+import json
+import socket
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bare import bare
+from processes import Process
+
+from factorbus.client import Draft, connect
+from factorbus.client.map import Map
+
+Spawn = Callable[..., Process]
+HOSTILE = str(Path(__file__).parent / "hostile.py")
+INSERTS = 150
+# The machine that runs this may be busy with other things; what it must not be is a second per insert, which is what
+# one full queue to somebody who does not read would cost whoever shared a thread with it.
+SLOWER, BESIDES_S, LONGEST_S = 5.0, 0.02, 0.9
+
+
+@pytest.fixture
+def service(tmp_path: Path, spawn: Spawn) -> str:
+    settings = tmp_path / "serve.toml"
+    # No front end here inserts 20,000 poses at once, so none may: who may has the solver for as long as that takes.
+    settings.write_text("[limits]\nsessions = 200\ninsert_variables = 1000\n")
+    process = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
+    return process.ready()[0]
+
+
+def times(driven: Map, first: int, count: int = INSERTS) -> list[float]:
+    """Seconds from sending to answer."""
+    seconds = []
+    for n in range(first, first + count):
+        draft = Draft().se2(f"x{n}").between_se2(f"x{n - 1}", f"x{n}", (1, 0, 0.1), sigmas=(0.1, 0.1, 0.02))
+        begun = time.perf_counter()
+        driven.insert(draft, timeout_s=30)
+        seconds.append(time.perf_counter() - begun)
+        time.sleep(0.005)
+    return seconds
+
+
+@pytest.mark.parametrize("way", ["garbage", "unread", "questions", "large", "names", "window"])
+def test_it_costs_the_others_nothing(service: str, spawn: Spawn, way: str) -> None:
+    with connect(service, client="honest", timeout_s=30) as bus, bus.map("shared", mirror=False) as driven:
+        driven.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
+        times(driven, 1, 30)
+        before = times(driven, 31)
+        hostile = spawn(HOSTILE, service, "shared", way)
+        hostile.ready()
+        during = times(driven, 31 + INSERTS)
+        hostile.tell("stop")
+        sent = int(hostile.line("sent")[0])
+        report = {
+            "way": way,
+            "sent": sent,
+            "before_ms": [round(1e3 * q, 2) for q in (statistics.median(before), max(before))],
+            "during_ms": [round(1e3 * q, 2) for q in (statistics.median(during), sorted(during)[-2], max(during))],
+        }
+        print(json.dumps(report))
+        assert sent > 50, "it was hostile"
+        assert statistics.median(during) < SLOWER * statistics.median(before) + BESIDES_S, report
+        assert max(during) < LONGEST_S, report
+
+
+def test_connections_that_say_nothing_do_not_keep_others_out(service: str) -> None:
+    host, port = service.partition("/")[2].split(":")
+    silent = [socket.create_connection((host, int(port)), timeout=30) for _ in range(150)]
+    try:
+        begun = time.perf_counter()
+        with connect(service, client="late", timeout_s=30) as bus:
+            bus.maps()
+        assert time.perf_counter() - begun < 5.0
+    finally:
+        for each in silent:
+            each.close()
+
+
+def test_more_sessions_than_allowed_are_turned_away_and_those_inside_go_on(tmp_path: Path, spawn: Spawn) -> None:
+    settings = tmp_path / "few.toml"
+    settings.write_text("[limits]\nsessions = 3\n")
+    endpoint = spawn(
+        "-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--no-warm", "--config", str(settings)
+    ).ready()[0]
+    with bare(endpoint) as first, bare(endpoint) as second, bare(endpoint):
+        with pytest.raises(Exception, match="did not answer"), connect(endpoint, timeout_s=0.3):
+            pass
+        first.create("kitchen")
+        assert second.stats("kitchen")["revision"] == 0

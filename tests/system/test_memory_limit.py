@@ -1,0 +1,82 @@
+"""Before the kernel would end the process, inserts are refused and say why; what is there can be asked and dropped."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bare import INFORMATION
+from processes import Process
+
+from factorbus.client import connect
+from factorbus.client.map import Map
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.problems import Refused
+from factorbus.service import memory
+
+Spawn = Callable[..., Process]
+POSES = 5000
+ROOM = 120 << 20
+
+
+def chunk(first: int) -> Batch:
+    """So many poses more, at rest where odometry says."""
+    own = np.arange(first, first + POSES)
+    edges = np.stack([own - 1, own], axis=1)[first == 0 :]
+    measured = np.tile([1.0, 0, 0], (len(edges), 1))
+    held = Factors("prior_se2", own[:1, None], np.array([[float(first), 0, 0]]), np.array([INFORMATION]))
+    return Batch(
+        (Variables("se2", own, np.stack([own, 0 * own, 0 * own], axis=1).astype(float)),),
+        (held, Factors("between_se2", edges, measured, np.tile(INFORMATION, (len(edges), 1)))),
+    )
+
+
+def fill(driven: Map) -> tuple[int, Refused]:
+    """Insert until refused; how many chunks went in, and the refusal."""
+    for n in range(200):
+        try:
+            driven.insert(chunk(n * POSES))
+        except Refused as refused:
+            return n, refused
+    raise AssertionError("a million poses, and no refusal")
+
+
+def resident(process_id: int) -> int:
+    return int(Path(f"/proc/{process_id}/statm").read_text().split()[1]) * 4096
+
+
+def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path, spawn: Spawn) -> None:
+    probe = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0")
+    with connect(probe.ready()[0], timeout_s=60) as bus:
+        limit = bus.stats()[0]["memory"]["resident_bytes"] + ROOM
+    probe.end()
+    settings = tmp_path / "serve.toml"
+    settings.write_text(f"[limits]\nmemory_bytes = {limit}\n")
+    service = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
+    with connect(service.ready()[0], timeout_s=120) as bus, bus.map("first", mirror=False) as first:
+        taken, refused = fill(first)
+        assert (refused.code, refused.detail["limit"]) == ("out_of_memory", limit)
+        assert "memory_bytes" in refused.message
+        account = bus.stats()[0]
+        assert resident(account["pid"]) < limit / 0.8, "by default the limit leaves a fifth for a step under way"
+        assert resident(account["pid"]) > limit - ROOM // 2, "not long before, either"
+        assert account["alive"]
+        assert account["ready"]
+        assert account["maps"][0]["refusals"] == {"out_of_memory": 1}
+        assert sum(len(group.keys) for group in first.ask_estimate().variables) == taken * POSES
+        bus.drop("first")
+        with bus.map("second", mirror=False) as second:
+            again, _ = fill(second)
+        assert again > taken // 2, "what was dropped makes room"
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_limit_of_a_control_group_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int) -> None:
+    (tmp_path / "max").write_text("max\n")
+    (tmp_path / "own").write_text(f"{1 << 28}\n")
+    files = [tmp_path / "absent", tmp_path / "max", tmp_path / "own"]
+    monkeypatch.setattr(memory, "_limit_files", lambda: files[: version + 1])
+    assert memory.available() == (1 << 28 if version == 2 else memory.os.sysconf("SC_PHYS_PAGES") * 4096)
+    held = memory.Memory(0)
+    assert held.limit == int(0.8 * memory.available())
+    held.close()

@@ -1,0 +1,72 @@
+"""What is in deploy/ fits what the code has: settings, files, units, names of metrics."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from factorbus.service.config import load
+from factorbus.service.histogram import Histogram
+from factorbus.service.metrics import families
+
+DEPLOY = Path(__file__).parent.parent / "deploy"
+NAME = re.compile(r"factorbus_[a-z0-9_]+")
+_NUMBERS = ["variables", "factors", "revision", "chi2", "clients", "waiting", "parked", "in_solver"]
+
+
+def known() -> set[str]:
+    """Every metric that a service with one map and one worker has, as Prometheus names it."""
+    row = dict.fromkeys([*_NUMBERS, "steps", "solver_cpu_s"], 1)
+    row |= {"name": "m", "step_s": Histogram().as_dict(), "insert_s": Histogram().as_dict()}
+    row |= {name: {"x": 1} for name in ("strategies", "inserts", "refusals", "bytes")}
+    account = {
+        "service": "s", "version": "1", "uptime_s": 1.0, "alive": True, "ready": True, "silent_s": {"watch": 0.0},
+        "memory": {"resident_bytes": 1, "limit_bytes": 2}, "maps": [row | {"journal": {"bytes": 3}}],
+        "workers": [{"name": "w", "slots": 1, "in_flight": 0, "trip_ms": 0.2}],
+    }  # fmt: skip
+    names = set()
+    for family in families(account):
+        ends = {"counter": ("_total",), "histogram": ("_bucket", "_sum", "_count")}.get(family.kind, ("",))
+        names |= {f"factorbus_{family.name}{end}" for end in ends}
+    return names
+
+
+@pytest.mark.parametrize("file", ["grafana/factorbus.json", "prometheus/alerts.yml"])
+def test_dashboards_and_alerts_ask_for_metrics_there_are(file: str) -> None:
+    asked = set(NAME.findall((DEPLOY / file).read_text()))
+    assert len(asked) > 3
+    assert asked <= known()
+
+
+def test_another_part_of_the_service_can_add_numbers() -> None:
+    assert "factorbus_map_journal_bytes" in known()
+
+
+def test_the_dashboard_is_one() -> None:
+    panels = json.loads((DEPLOY / "grafana" / "factorbus.json").read_text())["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels) > 10
+
+
+@pytest.mark.parametrize("file", ["systemd/serve.toml", "docker/serve.toml"])
+def test_the_settings_are_settings(file: str) -> None:
+    assert load(DEPLOY / file).metrics
+
+
+def test_what_the_image_copies_is_there() -> None:
+    lines = (DEPLOY / "docker" / "Dockerfile").read_text().splitlines()
+    copied = [word for line in lines if line.startswith("COPY") and "--from" not in line for word in line.split()[1:-1]]
+    assert len(copied) > 5
+    assert all((DEPLOY.parent / word).exists() for word in copied)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_takes_the_units(tmp_path: Path) -> None:
+    for unit in (DEPLOY / "systemd").glob("*.service"):
+        # It looks for the program, which is installed elsewhere.
+        (tmp_path / unit.name).write_text(unit.read_text().replace("/opt/factorbus/bin/factorbus", "/bin/true"))
+    units = [str(each) for each in tmp_path.glob("*.service")]
+    ran = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stderr) == (0, ""), ran.stderr
