@@ -41,7 +41,12 @@ class Bare:
                 came.put(codec.decode_problem(reply.err.payload.to_bytes() if reply.err else b""))
 
         self.session.get(
-            key, Callback(on_reply, drop=lambda: came.put(None), indirect=False), payload=payload, timeout=PATIENCE_S
+            key,
+            Callback(on_reply, drop=lambda: came.put(None), indirect=False),
+            payload=payload,
+            timeout=PATIENCE_S,
+            # Not what this very session says of itself, below @/<its id>/session.
+            allowed_destination=zenoh.Locality.REMOTE,
         )
         return came
 

@@ -56,8 +56,10 @@ class Process:
         self._popen.stdin.flush()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal."""
+        """Send a signal; one that stops it has done so, in all its threads, when this returns."""
         self._popen.send_signal(number)
+        if number == signal.SIGSTOP:
+            os.waitid(os.P_PID, self._popen.pid, os.WSTOPPED)
 
     def wait(self) -> int:
         """Its exit code, once it has ended."""

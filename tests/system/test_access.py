@@ -84,7 +84,8 @@ class Identity:
     def seen(self, token: str) -> bool:
         """Does an operator learn that it declared `token`?"""
         return self._seen(
-            lambda see: self.observer.liveliness().declare_subscriber(f"{P}/{token}", see),
+            # With history: the token may get there before the subscription does.
+            lambda see: self.observer.liveliness().declare_subscriber(f"{P}/{token}", see, history=True),
             lambda: self.session.liveliness().declare_token(f"{P}/{token}"),
         )
 

@@ -117,7 +117,13 @@ def test_a_stuck_solver_is_not_alive_and_comes_back(
     service = spawn(STUCK_SERVICE, str(stuck), "serve", *options)
     endpoint = service.ready()[0]
     assert endpoint in manager.hear("READY=1")
-    with connect(endpoint, timeout_s=60) as bus, bus.map("kitchen", mirror=False) as kitchen, bus.map("hall") as hall:
+    with (
+        connect(endpoint, timeout_s=60) as bus,
+        bus.map("kitchen", mirror=False) as kitchen,
+        # Of somebody else: what a client sends behind a step that is made where it is received waits for that step.
+        connect(endpoint, timeout_s=60) as another,
+        another.map("hall") as hall,
+    ):
         if thread == "receiving":  # short steps are made on the thread that receives
             for n in range(5):
                 kitchen.insert(point(f"l{n}"))

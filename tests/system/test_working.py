@@ -32,7 +32,8 @@ def fill(client: Bare) -> None:
     client.create("m")
     loop = Batch(factors=(edge("x0", "x2", 2.3),))
     for sequence, batch in enumerate((start(), pose("x1", "x0"), pose("x2", "x1"), loop), 1):
-        assert isinstance(client.ask(keys.insert_key("m", "a"), codec.encode_insert(Insert(sequence, batch))), bytes)
+        insert = codec.encode_insert(Insert(sequence, batch, settle=batch is loop))
+        assert isinstance(client.ask(keys.insert_key("m", "a"), insert), bytes)
 
 
 def worker(spawn: Spawn, endpoint: str, name: str) -> Process:
