@@ -77,7 +77,7 @@ def test_set_up_runs_again_only_when_what_is_installed_has_changed(tmp_path: Pat
 
 def test_the_deployed_configuration_is_one_that_serve_takes() -> None:
     config = load(ROOT / "deploy/systemd/serve.toml")
-    assert config.listen == ("tcp/0.0.0.0:7447",)
+    assert config.listen == ("tcp/127.0.0.1:7447",)
 
 
 @pytest.mark.parametrize("unit", ["factorbus.service", "factorbus-worker.service"])
