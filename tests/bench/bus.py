@@ -58,6 +58,7 @@ POSES = 10
 FACTORS = 10
 FLOOR = "floor/echo"
 BLOCK = 25
+WARM_UP = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,35 +136,34 @@ class Round:
 
 
 def one_round(client: "Client", echo: "Echo", laid_out: "Echo", name: str, samples: int) -> Round:
-    """A new map, so that the solver's part stays small; the first exchanges are not counted."""
+    """Every block has a new map, so that the solver's part stays small; the first exchanges are not counted."""
     taken = Round([], [], [], [], [])
-    with client.joined(name):
-        for _ in range(40):
-            warm_up = client.exchange()
-        for hub in (echo, laid_out):
-            hub.answer_with(warm_up.sizes)
-        hold_us = warm_up.solver
+    hold_us = 0.0
 
-        def ask_ours() -> None:
-            taken.ours.append(client.exchange())
+    def ask_ours() -> None:
+        taken.ours.append(client.exchange())
 
-        def ask_bare() -> None:
-            taken.bare.append(client.at_work(echo.exchange))
+    def ask_bare() -> None:
+        taken.bare.append(client.at_work(echo.exchange))
 
-        def ask_idle() -> None:
-            taken.idle.append(echo.exchange(client.payload))
+    def ask_idle() -> None:
+        taken.idle.append(echo.exchange(client.payload))
 
-        def ask_held() -> None:
-            taken.held.append(client.at_work(echo.exchange, hold_us))
+    def ask_held() -> None:
+        taken.held.append(client.at_work(echo.exchange, hold_us))
 
-        def ask_laid_out() -> None:
-            taken.laid_out.append(client.at_work(laid_out.exchange))
+    def ask_laid_out() -> None:
+        taken.laid_out.append(client.at_work(laid_out.exchange))
 
-        for _ in range(-(-samples // BLOCK)):
+    for block in range(-(-samples // BLOCK)):
+        with client.joined(f"{name}-{block}"):
+            warm_up = [client.exchange() for _ in range(WARM_UP)]
+            hold_us = float(np.median([sample.solver for sample in warm_up]))
+            for hub in (echo, laid_out):
+                hub.answer_with(warm_up[-1].sizes)
             for ask in client.random.permutation(np.array([ask_ours, ask_bare, ask_idle, ask_held, ask_laid_out])):
                 for _ in range(BLOCK):
                     ask()
-            hold_us = float(np.median([sample.solver for sample in taken.ours[-BLOCK:]]))
     return taken
 
 
