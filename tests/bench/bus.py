@@ -180,7 +180,7 @@ class Client:
     def joined(self, name: str) -> Iterator[None]:
         """A map of POSES poses on a ring, and its deltas."""
         self._ask(keys.admin_key("create"), codec.encode_map({"map": name}))
-        self._key, self._sequence = keys.insert_key(name, "bench"), 0
+        self._key, self._sequence = self._bus.declare_keyexpr(keys.insert_key(name, "bench")), 0
         with self._bus.declare_subscriber(keys.delta_key(name), Callback(self._on_delta, indirect=False)):
             self._insert(ring())
             yield
@@ -262,8 +262,11 @@ class Echo:
         self._came.put(sample.payload.to_bytes())
 
 
-def ask(bus: zenoh.Session, key: str, on_reply: Callable[[zenoh.Reply], None], **what: Any) -> None:
-    """A query as the client library sends it: the reply is handed on without waiting for the end of the query."""
+def ask(bus: zenoh.Session, key: zenoh.KeyExpr | str, on_reply: Callable[[zenoh.Reply], None], **what: Any) -> None:
+    """A query as the client library sends it: the reply is handed on without waiting for the end of the query.
+
+    The library also declares the key of its inserts; the floor, as bare as it is, does not.
+    """
     bus.get(key, Callback(on_reply, indirect=False), consolidation=zenoh.ConsolidationMode.NONE, **what)
 
 

@@ -49,10 +49,11 @@ def admit(graph: Graph, batch: BatchLike) -> None:
         sights.check(graph, first_factor)
 
 
-def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
+def try_admit(graph: Graph, raw: bytes, groups: I64, reached: I64 | None = None) -> int | None:
     """As `admit` for a small batch whose columns lie in `raw` where `groups` says; gives the id of its first factor.
 
-    None where anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
+    reached: 1 for each new variable that has a value, else 0, where the caller knows; it is written to.  None where
+    anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
     """
     mark = graph.mark()
     missing = admit_bytes(
@@ -62,9 +63,10 @@ def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
     if missing < 0:
         return None
     if missing:
-        first, new = mark[at.VARIABLES], [row for row in _rows(groups) if not row[at.G_FACTORS]]
-        reached = np.array([row[at.G_NUMBERS] >= 0 for row in new for _ in range(row[at.G_COUNT])], np.int64)
-        if _find_missing(graph, first, mark[at.FACTORS], reached) >= 0:
+        if reached is None:
+            new = [row for row in _rows(groups) if not row[at.G_FACTORS]]
+            reached = np.array([row[at.G_NUMBERS] >= 0 for row in new for _ in range(row[at.G_COUNT])], np.int64)
+        if _find_missing(graph, mark[at.VARIABLES], mark[at.FACTORS], reached) >= 0:
             graph.forget(mark)
             return None
     return mark[at.FACTORS]

@@ -23,6 +23,7 @@ from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
+from factorbus.solver.packing import Packing
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.ripening import find_ripe, with_points
 from factorbus.solver.state import State, dump, load
@@ -62,7 +63,7 @@ _VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Wh
 class Solver:
     """Variables, factors and their estimate.  Not thread-safe: one thread owns it."""
 
-    NOT_KEPT = ("_options", "_mode", "_live")
+    NOT_KEPT = ("_options", "_mode", "_live", "_packing")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -71,6 +72,7 @@ class Solver:
         self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
         self._tree = TreeSteps(self._graph, self._options) if self._mode.tree else None
         self._live = Live(self._graph, self._tree.tree) if self._tree else None
+        self._packing = Packing()
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
@@ -90,6 +92,11 @@ class Solver:
 
         The next step solves for it.  Raises the errors of `admission.admit`; nothing has changed then.
         """
+        packed = self._packing.pack(batch)
+        if packed:
+            first = try_admit(self._graph, *packed)
+            if first is not None:
+                return first
         mark = self._graph.mark()
         try:
             admit(self._graph, batch)
