@@ -65,6 +65,10 @@ class Process:
         """Its exit code, once it has ended."""
         return self._popen.wait(PATIENCE_S)
 
+    def errors(self) -> str:
+        """All it has written to its standard error."""
+        return self._log.read_text()
+
     def end(self) -> None:
         """End it if it runs, whatever state it is in."""
         if self._popen.poll() is None:

@@ -25,6 +25,7 @@ VIOLATIONS = {
     "Client, formats and simulated worlds do not": ("clients/factorbus/simulate", "from factorbus.client import draft"),
     "Pictures need": ("clients/factorbus/viz", "from factorbus.solver import errors"),
     "The gateway is": ("clients/factorbus/gateway", "from factorbus.solver import errors"),
+    "The bridge to ROS 2": ("clients/factorbus/ros2", "from factorbus.solver import errors"),
     "Data sets are files": ("clients/factorbus/datasets", "from factorbus.client import draft"),
     "What a front end installs": ("service/factorbus/formats", "import scipy.sparse"),
     "Numba is imported": ("workers/factorbus/workers", "import numba"),

@@ -92,7 +92,7 @@ def test_make_targets_of_contributing_exist() -> None:
 def test_commands_of_the_table_are_all_there_are() -> None:
     from factorbus.cli.main import COMMANDS
 
-    told = re.findall(r"^\| `factorbus ([a-z]+)", (ROOT / "README.md").read_text(), re.M)
+    told = re.findall(r"^\| `factorbus ([a-z0-9]+)", (ROOT / "README.md").read_text(), re.M)
     assert set(told) == set(COMMANDS) - {"robot", "version"}
 
 

@@ -30,7 +30,7 @@ every_root_is_there() {
     venv/bin/python - <<'EOF'
 from importlib.util import find_spec
 
-for part in ("proto", "solver", "service", "formats", "workers", "client", "cli", "viz", "simulate", "gateway"):
+for part in ("proto", "solver", "service", "formats", "workers", "client", "cli", "viz", "simulate", "gateway", "ros2"):
     assert find_spec(f"factorbus.{part}"), f"factorbus.{part} is not in the wheel"
 assert find_spec("factorbus").origin is None, "factorbus must stay a namespace package"
 EOF
@@ -47,6 +47,7 @@ light_client_works() {
     says "leave a variable free to move" venv/bin/factorbus explain underconstrained
     says "pip install 'factorbus[watch]'" venv/bin/factorbus watch town
     says "pip install 'factorbus[gateway]'" venv/bin/factorbus gateway
+    says "pip install 'factorbus[ros2]'" venv/bin/factorbus ros2 town
     venv/bin/python -c 'import sys, factorbus.client; assert not {"numba", "scipy", "sksparse"} & set(sys.modules)'
 }
 

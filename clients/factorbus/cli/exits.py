@@ -29,9 +29,12 @@ EXTRAS = {
     "watch": ("rerun",),
     "record": ("foxglove",),
     "gateway": ("starlette", "uvicorn", "websockets"),
+    "ros2": ("rosbags", "xxhash"),
 }
 
-_USAGE_CODES = ("bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_setting", "exposed")
+_USAGE_CODES = (
+    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting", "exposed",
+)  # fmt: skip
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down")
 
 

@@ -18,6 +18,7 @@ COMMANDS = {
     "simulate": ("simulate", "Write a simulated world to a file."),
     "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
     "gateway": ("gateway", "Maps for browsers: a live page, HTTP and WebSocket."),
+    "ros2": ("ros2", "Join a robot that speaks ROS 2 over Zenoh to a map."),
     "top": ("top", "Maps, clients and workers of a service, in the terminal."),
     "record": ("record", "Record a map into an MCAP file, which Foxglove opens."),
     "ask": ("ask", "How certain a map is, what it thinks of a measurement, and why."),

@@ -126,7 +126,14 @@ class Link:
 
 
 def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any], file: str = "") -> Link:
-    """A link to the first of `endpoints` that takes us, trying until `timeout_s` has passed.
+    """A link to the first of `endpoints` that takes us; as `open_session`."""
+    return Link(open_session(endpoints, timeout_s, settings, file))
+
+
+def open_session(
+    endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any], file: str = ""
+) -> zenoh.Session:
+    """A session with the first of `endpoints` that takes us, trying until `timeout_s` has passed.
 
     settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.  file: path of a
     zenoh configuration file that comes before all this.
@@ -136,7 +143,7 @@ def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str,
     start, pause = time.monotonic(), _FIRST_PAUSE_S
     while True:
         try:
-            return Link(zenoh.open(config))
+            return zenoh.open(config)
         except zenoh.ZError:
             if time.monotonic() - start + pause > timeout_s:
                 raise Unavailable(

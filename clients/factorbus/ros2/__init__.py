@@ -1,0 +1,15 @@
+"""Robots that speak ROS 2 over Zenoh (rmw_zenoh), on a map of ours, with no ROS installed on this side.
+
+Odometry, poses with covariance and landmark detections come in; the correction from map to odometry, the path and
+markers go out.  A client like any other: no compiler.  Needs the extra `ros2`.
+
+| module | |
+|---|---|
+| `names` | key expressions, liveliness tokens and attachments as rmw_zenoh has them |
+| `messages` | the types that are used, their hashes, CDR to objects and back |
+| `node` | a ROS 2 node on a Zenoh session; the only file here that touches zenoh |
+| `geometry`, `certainty` | rigid transforms and their covariances |
+| `track`, `front_end` | from odometry to keyframes, from messages to what is inserted; no bus and no clock |
+| `display` | an estimate as a path and as markers |
+| `bridge` | all of it together |
+"""

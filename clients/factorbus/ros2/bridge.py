@@ -1,0 +1,198 @@
+"""A robot on ROS 2 and a map of ours, joined: messages in on one thread, the correction out on the mirror's, pictures
+on a third."""
+
+import logging
+import queue
+import threading
+import time
+from collections import Counter, deque
+from typing import Any
+
+from factorbus.client import Draft, Map, Problem, Refused, Ticket, Unavailable
+from factorbus.proto.arrays import F64
+from factorbus.proto.messages import Delta
+from factorbus.proto.symbols import symbol
+from factorbus.ros2 import display
+from factorbus.ros2.front_end import FrontEnd
+from factorbus.ros2.messages import DETECTIONS, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
+from factorbus.ros2.names import Topic
+from factorbus.ros2.node import Node
+from factorbus.ros2.problems import BadRosMessage
+from factorbus.ros2.settings import Settings
+from factorbus.ros2.space import SPACES
+
+log = logging.getLogger("factorbus.ros2")
+
+# Messages that may wait to be read; the next ones are dropped and counted.  Odometry is absolute, so little is lost.
+_BACKLOG = 4096
+_IDLE_S = 0.2
+# Drawing may take this share of the time.
+_DRAWING = 0.05
+_OTHER_MAP = ("wrong_epoch", "unknown_map")
+
+
+class Bridge:
+    """Reads from the moment it is made until `run` returns.  The map and the node stay the caller's."""
+
+    def __init__(self, joined: Map, node: Node, messages: Messages, settings: Settings) -> None:
+        self._map, self._messages, self._settings = joined, messages, settings
+        self._inbox: queue.Queue[tuple[str, str, bytes]] = queue.Queue(_BACKLOG)
+        self._out: deque[Ticket] = deque()
+        self._tolerance_ns = int(1e9 * settings.tolerance_s)
+        self.counts: Counter[str] = Counter()
+        self._front_end = FrontEnd(settings, *self._place_in_map())
+        self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
+        self._path = node.publisher(self._topic(settings.path, PATH, 1))
+        self._markers = node.publisher(self._topic(settings.markers, MARKERS, 1))
+        self._forget = joined.estimate.on_delta(self._on_delta)
+        self._listen(node, settings.odometry, ODOMETRY)
+        for name in settings.poses:
+            self._listen(node, name, POSE)
+        for name in settings.landmarks:
+            self._listen(node, name, DETECTIONS)
+        if self._front_end.waits_for_pose:
+            log.warning("waiting for a pose on %s: %s", " or ".join(settings.poses), self._why_wait())
+
+    def run(self, stop: threading.Event) -> None:
+        """Until `stop`.  Raises what the map refuses in a way that nothing here can mend."""
+        drawing = threading.Thread(target=self._draw, args=(stop,), name="factorbus-ros2-display", daemon=True)
+        drawing.start()
+        try:
+            while not stop.is_set():
+                try:
+                    topic, type_name, data = self._inbox.get(timeout=_IDLE_S)
+                except queue.Empty:
+                    self._collect()
+                    continue
+                self._read(stop, topic, type_name, data)
+                self._collect()
+        finally:
+            self._forget()
+            stop.set()
+            drawing.join()
+
+    def _listen(self, node: Node, name: str, type_name: str) -> None:
+        def hear(data: bytes) -> None:
+            try:
+                self._inbox.put_nowait((name, type_name, data))
+            except queue.Full:
+                self.counts["dropped"] += 1
+
+        node.subscribe(self._topic(name, type_name, 10), hear)
+
+    def _topic(self, name: str, type_name: str, depth: int) -> Topic:
+        return Topic(name, type_name, self._messages.hash(type_name), depth)
+
+    def _place_in_map(self) -> tuple[int, list[int], bool]:
+        """The first index that is free, the landmarks there are, and whether a pose has to be told first."""
+        columns = self._map.estimate.snapshot().columns
+        space, first = SPACES[self._settings.space], 0
+        for keys, _ in columns.values():
+            mine = keys[(keys >> 56) == ord(self._settings.letter)]
+            first = max([first, *(mine - symbol(self._settings.letter, 0) + 1).tolist()])
+        landmarks = columns[space.point][0].tolist() if space.point in columns else []
+        return first, landmarks, self._settings.start == "pose" or any(len(keys) for keys, _ in columns.values())
+
+    def _why_wait(self) -> str:
+        return (
+            "as was asked for"
+            if self._settings.start == "pose"
+            else "the map is not empty, and where in it we are is unknown"
+        )
+
+    def _read(self, stop: threading.Event, topic: str, type_name: str, data: bytes) -> None:
+        self.counts[topic] += 1
+        try:
+            message = self._messages.read(topic, type_name, data)
+            draft = self._draft(topic, type_name, message)
+        except BadRosMessage as bad:
+            self._tell(bad)
+            return
+        for bad in self._front_end.refused:
+            self._tell(bad)
+        self._front_end.refused.clear()
+        if draft is not None:
+            self._send(stop, draft)
+        elif type_name == ODOMETRY:
+            self._correct()  # a step brings one by itself
+
+    def _draft(self, topic: str, type_name: str, message: Any) -> Draft | None:
+        if type_name == ODOMETRY:
+            return self._front_end.odometry(message)
+        if type_name == POSE:
+            return self._front_end.pose(topic, message)
+        return self._front_end.detections(topic, message)
+
+    def _send(self, stop: threading.Event, draft: Draft) -> None:
+        """Until it is on its way: while the service is away, odometry waits in the inbox."""
+        while not stop.is_set():
+            try:
+                self._out.append(self._map.send(draft, timeout_s=1.0))
+            except Unavailable as unavailable:
+                self._tell(unavailable)
+                continue
+            return
+
+    def _collect(self) -> None:
+        while self._out and self._out[0].done():
+            try:
+                self._out.popleft().result(0)
+                self.counts["inserted"] += 1
+            except Refused as refused:
+                self._recover(refused)
+
+    def _recover(self, refused: Refused) -> None:
+        """Those after a refused insert lean on it: see them all answered, then go on from what is in the map."""
+        log.error("the map refused an insert: %s [%s]", refused.message, refused.code)
+        self.counts["refused"] += 1
+        for ticket in self._out:
+            try:
+                ticket.result()
+            except Problem as also:
+                log.info("and one after it: %s [%s]", also.message, also.code)
+        self._out.clear()
+        if refused.code in _OTHER_MAP:
+            self._map.rejoin()
+            self._map.estimate.wait_for(0)
+            self._front_end.begin_again(*self._place_in_map())
+        else:
+            self._front_end.rewind(lambda key: key in self._map.estimate)
+
+    def _on_delta(self, _: Delta) -> None:
+        """On the mirror's thread, after a step."""
+        self._correct()
+
+    def _correct(self) -> None:
+        mirror = self._map.estimate
+
+        def value_of(key: int) -> F64 | None:
+            try:
+                return mirror[key]
+            except KeyError:
+                return None
+
+        T_map_odom = self._front_end.try_correction(value_of)
+        if T_map_odom is not None:
+            stamp_ns = self._front_end.stamp_ns + self._tolerance_ns
+            frame = self._front_end.odometry_frame
+            self._transforms.publish(display.transform(self._messages, self._settings, frame, T_map_odom, stamp_ns))
+            self.counts["transforms"] += 1
+
+    def _draw(self, stop: threading.Event) -> None:
+        """Path and markers whenever the estimate has changed, as often as may be."""
+        drawn, pause_s = (-1, -1), self._settings.display_s
+        while not stop.wait(pause_s):
+            mirror = self._map.estimate
+            if drawn == (mirror.epoch, mirror.revision):
+                continue
+            start, snapshot, stamp_ns = time.perf_counter(), mirror.snapshot(), self._front_end.stamp_ns
+            self._path.publish(display.path(self._messages, self._settings, snapshot, stamp_ns))
+            self._markers.publish(display.markers(self._messages, self._settings, snapshot, stamp_ns))
+            drawn = snapshot.epoch, snapshot.revision
+            pause_s = max(self._settings.display_s, (time.perf_counter() - start) / _DRAWING)
+
+    def _tell(self, problem: Problem) -> None:
+        """The first of a kind, then every hundredth."""
+        self.counts[problem.code] += 1
+        if self.counts[problem.code] % 100 == 1:
+            log.warning("%s [%s] (%d so far)", problem.message, problem.code, self.counts[problem.code])

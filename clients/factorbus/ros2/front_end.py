@@ -1,0 +1,283 @@
+"""From what a robot says to what goes into the map.  No bus and no clock: messages in, drafts out.
+
+Odometry makes keyframes and the factors between them.  A pose or a sighting belongs to the last keyframe before it: it
+is carried there by odometry, and what that adds to its covariance is added.  What is stamped later than the last
+odometry waits for the next.
+"""
+
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from factorbus.client.draft import Draft
+from factorbus.proto.arrays import F64
+from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
+from factorbus.ros2.certainty import checked, floored, information
+from factorbus.ros2.geometry import Transform, carried, from_pose, local
+from factorbus.ros2.messages import Stamp
+from factorbus.ros2.problems import BadRosMessage
+from factorbus.ros2.settings import Settings
+from factorbus.ros2.space import SPACES
+from factorbus.ros2.track import Place, Sample, Track
+
+_WAITING = 256
+_ALL_AXES = (0, 1, 2, 3, 4, 5)
+
+
+class FrontEnd:
+    """One robot's.  `refused` collects what was not used and why; whoever drives this empties it.
+
+    first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
+    """
+
+    def __init__(self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool) -> None:
+        self._settings, self._space, self._floors = settings, SPACES[settings.space], settings.floors
+        self._track = Track()
+        self._waiting: deque[tuple[int, str, Any]] = deque(maxlen=_WAITING)
+        self.refused: list[BadRosMessage] = []
+        self.odometry_frame, self.base_frame = "", ""
+        self.begin_again(first, landmarks, wait_for_pose)
+
+    def begin_again(self, first: int, landmarks: Iterable[int], wait_for_pose: bool) -> None:
+        """As new, for a map that is another one."""
+        self._next, self._landmarks, self._wait_for_pose = first, set(landmarks), wait_for_pose
+        self._track.forget()
+        self._waiting.clear()
+
+    def rewind(self, present: Callable[[int], bool]) -> None:
+        """An insert was refused: go on from the last keyframe that is in the map."""
+        self._track.rewind(present)
+        self._landmarks = {key for key in self._landmarks if present(key)}
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the last odometry; 0 before the first."""
+        latest = self._track.latest
+        return latest.stamp_ns if latest else 0
+
+    @property
+    def waits_for_pose(self) -> bool:
+        """Nothing goes into the map before a pose is told."""
+        return self._wait_for_pose and self._track.keyframe is None
+
+    def try_correction(self, value_of: Callable[[int], F64 | None]) -> Transform | None:
+        """T_map_odom by the newest keyframe that has a value, if there is one."""
+        for keyframe in reversed(self._track.keyframes):
+            if (row := value_of(keyframe.key)) is not None:
+                return self._space.transform(row) @ keyframe.T_odom_base.inverse()
+        return None
+
+    def odometry(self, message: Any) -> Draft | None:
+        """A nav_msgs/Odometry.  Raises BadRosMessage: it is not used."""
+        sample = self._sample(message)
+        draft = Draft()
+        keyframe = self._track.keyframe
+        if keyframe is None and not self._wait_for_pose:
+            draft.variable(self._space.pose, self._mark(sample), self._space.row(sample.T_odom_base), fixed=True)
+        elif keyframe is not None and self._is_far(sample):
+            self._add_keyframe(draft, sample)
+        self._use_what_waited(draft)
+        return None if _is_empty(draft) else draft
+
+    def pose(self, topic: str, message: Any) -> Draft | None:
+        """A geometry_msgs/PoseWithCovarianceStamped in the map's frame.  Raises BadRosMessage."""
+        frame = message.header.frame_id
+        if frame != self._settings.map_frame:
+            raise BadRosMessage(topic, f"a pose in frame {frame!r}", f"one in {self._settings.map_frame!r}")
+        return self._take(topic, message)
+
+    def detections(self, topic: str, message: Any) -> Draft | None:
+        """A vision_msgs/Detection3DArray.  Raises BadRosMessage."""
+        return self._take(topic, message) if message.detections else None
+
+    def _sample(self, message: Any) -> Sample:
+        topic = self._settings.odometry
+        frames = message.header.frame_id, message.child_frame_id
+        if self.base_frame and frames != (self.odometry_frame, self.base_frame):
+            raise BadRosMessage(topic, f"frames {frames}", f"{self.odometry_frame, self.base_frame} as before")
+        if not all(frames):
+            raise BadRosMessage(topic, f"frames {frames}", "names of both the odometry and the base frame")
+        stamp_ns = Stamp.of(message.header.stamp).ns
+        if self._track.latest is not None and stamp_ns <= self.stamp_ns:
+            raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", f"one after the last, {self.stamp_ns} ns")
+        T = self._transform(topic, message.pose.pose)
+        covariance = checked(topic, message.pose.covariance, self._space.axes)
+        twist = checked(topic, message.twist.covariance, self._space.axes)
+        self.odometry_frame, self.base_frame = frames
+        return self._track.add(stamp_ns, self._space.fitted(T), local(covariance, self._space.fitted(T).R), twist)
+
+    def _is_far(self, sample: Sample) -> bool:
+        T = self._track.place_of(sample).T
+        return float(np.linalg.norm(T.t)) >= self._settings.keyframe_m or T.angle() >= self._settings.keyframe_rad
+
+    def _mark(self, sample: Sample) -> int:
+        key = symbol(self._settings.letter, self._next)
+        self._next += 1
+        self._track.mark(key, sample)
+        return key
+
+    def _add_keyframe(self, draft: Draft, sample: Sample) -> None:
+        place = self._track.place_of(sample)
+        weight = information(self._space.residual(self._floored_way(place)))
+        key = self._mark(sample)
+        draft.variable(self._space.pose, key)
+        measured = self._space.row(place.T)
+        draft.factor(f"between_{self._space.pose}", (place.keyframe.key, key), measured, information=weight)
+
+    def _floored_way(self, place: Place) -> F64:
+        floors, metres, radians = self._floors, float(np.linalg.norm(place.T.t)), place.T.angle()
+        return self._space.floored(
+            place.covariance,
+            max(floors.drift_m * metres, floors.least_m),
+            max(floors.drift_rad * metres + floors.turn_rad * radians, floors.least_rad),
+        )
+
+    def _take(self, topic: str, message: Any) -> Draft | None:
+        stamp_ns = Stamp.of(message.header.stamp).ns
+        if self._track.latest is None or stamp_ns > self.stamp_ns:
+            self._waiting.append((stamp_ns, topic, message))
+            return None
+        draft = Draft()
+        self._use(draft, stamp_ns, topic, message)
+        return None if _is_empty(draft) else draft
+
+    def _use_what_waited(self, draft: Draft) -> None:
+        ripe = [each for each in self._waiting if each[0] <= self.stamp_ns]
+        self._waiting = deque((each for each in self._waiting if each[0] > self.stamp_ns), _WAITING)
+        for stamp_ns, topic, message in ripe:
+            try:
+                self._use(draft, stamp_ns, topic, message)
+            except BadRosMessage as bad:
+                self.refused.append(bad)
+
+    def _use(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
+        if not self._track.covers(stamp_ns):
+            raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", "one for which odometry is still remembered")
+        if hasattr(message, "detections"):
+            self._use_detections(draft, stamp_ns, topic, message)
+        else:
+            self._use_pose(draft, stamp_ns, topic, message)
+
+    def _use_pose(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
+        T_map_base = self._space.fitted(self._transform(topic, message.pose.pose))
+        covariance = local(checked(topic, message.pose.covariance, self._space.axes), T_map_base.R)
+        covariance = self._space.floored(covariance, self._floors.pose_m, self._floors.pose_rad)
+        begins = self.waits_for_pose
+        if begins:
+            self._mark(self._track.before(stamp_ns))
+        place = self._track.try_place(stamp_ns)
+        if place is None:
+            raise BadRosMessage(topic, "a pose from before the first keyframe", "one from after it")
+        T_base_keyframe = place.T.inverse()
+        T_map_keyframe = T_map_base @ T_base_keyframe
+        if place.T.t.any() or place.T.angle() > 0.0:
+            covariance = carried(covariance, T_base_keyframe) + carried(self._floored_way(place), T_base_keyframe)
+        row = self._space.row(T_map_keyframe)
+        if begins:
+            draft.variable(self._space.pose, place.keyframe.key, row)
+        weight = information(self._space.residual(covariance))
+        draft.factor(f"prior_{self._space.pose}", (place.keyframe.key,), row, information=weight)
+
+    def _use_detections(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
+        place = self._track.try_place(stamp_ns)
+        if place is None:
+            raise BadRosMessage(topic, "sightings from before the first keyframe", "some from after it")
+        way = self._floored_way(place)
+        # All are looked at before one is used: a message is used whole or not at all.
+        seen = [self._sighting(topic, message, each, place, way) for each in message.detections]
+        for key, measured, weight in seen:
+            if key not in self._landmarks:
+                self._landmarks.add(key)
+                draft.variable(self._space.point, key)
+            kind = f"landmark_{self._space.pose}"
+            draft.factor(kind, (place.keyframe.key, key), measured, information=weight)
+
+    def _sighting(self, topic: str, message: Any, seen: Any, place: Place, way: F64) -> tuple[int, F64, F64]:
+        """Key of the landmark, where it is from the keyframe, and the information of that.
+
+        q = T p', p' = R p + t with T the keyframe's way, (R, t) the mount: Σ_q = R_q Σ_p R_qᵀ + J Σ_T Jᵀ with
+        R_q = R_T R and J = R_T [I, −[p']ₓ].
+        """
+        position, covariance = _position(topic, seen)
+        mount = self._mount(topic, seen.header.frame_id or message.header.frame_id)
+        p = mount.R @ position + mount.t
+        R = place.T.R @ mount.R
+        J = place.T.R @ np.hstack([np.eye(3), -_cross(p)])
+        axes = list(self._space.point_axes)
+        spread = (R @ covariance @ R.T + J @ way @ J.T)[np.ix_(axes, axes)]
+        weight = information(floored(spread, np.full(len(axes), self._floors.landmark_m)))
+        key = symbol(self._settings.landmark_letter, landmark_index(_identity(topic, seen)))
+        return key, (place.T.R @ p + place.T.t)[axes], weight
+
+    def _mount(self, topic: str, frame: str) -> Transform:
+        if frame == self.base_frame:
+            return Transform(np.eye(3), np.zeros(3))
+        if frame not in self._settings.mounts:
+            wanted = f"{self.base_frame!r}, or where that frame is on the robot: --mount {frame}=x,y,z,qx,qy,qz,qw"
+            raise BadRosMessage(topic, f"sightings in frame {frame!r}", wanted)
+        return self._settings.mounts[frame]
+
+    def _transform(self, topic: str, pose: Any) -> Transform:
+        try:
+            return from_pose(pose)
+        except ValueError as error:
+            raise BadRosMessage(topic, str(error), "finite numbers and a unit quaternion") from None
+
+
+def landmark_index(identity: str) -> int:
+    """The index of a landmark's key: its identity where that is a number, else 56 bits of BLAKE2b of it."""
+    if identity.isascii() and identity.isdigit() and int(identity) <= MAX_INDEX:
+        return int(identity)
+    return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=7).digest(), "big")
+
+
+def describe(draft: Draft) -> str:
+    """What is in it, for a log."""
+    keys = [format_symbol(key) for group in draft.batch().variables for key in group.keys.tolist()]
+    return f"new {', '.join(keys) or 'nothing'}, {draft.batch().factor_count} factors"
+
+
+def _identity(topic: str, seen: Any) -> str:
+    """The detection's own id, else the class of its best hypothesis (a tag's number, usually)."""
+    best = _best(seen)
+    identity = seen.id or (best.hypothesis.class_id if best is not None else "")
+    if not identity:
+        raise BadRosMessage(topic, "a detection without id or class", "one that says which landmark it is")
+    return identity
+
+
+def _position(topic: str, seen: Any) -> tuple[F64, F64]:
+    """Where it is in the sensor's frame, (3,), and the covariance of that, (3, 3)."""
+    best = _best(seen)
+    if best is None:
+        where, covariance = seen.bbox.center.position, np.zeros((3, 3))
+    else:
+        where = best.pose.pose.position
+        covariance = checked(topic, _translation_only(best.pose.covariance), _ALL_AXES)[:3, :3]
+    position = np.array([where.x, where.y, where.z], np.float64)
+    if not np.isfinite(position).all():
+        raise BadRosMessage(topic, f"a position of {position.tolist()}", "finite numbers")
+    return position, covariance
+
+
+def _translation_only(numbers: F64) -> F64:
+    made = np.zeros((6, 6))
+    made[:3, :3] = np.asarray(numbers, np.float64).reshape(6, 6)[:3, :3]
+    return made
+
+
+def _best(seen: Any) -> Any:
+    return max(seen.results, key=lambda each: each.hypothesis.score, default=None)
+
+
+def _cross(p: F64) -> F64:
+    x, y, z = p.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _is_empty(draft: Draft) -> bool:
+    batch = draft.batch()
+    return not batch.variables and not batch.factors

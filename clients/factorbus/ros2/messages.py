@@ -1,0 +1,92 @@
+"""The ROS messages that are used: their type hashes, and CDR to objects and back, by rosbags.
+
+Landmarks come as vision_msgs/Detection3DArray: of the messages in common use it is the one that has for each sighting
+an identity, a position in metres and a covariance (AprilTag's own message has corners in pixels; markers are for
+drawing).  It is in no type store, so its definition stands here, as it is since ROS 2 Humble.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from factorbus.ros2.problems import BadRosMessage
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+DETECTIONS = "vision_msgs/msg/Detection3DArray"
+PATH = "nav_msgs/msg/Path"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+
+# What stands in keys for a hash where the distribution has none.
+NO_HASH = "TypeHashNotSupported"
+DISTRIBUTIONS = {
+    "humble": Stores.ROS2_HUMBLE,
+    "jazzy": Stores.ROS2_JAZZY,
+    "kilted": Stores.ROS2_KILTED,
+    "lyrical": Stores.ROS2_LYRICAL,
+}
+
+_VISION = {
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id"
+    ),
+    DETECTIONS: "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """Time as ROS has it."""
+
+    ns: int
+
+    @classmethod
+    def of(cls, message: Any) -> "Stamp":
+        """Of a builtin_interfaces/Time."""
+        return cls(message.sec * 1_000_000_000 + message.nanosec)
+
+
+class Messages:
+    """The types of one distribution.  Everything in `type_of` is a dataclass whose fields are those of the message."""
+
+    def __init__(self, distribution: str) -> None:
+        self._store = get_typestore(DISTRIBUTIONS[distribution])
+        self._hashed = distribution != "humble"
+        for name, text in _VISION.items():
+            self._store.register(get_types_from_msg(text, name))
+
+    def hash(self, type_name: str) -> str:
+        """RIHS01_ and the SHA-256 of the type's description (REP 2016), or what stands for it."""
+        return self._store.hash_rihs01(type_name) if self._hashed else NO_HASH
+
+    def type_of(self, type_name: str) -> Any:
+        """The class to make messages of."""
+        return self._store.types[type_name]
+
+    def time(self, ns: int) -> Any:
+        """A builtin_interfaces/Time."""
+        return self.type_of("builtin_interfaces/msg/Time")(ns // 1_000_000_000, ns % 1_000_000_000)
+
+    def header(self, ns: int, frame: str) -> Any:
+        """A std_msgs/Header."""
+        return self.type_of("std_msgs/msg/Header")(self.time(ns), frame)
+
+    def write(self, type_name: str, message: Any) -> bytes:
+        """CDR, little-endian, with its four bytes of encapsulation."""
+        return bytes(self._store.serialize_cdr(message, type_name, little_endian=True))
+
+    def read(self, topic: str, type_name: str, data: bytes) -> Any:
+        """A message from CDR of either byte order.  Raises BadRosMessage."""
+        try:
+            return self._store.deserialize_cdr(data, type_name)
+        except (SerdeError, IndexError, OverflowError, MemoryError) as error:
+            raise BadRosMessage(topic, f"{len(data)} bytes that cannot be read ({error})", f"a {type_name}") from None

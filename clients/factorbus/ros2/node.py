@@ -1,0 +1,78 @@
+"""A ROS 2 node on a Zenoh session, as rmw_zenoh would have made it.  The only file here that touches zenoh."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+from zenoh.handlers import Callback
+
+from factorbus.client.link import open_session
+from factorbus.ros2.names import NodeName, Topic, attachment, gid
+
+
+class Node:
+    """One node, seen by others from its token on.  Close it, or use it in `with`."""
+
+    def __init__(self, session: zenoh.Session, domain: int, namespace: str, name: str) -> None:
+        self._session, self._domain = session, domain
+        self._name = NodeName(str(session.info.zid()), domain, namespace, name)
+        self._tokens = [session.liveliness().declare_token(self._name.token())]
+        self._declared: list[Any] = []
+
+    def __enter__(self) -> "Node":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def publisher(self, topic: Topic) -> "Publisher":
+        """What publishes on a topic."""
+        made = self._session.declare_publisher(
+            topic.key(self._domain), congestion_control=zenoh.CongestionControl.DROP, express=True
+        )
+        self._declared.append(made)
+        return Publisher(made, gid(self._announce("MP", topic)))
+
+    def subscribe(self, topic: Topic, hear: Callable[[bytes], None]) -> None:
+        """From now on every message on a topic goes to `hear`, on Zenoh's thread: it may only hand over."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            hear(sample.payload.to_bytes())
+
+        key = topic.key(self._domain)
+        self._declared.append(self._session.declare_subscriber(key, Callback(on_sample, indirect=False)))
+        self._announce("MS", topic)
+
+    def close(self) -> None:
+        """Leave: tokens first, so that nobody counts on what is going."""
+        for declared in (*self._tokens, *self._declared):
+            declared.undeclare()
+        self._tokens, self._declared = [], []
+        self._session.close()
+
+    def _announce(self, kind: str, topic: Topic) -> str:
+        token = self._name.endpoint_token(len(self._tokens), kind, topic)
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        return token
+
+
+class Publisher:
+    """Publishes on one topic, each message with its number and time.  May be used from several threads."""
+
+    def __init__(self, publisher: zenoh.Publisher, of: bytes) -> None:
+        self._publisher, self._gid, self._sequence, self._lock = publisher, of, 0, threading.Lock()
+
+    def publish(self, data: bytes) -> None:
+        """CDR as it goes out."""
+        with self._lock:
+            self._sequence += 1
+            self._publisher.put(data, attachment=attachment(self._sequence, time.time_ns(), self._gid))
+
+
+def open_node(
+    endpoint: str, domain: int, namespace: str, name: str, timeout_s: float, settings: Mapping[str, Any], file: str = ""
+) -> Node:
+    """A node at the router (or whatever listens) at `endpoint`.  Raises Unavailable, BadEndpoint, BadSetting."""
+    return Node(open_session([endpoint], timeout_s, settings, file), domain, namespace, name)

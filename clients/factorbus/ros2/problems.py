@@ -1,0 +1,21 @@
+"""What can be wrong with what a robot says, or with how it is named."""
+
+from factorbus.proto.problems import Problem
+
+
+class BadRosMessage(Problem):
+    """A message that is not used: bytes that are not of its type, a frame, a covariance or a number that cannot be."""
+
+    code = "bad_ros_message"
+
+    def __init__(self, topic: str, found: str, wanted: str) -> None:
+        super().__init__(f"{topic}: {found}; wanted {wanted}; the message is not used", topic=topic)
+
+
+class BadRosName(Problem):
+    """A topic, namespace, node or mount that cannot be."""
+
+    code = "bad_ros_name"
+
+    def __init__(self, what: str, name: str, wanted: str) -> None:
+        super().__init__(f"{what} {name!r} cannot be; wanted {wanted}", name=name)

@@ -1,0 +1,105 @@
+"""What a bridge is told: topics, frames, when there is a keyframe, how certain anything may be."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from factorbus.proto.symbols import symbol
+from factorbus.ros2.geometry import Transform, from_quaternion
+from factorbus.ros2.problems import BadRosName
+
+
+@dataclass(frozen=True, slots=True)
+class Floors:
+    """Standard deviations below which no measurement counts; see `certainty`.
+
+    Of odometry between keyframes: `drift_m` metres and `drift_rad` radians per metre driven, `turn_rad` radians per
+    radian turned, and never less than `least_m`, `least_rad`.  Poses: `pose_m`, `pose_rad`, landmarks: `landmark_m`.
+    """
+
+    drift_m: float = 0.02
+    drift_rad: float = 0.01
+    turn_rad: float = 0.02
+    least_m: float = 0.001
+    least_rad: float = 0.001
+    pose_m: float = 0.01
+    pose_rad: float = 0.01
+    landmark_m: float = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """space: "plane" (se2, point2) or "space" (se3, point3).  letter, landmark_letter: of the keys.
+    start: "odometry": the map begins where odometry does; "pose": with the first pose that is told.
+    keyframe_m, keyframe_rad: a keyframe when that far or that much turned since the last.
+    mounts: frame of a sensor to T_base_sensor.  tolerance_s: by how much transforms are stamped ahead.
+    display_s: least time between paths.
+    """
+
+    odometry: str = "/odom"
+    poses: tuple[str, ...] = ("/initialpose",)
+    landmarks: tuple[str, ...] = ("/detections",)
+    path: str = "/factorbus/path"
+    markers: str = "/factorbus/markers"
+    transforms: str = "/tf"
+    map_frame: str = "map"
+    space: str = "plane"
+    letter: str = "x"
+    landmark_letter: str = "l"
+    start: str = "odometry"
+    keyframe_m: float = 0.5
+    keyframe_rad: float = 0.35
+    tolerance_s: float = 0.1
+    display_s: float = 1.0
+    mounts: Mapping[str, Transform] = field(default_factory=dict)
+    floors: Floors = field(default_factory=Floors)
+
+
+def from_options(
+    *,
+    odom: str,
+    poses: Sequence[str],
+    landmarks: Sequence[str],
+    tf: str,
+    path: str,
+    markers: str,
+    map_frame: str,
+    space: bool,
+    letter: str,
+    start: str,
+    keyframe: tuple[float, float],
+    mounts: Sequence[str],
+    drift: tuple[float, float],
+    tolerance: float,
+    display: float,
+) -> Settings:
+    """From the options of the command.  Raises BadRosName, BadSymbol."""
+    symbol(letter, 0)
+    given = Settings(
+        odometry=odom,
+        path=path,
+        markers=markers,
+        transforms=tf,
+        map_frame=map_frame,
+        space="space" if space else "plane",
+        letter=letter,
+        start=start,
+        keyframe_m=keyframe[0],
+        keyframe_rad=keyframe[1],
+        tolerance_s=tolerance,
+        display_s=display,
+        mounts=dict(map(_mount, mounts)),
+        floors=Floors(drift_m=drift[0], drift_rad=drift[0] / 2, turn_rad=drift[1]),
+    )
+    # Without these options the usual topics are read.
+    given = replace(given, poses=tuple(poses)) if poses else given
+    return replace(given, landmarks=tuple(landmarks)) if landmarks else given
+
+
+def _mount(text: str) -> tuple[str, Transform]:
+    """FRAME=x,y,z,qx,qy,qz,qw."""
+    frame, _, numbers = text.partition("=")
+    try:
+        x, y, z, *quat_xyzw = (float(number) for number in numbers.split(","))
+        return frame, from_quaternion((x, y, z), quat_xyzw)
+    except ValueError:
+        raise BadRosName("the mount", text, "FRAME=x,y,z,qx,qy,qz,qw with a unit quaternion") from None

@@ -1,0 +1,161 @@
+"""What odometry tells: where the robot was at any time of late, and how certain the way from its last keyframe is."""
+
+import bisect
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.proto.arrays import F64
+from factorbus.ros2.geometry import Transform, between, carried
+
+_KEPT = 4096
+_KEYFRAMES = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A pose of the map: its key, where odometry had it, its covariance there, that of the way from the one before."""
+
+    key: int
+    T_odom_base: Transform
+    covariance: F64
+    way: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One odometry: when, T_odom_base, its covariance (6, 6, local), its keyframe and the covariance of the way."""
+
+    stamp_ns: int
+    T_odom_base: Transform
+    covariance: F64
+    keyframe: Keyframe | None
+    way: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the robot was: T_keyframe_base, its covariance (6, 6, local) as far as odometry tells one."""
+
+    keyframe: Keyframe
+    T: Transform
+    covariance: F64
+
+
+class Track:
+    """The last odometry, oldest first.
+
+    The covariance of a way is the sum of Σ Δt² over its samples, carried along, Σ being the covariance of each sample's
+    twist: errors of one sample and the next are taken as independent.  Where all twists say zero, it is by what the
+    covariance of the pose has grown.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[Sample] = deque(maxlen=_KEPT)
+        self._keyframes: deque[Keyframe] = deque(maxlen=_KEYFRAMES)
+
+    @property
+    def latest(self) -> Sample | None:
+        """The last odometry."""
+        return self._samples[-1] if self._samples else None
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """Those of late, oldest first."""
+        return tuple(self._keyframes)
+
+    @property
+    def keyframe(self) -> Keyframe | None:
+        """The last one."""
+        return self._keyframes[-1] if self._keyframes else None
+
+    def add(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, twist: F64) -> Sample:
+        """An odometry that is later than the last.  twist (6, 6): covariance of its velocities."""
+        last = self.latest
+        way = np.zeros((6, 6))
+        if last is not None:
+            way = _extended(last, T_odom_base, stamp_ns, twist)
+        made = Sample(stamp_ns, T_odom_base, covariance, self.keyframe, way)
+        self._samples.append(made)
+        return made
+
+    def mark(self, key: int, at: Sample) -> Keyframe:
+        """Make a sample a keyframe; those after it belong to it."""
+        way = at.way if at.keyframe is self.keyframe else np.zeros((6, 6))
+        made = Keyframe(key, at.T_odom_base, at.covariance, way)
+        self._keyframes.append(made)
+        self._samples = deque((_since(made, at, each) for each in self._samples), maxlen=_KEPT)
+        return made
+
+    def try_place(self, stamp_ns: int) -> Place | None:
+        """Where the robot was; None before the first keyframe."""
+        before, T_odom_base = self._interpolated(stamp_ns)
+        if before.keyframe is None:
+            return None
+        T = before.keyframe.T_odom_base.inverse() @ T_odom_base
+        way = carried(before.way, before.T_odom_base.inverse() @ T_odom_base)
+        return Place(before.keyframe, T, _or_growth(way, before, T))
+
+    def place_of(self, sample: Sample) -> Place:
+        """The same for an odometry that has a keyframe."""
+        if sample.keyframe is None:
+            raise ValueError("an odometry before the first keyframe has no place in the map")
+        T = sample.keyframe.T_odom_base.inverse() @ sample.T_odom_base
+        return Place(sample.keyframe, T, _or_growth(sample.way, sample, T))
+
+    def covers(self, stamp_ns: int) -> bool:
+        """Not before the first odometry that is kept."""
+        return bool(self._samples) and stamp_ns >= self._samples[0].stamp_ns
+
+    def before(self, stamp_ns: int) -> Sample:
+        """The last odometry that is not later."""
+        return self._interpolated(stamp_ns)[0]
+
+    def rewind(self, present: Callable[[int], bool]) -> None:
+        """Forget the last keyframes that are not there; odometry from then on belongs to the last that is."""
+        dropped: list[Keyframe] = []
+        while self._keyframes and not present(self._keyframes[-1].key):
+            dropped.insert(0, self._keyframes.pop())
+        last = self.latest
+        self._samples.clear()
+        if last is not None and self.keyframe is not None:
+            way = last.way
+            for left in reversed(dropped):
+                way = carried(left.way, left.T_odom_base.inverse() @ last.T_odom_base) + way
+            self._samples.append(Sample(last.stamp_ns, last.T_odom_base, last.covariance, self.keyframe, way))
+
+    def forget(self) -> None:
+        """Everything."""
+        self._samples.clear()
+        self._keyframes.clear()
+
+    def _interpolated(self, stamp_ns: int) -> tuple[Sample, Transform]:
+        at = bisect.bisect_right(self._samples, stamp_ns, key=lambda each: each.stamp_ns) - 1
+        before = self._samples[at]
+        if at + 1 == len(self._samples):
+            return before, before.T_odom_base
+        after = self._samples[at + 1]
+        share = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
+        return before, between(before.T_odom_base, after.T_odom_base, share)
+
+
+def _since(keyframe: Keyframe, at: Sample, sample: Sample) -> Sample:
+    """A sample once `at` is a keyframe: from there on it belongs to it, and its way is what is left of it."""
+    if sample.stamp_ns < at.stamp_ns:
+        return sample
+    way = sample.way - carried(at.way, at.T_odom_base.inverse() @ sample.T_odom_base)
+    return Sample(sample.stamp_ns, sample.T_odom_base, sample.covariance, keyframe, way)
+
+
+def _extended(last: Sample, T_odom_base: Transform, stamp_ns: int, twist: F64) -> F64:
+    """The way's covariance one sample on: that so far, carried, and Σ Δt² of the new one."""
+    seconds = 1e-9 * (stamp_ns - last.stamp_ns)
+    return carried(last.way, last.T_odom_base.inverse() @ T_odom_base) + seconds**2 * twist
+
+
+def _or_growth(way: F64, sample: Sample, T: Transform) -> F64:
+    if way.any() or sample.keyframe is None:
+        return way
+    return sample.covariance - carried(sample.keyframe.covariance, T)

@@ -1,0 +1,155 @@
+"""A ROS 2 node over bare Zenoh, for tests and measurements: nothing of ours, messages by `words`."""
+
+import itertools
+import json
+import math
+import queue
+import time
+from typing import Any
+
+import words
+import xxhash
+import zenoh
+from zenoh.ext import Int64, UInt8, z_deserialize, z_serialize
+from zenoh.handlers import Callback
+
+
+def session(endpoint: str) -> zenoh.Session:
+    """As a client of whatever listens there."""
+    config = zenoh.Config()
+    for path, value in {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
+
+
+def topic_key(domain: int, topic: str, cls: type) -> str:
+    package, folder, name = words.type_name(cls).split("/")
+    return f"{domain}{topic}/{package}::{folder}::dds_::{name}_/{words.type_hash(cls)}"
+
+
+class RosNode:
+    """Publishes and hears; what is heard comes as (topic, message, attachment)."""
+
+    def __init__(self, bus: zenoh.Session, domain: int) -> None:
+        self._bus, self._domain, self._gid = bus, domain, xxhash.xxh3_128_digest(b"robot")
+        self._publishers: dict[str, Any] = {}
+        self._sequence = itertools.count(1)
+        self.came: queue.SimpleQueue[tuple[str, Any, Any]] = queue.SimpleQueue()
+        self._kept: list[Any] = []
+
+    def publish(self, topic: str, message: Any) -> None:
+        """With the attachment that rmw_zenoh's subscriptions want."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self._bus.declare_publisher(topic_key(self._domain, topic, type(message)))
+        gid = [UInt8(byte) for byte in self._gid]
+        head = bytes(z_serialize(Int64(next(self._sequence)))) + bytes(z_serialize(Int64(time.time_ns())))
+        self._publishers[topic].put(bytes(message.serialize()), attachment=head + bytes(z_serialize(gid)))
+
+    def subscribe(self, topic: str, cls: Any) -> None:
+        def hear(sample: zenoh.Sample) -> None:
+            attached = sample.attachment.to_bytes() if sample.attachment else b""
+            self.came.put((topic, cls.deserialize(sample.payload.to_bytes()), read_attachment(attached)))
+
+        key = topic_key(self._domain, topic, cls)
+        self._kept.append(self._bus.declare_subscriber(key, Callback(hear, indirect=False)))
+
+    def tokens(self) -> list[str]:
+        """Who is there, as `ros2 topic list` finds out."""
+        replies = self._bus.liveliness().get(f"@ros2_lv/{self._domain}/**", timeout=5)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+    def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> None:
+        """Until so many publishers and subscriptions are seen: a token comes after what it stands for."""
+        seen: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+        def see(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr).split("/")[5] in ("MP", "MS"):
+                seen.put(str(sample.key_expr))
+
+        key = f"@ros2_lv/{self._domain}/**"
+        watching = self._bus.liveliness().declare_subscriber(key, Callback(see, indirect=False), history=True)
+        for _ in range(count):
+            seen.get(timeout=timeout_s)
+        watching.undeclare()
+
+    def wait_for(self, topic: str, timeout_s: float = 30.0) -> tuple[Any, Any]:
+        """The next message on a topic; others are passed over."""
+        end = time.monotonic() + timeout_s
+        while True:
+            came, message, attached = self.came.get(timeout=max(end - time.monotonic(), 0.001))
+            if came == topic:
+                return message, attached
+
+
+def read_attachment(data: bytes) -> tuple[int, int, bytes]:
+    """Number, time, gid, by Zenoh's own serialisation."""
+    number, stamp = z_deserialize(Int64, zenoh.ZBytes(data[:8])), z_deserialize(Int64, zenoh.ZBytes(data[8:16]))
+    return int(number), int(stamp), bytes(z_deserialize(list[UInt8], zenoh.ZBytes(data[16:])))
+
+
+def stamp(ns: int) -> Any:
+    return words.Time(ns // 10**9, ns % 10**9)
+
+
+def pose(x: float, y: float, yaw: float) -> Any:
+    turn = words.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    return words.Pose(words.Point(x, y, 0.0), turn)
+
+
+def plane(of: Any) -> tuple[float, float, float]:
+    """x, y and yaw of a Pose or a Transform."""
+    where, turn = (of.position, of.orientation) if hasattr(of, "position") else (of.translation, of.rotation)
+    return where.x, where.y, math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
+
+
+def compose(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], math.remainder(a[2] + b[2], math.tau)
+
+
+def inverse(a: tuple[float, float, float]) -> tuple[float, float, float]:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
+
+
+def diagonal(*variances: float) -> list[float]:
+    """36 numbers."""
+    made = [0.0] * 36
+    made[::7] = variances
+    return made
+
+
+def odometry(ns: int, where: tuple[float, float, float], speeds: list[float] | None = None) -> Any:
+    """speeds: variances of the six velocities."""
+    still = words.Twist(words.Vector3(0.0, 0.0, 0.0), words.Vector3(0.0, 0.0, 0.0))
+    return words.Odometry(
+        words.Header(stamp(ns), "odom"),
+        "base_link",
+        words.PoseWithCovariance(pose(*where), [0.0] * 36),
+        words.TwistWithCovariance(still, diagonal(*(speeds or [0.0] * 6))),
+    )
+
+
+def detections(ns: int, frame: str, seen: list[tuple[str, tuple[float, float, float], float]]) -> Any:
+    """seen: identity, position, standard deviation of each."""
+    made = []
+    for identity, (x, y, z), sigma in seen:
+        where = words.Pose(words.Point(x, y, z), words.Quaternion(0.0, 0.0, 0.0, 1.0))
+        variances = [sigma**2] * 3 + [0.0] * 3
+        result = words.ObjectHypothesisWithPose(
+            words.ObjectHypothesis(identity, 1.0), words.PoseWithCovariance(where, diagonal(*variances))
+        )
+        box = words.BoundingBox3D(where, words.Vector3(0.1, 0.1, 0.1))
+        made.append(words.Detection3D(words.Header(stamp(ns), frame), [result], box, ""))
+    return words.Detection3DArray(words.Header(stamp(ns), frame), made)
+
+
+def known_pose(ns: int, where: tuple[float, float, float], variances: list[float]) -> Any:
+    return words.PoseWithCovarianceStamped(
+        words.Header(stamp(ns), "map"), words.PoseWithCovariance(pose(*where), diagonal(*variances))
+    )

@@ -1,0 +1,45 @@
+"""The commands of deploy/ros2/README.md work as they stand there, but for the ports; its options and codes exist."""
+
+import re
+import shlex
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import ros
+from processes import Process
+
+from factorbus.cli.ros2 import command
+from factorbus.ros2.settings import Floors, Settings
+
+README = (Path(__file__).parents[2] / "deploy" / "ros2" / "README.md").read_text(encoding="utf-8")
+
+
+def test_its_commands_run(spawn: Callable[..., Process]) -> None:
+    """The robot's router is another service here: any Zenoh hub is one."""
+    serve, join = (shlex.split(text)[1:] for text in re.findall(r"^```bash\n(.*?)^```$", README, re.M | re.S))
+    assert serve[-2:] == ["--listen", "tcp/127.0.0.1:7448"]
+    assert join[2:] == ["--connect", "tcp/127.0.0.1:7448", "--ros", "tcp/127.0.0.1:7447"]
+    ours, theirs = (spawn("-m", "factorbus.cli", *serve[:-1], "tcp/127.0.0.1:0", "--no-warm") for _ in range(2))
+    (at,), (router,) = ours.ready(), theirs.ready()
+    bridge = spawn("-m", "factorbus.cli", *join[:3], at, "--ros", router)
+    assert bridge.ready() == [router]
+    with ros.session(router) as bus:
+        node = ros.RosNode(bus, 0)
+        node.wait_for_endpoints(6)
+        assert any(token.endswith("/NN/%/%/factorbus") for token in node.tokens())
+    bridge.signal(signal.SIGINT)
+    assert bridge.wait() == 0
+
+
+def test_its_options_and_numbers_are_those_of_the_command() -> None:
+    named = set(re.findall(r"`(--[a-z-]+)", README))
+    assert named <= {option for parameter in command.params for option in parameter.opts} | {"--listen"}
+    defaults = Settings()
+    assert {defaults.odometry, *defaults.poses, *defaults.landmarks, defaults.transforms} <= set(
+        re.findall(r"`(/\w+)`", README)
+    )
+    floors = Floors()
+    assert (floors.drift_m, floors.drift_rad, floors.turn_rad) == (0.02, 0.01, 0.02)
+    assert (floors.least_m, floors.least_rad) == (0.001, 0.001)
+    assert (floors.pose_m, floors.pose_rad, floors.landmark_m) == (0.01, 0.01, 0.01)
