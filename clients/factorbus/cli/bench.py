@@ -11,7 +11,7 @@ from factorbus.cli.exits import FAILED, OK, Stopped
 from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
-BENCHES = ("cholesky", "bus", "idp")  # what `all` runs, a minute or two
+BENCHES = ("cholesky", "bus", "idp", "ros2")  # what `all` runs, a minute or two
 LONG = ("paper", "peers", "fuzz")  # hours (fuzz: half an hour); on request
 ASKED = ("ask",)  # a minute or two, most of it GTSAM's; on request
 
@@ -28,6 +28,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
     idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
                --figures FOLDER, --no-workers
+    ros2       a robot's odometry with its transform back through `factorbus ros2`, against bare Zenoh
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
@@ -35,7 +36,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
     fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
-    all        cholesky, bus and idp
+    all        cholesky, bus, idp and ros2
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
     the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.
