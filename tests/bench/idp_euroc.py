@@ -124,9 +124,10 @@ def similar(way: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, float]:
 
 def ask_evo(folder: Path) -> dict[str, float] | None:
     """What evo says of the two trajectories; None where it is not installed."""
-    if shutil.which("evo_ape") is None:
+    beside = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", "")))
+    if (program := shutil.which("evo_ape", path=beside)) is None:
         return None
-    command = ["evo_ape", "tum", "truth.tum", "filter.tum", "--align", "--correct_scale", "--no_warnings"]
+    command = [program, "tum", "truth.tum", "filter.tum", "--align", "--correct_scale", "--no_warnings"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     words = (line.split() for line in ran.stdout.splitlines())
     return {row[0]: float(row[1]) for row in words if len(row) == 2 and row[0] in ("rmse", "max", "mean", "median")}

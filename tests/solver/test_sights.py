@@ -15,6 +15,8 @@ from factorbus.proto.kinds import LOSSES
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels.linearise import evaluate_one
@@ -222,6 +224,31 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     place = (weak + 1e6 * strong) / (1e6 + 1)
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
     assert solver.chi2() == pytest.approx(ASLEEP + 16.0, rel=1e-3)
+    accounts = why_variable(Blocks(solver.factored()), solver._graph.find(P), keeps_steps=False).factors
+    assert [account.asleep for account in accounts] == ["", why, ""]
+    assert accounts[1].influence == 0.0
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_why_says_what_a_loss_leaves_of_a_factor(loss: str) -> None:
+    """Two priors that contradict each other; the second, weaker one has a loss."""
+    for apart in (0.5, 3.0, 40.0):
+        places, given = np.array([[0.0, 0, 0], [apart, 0, 0]]), (1e4 * unit(3), unit(3))
+        first, second = (
+            Factors("prior_point3", np.array([[P]]), place[None], information)
+            for place, information in zip(places, given, strict=True)
+        )
+        solver = Solver()
+        soft = second._replace(loss=loss, scale=np.array([2.0]))
+        solver.stage(Batch((Variables("point3", np.array([P]), places[:1]),), (first, soft)))
+        solver.step(settle=True)
+        s = float(np.sum((solver.estimate()[0].values[0] - places[1]) ** 2))
+        account = why_factor(Blocks(solver.factored()), 1)
+        assert (account.loss, account.asleep) == (loss, "")
+        assert account.weight == pytest.approx(weight(loss, 2.0, s), rel=1e-6)
+        assert account.chi2 == pytest.approx(account.weight * s, rel=1e-6)
+        plain = why_factor(Blocks(solver.factored()), 0)
+        assert (plain.loss, plain.weight) == ("", 1.0)
 
 
 def test_a_point_by_two_pixels_and_a_camera_by_its_points_are_held() -> None:

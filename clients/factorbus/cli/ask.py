@@ -192,7 +192,10 @@ def _factor_line(account: Any) -> str:
     without = account["without"]
     fall = "nothing else measures this" if without is None else f"without it χ² falls by {without:.3g}"
     share = f"{account['influence']:.2f} of {account['dims']} known from it"
-    return f"χ² {account['chi2']:.3g}, {share}, {fall}"
+    told = f"χ² {account['chi2']:.3g}, {share}, {fall}"
+    if account.get("asleep"):
+        return f"asleep: {account['asleep']}"
+    return f"{told}, weight {account['weight']:.2g} by {account['loss']}" if account.get("loss") else told
 
 
 def _told(account: Any) -> str:

@@ -59,6 +59,12 @@ def asleep(graph: Graph) -> list[tuple[int, str, str]]:
         found.append((int(row), graph.describe(graph.fac[row]), REASONS[int(status)]))
 
 
+def why_asleep(graph: Graph, factor: int) -> str:
+    """Why the sight `factor` has no pixel at the present values; empty: it has one, or is no sight."""
+    row, status = find_lost(False, factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload)
+    return REASONS[int(status)] if row >= 0 else ""
+
+
 @lru_cache(maxsize=64)
 def _limit(kind: str, code: float, fu: float, fv: float, _cx: float, _cy: float, limit: float, *more: float) -> float:
     if code not in (lens_at.RADIAL, lens_at.RADTAN, lens_at.FISHEYE):

@@ -1,14 +1,16 @@
 """What holds a variable, and what a factor does: the numbers behind an estimate.  MATH §10.5."""
 
+import copy
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from factorbus.solver import errors
+from factorbus.solver import errors, sights
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import Linear, judge_rows, linearised
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
+from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64
@@ -34,6 +36,8 @@ class UnknownFactor(errors.SolverError):
 class FactorAccount:
     """One factor at the estimate.
 
+    loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one; residual and all that follows are times √w
+    asleep: why a sight has no pixel, and so no weight; else ""
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: rᵀ Ω r
     influence: tr(Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: rᵀ (Ω⁻¹ − H Σ Hᵀ)⁻¹ r, by how much χ² would fall without it; None: nothing else measures what it does
@@ -48,6 +52,9 @@ class FactorAccount:
     dims: int
     influence: float
     without: float | None
+    loss: str
+    weight: float
+    asleep: str
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
@@ -150,5 +157,16 @@ def _account(blocks: Blocks, factor: int, linear: Linear, T: F64) -> FactorAccou
     if left[0] > _NOTHING:
         without = float(weighted @ np.linalg.solve(np.eye(d) - L.T @ T @ L, weighted))
     return FactorAccount(
-        factor, kind.name, keys, r, weighted, float(weighted @ weighted), d, float(np.trace(W @ T)), without
-    )
+        factor, kind.name, keys, r, weighted, float(weighted @ weighted), d, float(np.trace(W @ T)), without,
+        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), _weight(graph, factor, linear),
+        sights.why_asleep(graph, factor),
+    )  # fmt: skip
+
+
+def _weight(graph: Graph, factor: int, linear: Linear) -> float:
+    """w, from r with and without the loss."""
+    plain = copy.copy(graph)
+    plain.fac = graph.fac[: factor + 1].copy()
+    plain.fac[factor, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
+    r = linearised(plain, factor, factor + 1).r[0]
+    return float(linear.r[0] @ linear.r[0]) / float(r @ r) if r.any() else 1.0
