@@ -14,7 +14,8 @@ from factorbus.solver import FactorGroup, Group, Options, Solver, errors
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import judge_candidates
 from factorbus.solver.covariance.relative import relative
-from factorbus.solver.covariance.why import UnknownFactor, why_factor, why_variable
+from factorbus.solver.covariance.why import why_factor, why_variable
+from factorbus.solver.errors import UnknownFactor
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS

@@ -11,6 +11,8 @@ from factorbus.cli.exits import FAILED, OK, input_file
 from factorbus.cli.options import DEFAULT_ENDPOINT, file_argument, json_option, zenoh_option
 from factorbus.cli.screen import document, table
 
+_SHOWN = 20  # more false factors than these are told with --json only
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -174,6 +176,60 @@ def why_command(name: str, what: str, connect: str, zenoh: str, timeout_s: float
     step = found.step
     if step:
         table([("the last step", f"{step['strategy']}, because {step['because']}")])
+    return OK
+
+
+@command.command("repair")
+@_asking
+@click.argument("factors", nargs=-1, type=int)
+@click.option("--apply", "applied", is_flag=True, help="Take what is false out of the map, and settle it.")
+@click.option("--loss", "loss", metavar="LOSS", default="", help="With --apply: keep it, with this robust loss.")
+@click.option(
+    "--probability",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.99,
+    show_default=True,
+    help="With which a right measurement is kept.",
+)
+def repair_command(
+    name: str,
+    factors: tuple[int, ...],
+    applied: bool,
+    loss: str,
+    probability: float,
+    connect: str,
+    zenoh: str,
+    timeout_s: float,
+    as_json: bool,
+) -> int:
+    """Which of the factors FACTORS (ids), or of all that close loops, are false. Changes nothing without --apply.
+
+    \b
+    factorbus ask repair warehouse
+    factorbus ask repair warehouse --apply
+    factorbus ask repair warehouse 17 18 --apply --loss dcs
+    """
+    from factorbus.client import Changes
+
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.repair(factors or None, probability=probability, timeout_s=timeout_s)
+        if applied and found.factors.size:
+            changes = Changes().repair(found, (loss, 1.0) if loss else None)
+            asked.change(changes, settle=True, timeout_s=timeout_s)
+    rows = list(zip(found.factors.tolist(), found.distance.tolist(), strict=True))
+    if as_json:
+        content = {"revision": found.revision, "suspects": found.suspects, "before": found.before, "after": found.after}
+        document(content | {"false": [{"factor": factor, "distance": s} for factor, s in rows], "applied": applied})
+        return OK
+    table(
+        [
+            ("looked at", str(found.suspects)),
+            ("false", f"{len(rows)}{', taken care of' if applied and rows else ''}"),
+            ("cost", f"{found.before:.6g}, without them {found.after:.6g}"),
+            *((str(factor), f"rᵀΩr {s:.4g}") for factor, s in rows[:_SHOWN]),
+        ],
+        title=f"At revision {found.revision}, in {found.seconds:.2f} s",
+    )
     return OK
 
 

@@ -8,6 +8,7 @@
 """
 
 from factorbus.client.bus import Bus, connect
+from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.grown import Factored, Grown
@@ -21,6 +22,7 @@ __all__ = [
     "BadCamera",
     "Bus",
     "Camera",
+    "Changes",
     "Draft",
     "Factored",
     "Features",

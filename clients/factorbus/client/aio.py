@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Doubt
+from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft, Key
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
@@ -27,6 +28,7 @@ from factorbus.client.map import MapRow
 from factorbus.client.mirror import Mirror
 from factorbus.client.stream import DeltaStream
 from factorbus.client.ticket import NoAnswerYet, Ticket
+from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, Graph
 
@@ -141,20 +143,33 @@ class Map:
         *,
         settle: bool = False,
         points_below: float = 0.0,
+        changes: Changes | None = None,
         timeout_s: float | None = None,
     ) -> Accepted:
-        """Add `batch` to the map and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
-        return await self.result(await self.send(batch, settle=settle, points_below=points_below), timeout_s)
+        """Make `changes`, add `batch` and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
+        sent = await self.send(batch, settle=settle, points_below=points_below, changes=changes)
+        return await self.result(sent, timeout_s)
 
     async def settle(self, timeout_s: float | None = None) -> Accepted:
         """Have the map iterate until it has converged.  Raises Refused, NoAnswerYet."""
         return await self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
-    async def send(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> Ticket:
+    async def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+        """Change what the map has: remove, weigh, fix, ...  Raises Refused, NoAnswerYet."""
+        return await self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+
+    async def send(
+        self,
+        batch: Batch | Draft,
+        *,
+        settle: bool = False,
+        points_below: float = 0.0,
+        changes: Changes | None = None,
+    ) -> Ticket:
         """Send `batch`; waits only while the window is full."""
         await self._room.acquire()
         try:
-            ticket = self._map.send(batch, settle=settle, points_below=points_below)
+            ticket = self._map.send(batch, settle=settle, points_below=points_below, changes=changes)
         except BaseException:
             self._room.release()
             raise
@@ -184,6 +199,12 @@ class Map:
     async def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s))
+
+    async def repair(
+        self, factors: Sequence[int] | None = None, *, probability: float = 0.99, timeout_s: float | None = None
+    ) -> Repaired:
+        """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))
 
     async def graph(self, timeout_s: float | None = None) -> Graph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
+from factorbus.client.changes import Changes
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft, Key
 from factorbus.client.link import Link
@@ -17,6 +18,7 @@ from factorbus.client.ticket import Ticket
 from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
+from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
 from factorbus.proto.problems import Problem, Refused, TooLarge, Unavailable
@@ -92,17 +94,19 @@ class Map:
         *,
         settle: bool = False,
         points_below: float = 0.0,
+        changes: Changes | None = None,
         timeout_s: float | None = None,
     ) -> Accepted:
         """Add `batch` to the map and wait until it is in the estimate, the mirror included.
 
         points_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
+        changes: are made first; all of it happens or none.
 
         Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
         """
         end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
         left = end - time.monotonic()
-        ticket = self.send(batch, settle=settle, points_below=points_below, timeout_s=left)
+        ticket = self.send(batch, settle=settle, points_below=points_below, changes=changes, timeout_s=left)
         accepted = ticket.result(max(end - time.monotonic(), 0.0))
         self._catch_up(max(end - time.monotonic(), 0.0))
         return accepted
@@ -111,12 +115,17 @@ class Map:
         """Have the map iterate until it has converged.  Raises Refused, Unavailable."""
         return self.insert(Batch(), settle=True, timeout_s=timeout_s)
 
+    def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
+        """Change what the map has: remove, weigh, fix, ...  Raises Refused (the map is as it was), Unavailable."""
+        return self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+
     def send(
         self,
         batch: Batch | Draft,
         *,
         settle: bool = False,
         points_below: float = 0.0,
+        changes: Changes | None = None,
         timeout_s: float | None = None,
     ) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
@@ -128,7 +137,9 @@ class Map:
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._changed:
                 self._wait_for_room(timeout_s)
-            ticket = self._ticket(Insert(self._window.next, batch, settle, self.epoch, points_below), timeout_s)
+            listed = changes.listed() if changes is not None else ()
+            insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
+            ticket = self._ticket(insert, timeout_s)
             with self._changed:
                 self._window.sent(ticket)
             self._courier.carry(ticket.errand)
@@ -169,6 +180,16 @@ class Map:
     def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
         return self.ask.chi2(batch, timeout_s).result()
+
+    def repair(
+        self, factors: Sequence[int] | None = None, *, probability: float = 0.99, timeout_s: float | None = None
+    ) -> Repaired:
+        """Which factors (ids; None: of all that close loops) are false; nothing is changed yet.
+
+        probability: with which a right one is kept.  `change(Changes().repair(answer), settle=True)` applies it.
+        Raises Refused, Unavailable.
+        """
+        return self.ask.repair(factors, probability, timeout_s).result()
 
     def graph(self, timeout_s: float | None = None) -> Graph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""

@@ -9,8 +9,10 @@ import numpy as np
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Key
 from factorbus.proto import codec, keys
+from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.messages import Chi2, Estimate, Graph
 from factorbus.proto.problems import BadMessage
+from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
 from factorbus.proto.symbols import parse_symbol
 
 T = TypeVar("T")
@@ -44,6 +46,12 @@ class Questions:
     def export(self, format: str, timeout_s: float | None) -> Future[str]:
         """The map as the text of a file."""
         return self._ask("export", codec.encode_map({"format": format}), _text, timeout_s)
+
+    def repair(self, factors: Sequence[int] | None, probability: float, timeout_s: float | None) -> Future[Repaired]:
+        """Which factors are false, and the estimate without them."""
+        chosen = None if factors is None else np.array(factors, np.int64)
+        question = encode_ask_repair(AskRepair(chosen, probability, values=True))
+        return self._ask("repair", question, decode_repaired, timeout_s)
 
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"

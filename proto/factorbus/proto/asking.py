@@ -1,6 +1,6 @@
-"""Questions about uncertainty, and their answers: covariances, gates, associations, gains.  As values.
+"""Questions about uncertainty, and their answers: covariances, gates, associations, gains, repairs.  As values.
 
-`asking_codec` turns them into bytes and back, `proto/README.md` §16 explains them.
+`asking_codec` and `repair_codec` turn them into bytes and back, `proto/README.md` §16 and §17 explain them.
 """
 
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.messages import Factors
+from factorbus.proto.messages import Factors, Variables
 from factorbus.proto.symbols import parse_symbol
 
 BLOCKS = ("diagonal", "joint", "cross", "relative", "last")
@@ -158,3 +158,34 @@ class Why:
     variable: Mapping[str, Any]
     factor: Mapping[str, Any]
     step: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class AskRepair:
+    """Which of `factors` (n,) ids are false, None: of all that close loops.  probability: that a right one is kept.
+
+    values: the answer is to have the repaired estimate.
+    """
+
+    factors: I64 | None = None
+    probability: float = 0.99
+    values: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """factors (n,): ids of those that are false; distance (n,): s of each at the repaired estimate.
+
+    suspects: how many were looked at.  before, after: what the map costs as it is and repaired, each suspect no more
+    than its bound.  variables: the repaired estimate, if it was asked for.
+    """
+
+    epoch: int
+    revision: int
+    factors: I64
+    distance: F64
+    suspects: int
+    before: float
+    after: float
+    seconds: float
+    variables: tuple[Variables, ...] = ()

@@ -14,6 +14,7 @@ import numpy as np
 
 from factorbus.proto import fields
 from factorbus.proto.arrays import I64
+from factorbus.proto.change_columns import changes_to_maps, read_changes
 from factorbus.proto.columns import factors_to_maps, read_batch, read_values, variables_to_maps
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Graph, Insert, Job, JobDone, Optimum
@@ -35,6 +36,8 @@ def encode_insert(message: Insert) -> bytes:
         content["settle"] = True
     if message.points_below:
         content["points_below"] = message.points_below
+    if message.changes:
+        content["changes"] = changes_to_maps(message.changes)
     return _pack(content)
 
 
@@ -47,6 +50,7 @@ def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
         settle=fields.flag("", content, "settle"),
         epoch=fields.integer("", content, "epoch", default=0),
         points_below=fields.number("", content, "points_below") if "points_below" in content else 0.0,
+        changes=read_changes(content) if "changes" in content else (),
     )
 
 

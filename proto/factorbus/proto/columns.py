@@ -1,11 +1,12 @@
 """Groups of variables and factors as maps of columns, both ways.  Shapes come from the kind and the number of keys."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from factorbus.proto import fields
+from factorbus.proto.arrays import I64
 from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
@@ -67,6 +68,8 @@ def _factors_map(group: Factors) -> dict[str, Any]:
     }
     if group.loss:
         content |= {"loss": group.loss, "scale": _bytes(group.scale, F8)}
+    if group.ids is not None:
+        content["ids"] = _bytes(group.ids, I8)
     return content
 
 
@@ -104,14 +107,22 @@ def _read_factors(index: int, content: Map) -> Factors:
     keys = fields.keys(place, content, len(known.connects))
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)
+    ids = _read_ids(place, content, len(keys)) if "ids" in content else None
     loss = content.get("loss")
     if loss is None:
-        return Factors(known.name, keys, measured, information)
+        return Factors(known.name, keys, measured, information, ids=ids)
     if type(loss) is not str or loss not in LOSSES:
         seen = repr(loss[:64]) if type(loss) is str else "not a string"
         raise BadMessage(f"{place()}.loss", seen, f"one of {', '.join(LOSSES)}, or no such field")
     scale = fields.rows(place, content, "scale", len(keys), 1).reshape(-1)
-    return Factors(known.name, keys, measured, information, loss, scale)
+    return Factors(known.name, keys, measured, information, loss, scale, ids)
+
+
+def _read_ids(place: Callable[[], str], content: Map, count: int) -> I64:
+    value = fields.binary(place(), content, "ids")
+    if len(value) != 8 * count:
+        raise BadMessage(f"{place()}.ids", f"{len(value)} bytes", f"{8 * count} ({count} int64)")
+    return np.ndarray((count,), I8, value)
 
 
 def _row_size(content: Map, count: int) -> int:

@@ -18,7 +18,7 @@ import re
 from factorbus.proto.problems import BadName
 
 PREFIX = "factorbus/v1"
-QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why")
+QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair")
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 

@@ -69,3 +69,26 @@ FACTOR_KINDS = {
         FactorKind("point_seen", ("se3", "point3"), 13, 2, f"{_PIXEL}, {_LENS}"),
     )
 }
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeKind:
+    """A change of what a map has: it names factors (by id) or variables (by key); `numbers`: its column, if any."""
+
+    name: str
+    names: str
+    numbers: str = ""
+
+
+CHANGES = {
+    kind.name: kind
+    for kind in (
+        ChangeKind("remove_factors", "factors"),
+        ChangeKind("remove_variables", "keys"),
+        ChangeKind("loss", "factors", "scale"),
+        ChangeKind("weigh", "factors", "weight"),
+        ChangeKind("fix", "keys"),
+        ChangeKind("free", "keys"),
+        ChangeKind("place", "keys", "values"),
+    )
+}

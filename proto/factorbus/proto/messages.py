@@ -31,7 +31,8 @@ class Factors(NamedTuple):
 
     keys (m, arity) in the kind's `connects` order; measured (m, kind.size); information (m, r(r+1)/2): the upper
     triangle of the information matrix (inverse covariance) row by row, r = kind.dim.  loss: one of `kinds.LOSSES` that
-    all of them have, "": none; scale (m,): of the loss, standard deviations.
+    all of them have, "": none; scale (m,): of the loss, standard deviations.  ids (m,): of a whole graph, what each is
+    called in changes and questions.
     """
 
     kind: str
@@ -40,6 +41,30 @@ class Factors(NamedTuple):
     information: F64
     loss: str = ""
     scale: F64 | None = None
+    ids: I64 | None = None
+
+
+class Change(NamedTuple):
+    """A change of what a map has: `change` is one of `kinds.CHANGES`, which says what the other fields are for.
+
+    factors (n,): ids, `first_factor` of an Accepted and on; keys (n,): of variables.
+    remove_factors    factors                    they go
+    remove_variables  keys, alone                they go, and every factor on them; alone: refused if another is on them
+    loss              factors, loss, scale (n,)  their loss from now on; "": none
+    weigh             factors, weight (n,)       their information is multiplied by it
+    fix, free         keys                       held where they are; estimated again
+    place             kind, keys, values         variables of one kind go to these values (n, size)
+    """
+
+    change: str
+    factors: I64 | None = None
+    keys: I64 | None = None
+    loss: str = ""
+    scale: F64 | None = None
+    weight: F64 | None = None
+    alone: bool = False
+    kind: str = ""
+    values: F64 | None = None
 
 
 class Batch(NamedTuple):
@@ -66,6 +91,7 @@ class Insert(NamedTuple):
 
     sequence: 1, 2, 3, ... per client and map; the same number again gets the first answer again.
     epoch: the epoch of the map the client joined, or 0 for "whichever"; another one is refused.
+    changes: made before `batch` is added, in their order; all of it happens or none.
     """
 
     sequence: int
@@ -73,6 +99,7 @@ class Insert(NamedTuple):
     settle: bool = False
     epoch: int = 0
     points_below: float = 0.0
+    changes: tuple[Change, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

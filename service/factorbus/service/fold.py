@@ -5,8 +5,11 @@
     3  if the step fails, nobody knows yet whose fault it is: the solver has taken all of them back, and they are
        tried again one at a time, so that only the guilty are refused
 
+An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
+the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
+
 A fault of the solver itself (anything but SolverError) leaves it in a state nobody can vouch for.  It is replaced by
-a new one with the content that had been accepted, which is append-only and counted here, and the whole estimate is
+a new one with the content that had been accepted, which comes first and is counted here, and the whole estimate is
 published again; the insert that brought the fault about is refused as internal.
 """
 
@@ -15,18 +18,19 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from itertools import groupby
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Accepted, Batch, Delta, Variables
+from factorbus.proto.messages import Accepted, Batch, Delta, Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
 from factorbus.service.events import Alone, Folded, Judged, Located, Outcome, Stepped, Waiting
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
-from factorbus.service.questions import Question, Snapshot, as_factors, as_variables, snapshot
+from factorbus.service.questions import Question, Snapshot, snapshot
 from factorbus.service.uncertain import Uncertain
 from factorbus.solver.errors import SolverError
 
@@ -160,12 +164,45 @@ class Folder:
         the end.
         """
         cpu_s = time.thread_time()
+        for changing, group in groupby(inserts, _is_change):
+            if changing:
+                for insert in group:
+                    yield from self._change(insert)
+            else:
+                yield from self._add(list(group))
+        yield self._folded(cpu_s)
+
+    def _add(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
+        """Inserts that only add: in one step, or one at a time where that fails."""
         try:
             yield from self._together(inserts)
         except _TakenBack:
             for insert in inserts:
                 yield from self._together([insert])
-        yield self._folded(cpu_s)
+
+    def _change(self, insert: Waiting) -> Iterator[Judged | Stepped]:
+        """One that changes what the map has: in a new solver, so that the map is as it was wherever that fails."""
+        content, started = cast(Insert, insert.content), time.perf_counter()
+        try:
+            if self._broken:
+                raise Broken(self._broken)
+            self._check_room(insert.size, content.batch)
+            solver, first_factor, report, counted = self._solver.with_changes(
+                content.changes, content.batch, content.settle
+            )
+        except (Problem, SolverError) as problem:
+            yield Judged((Outcome(insert, problem),))
+            return
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: the solver failed in a change; the map goes on without it", reference)
+            yield Judged((Outcome(insert, Internal(reference)),))
+            return
+        self._solver = solver
+        staged = _Staged(insert, first_factor, content.settle, content.points_below)
+        yield from self._stepped([staged], [], report, started, counted)
+        if content.points_below:
+            yield from self._ripen(content.points_below)
 
     def fold_alone(self, insert: Waiting) -> Alone | Iterator[Judged | Stepped | Folded]:
         """What `fold` comes to for one insert: in one piece where all goes as usual, in a third of the time.
@@ -291,10 +328,15 @@ class Folder:
                     raise TooLarge("the map with this insert", count + more, limit, what)
 
     def _stepped(
-        self, staged: Sequence[_Staged], refused: Sequence[Outcome], report: Any, started: float
+        self,
+        staged: Sequence[_Staged],
+        refused: Sequence[Outcome],
+        report: Any,
+        started: float,
+        changed: Mapping[str, int] | None = None,
     ) -> Iterator[Judged | Stepped]:
-        """The step went well: the answers, then the delta."""
-        account = report.as_dict()
+        """The step went well: the answers, then the delta; after a change that has everything."""
+        account = report.as_dict() | (changed or {})
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
         accepted = [
@@ -310,7 +352,7 @@ class Folder:
         self._held = self._solver.variable_count, self._solver.factor_count
         yield Judged((*accepted, *refused), self._revision, len(staged))
         try:
-            told = self._told(account)
+            told = self._told(account, None if changed is None else 0)
         except Exception:
             # The step is done and answered; who misses its delta sees the gap.
             yield from self._replace_solver(self._fault())
@@ -373,22 +415,20 @@ class Folder:
 
     def _rebuild(self) -> dict[str, Any] | None:
         """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""
-        variables, factors = self._solver.graph(*self._held)
-        kept = Batch(tuple(_checked(group) for group in as_variables(variables)), as_factors(factors))
-        found = kept.variable_count, kept.factor_count
+        variables, _ = self._solver.graph(*self._held)
+        for group in variables:
+            if not np.isfinite(group.values).all():
+                raise ValueError(f"the failed solver's values of {group.kind} are not finite")
+        fresh, started = self._make(), time.perf_counter()
+        report = fresh.renew(self._solver, *self._held)
+        found = fresh.variable_count, fresh.factor_count
         if found != self._held:
             raise ValueError(f"the failed solver holds {found} variables and factors; accepted were {self._held}")
-        fresh, started = self._make(), time.perf_counter()
-        account = None
-        if any(self._held):
-            fresh.stage(kept)
-            account = fresh.step().as_dict()
-            account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._solver = fresh
-        return account
+        if not any(self._held):
+            return None
+        return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
 
 
-def _checked(group: Variables) -> Variables:
-    if group.values is None or not np.isfinite(group.values).all():
-        raise ValueError(f"the failed solver's values of {group.kind} are not finite")
-    return group
+def _is_change(insert: Waiting) -> bool:
+    return isinstance(insert.content, Insert) and bool(insert.content.changes)

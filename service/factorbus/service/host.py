@@ -225,7 +225,7 @@ class Host:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
                     # measured: an answer sent before its delta is encoded makes the delta 0.2 ms later.
-                    effects = self.core.judged(event)
+                    effects += self.core.judged(event)
                     continue
                 stepped = isinstance(event, Stepped)
                 effects += self.core.stepped(event) if stepped else self.core.folded(event)

@@ -4,6 +4,7 @@ A snapshot is taken on the solver's thread between two steps and is a copy: maki
 somebody else's time, and no reader sees half a step or holds one up.
 """
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,13 +13,16 @@ import numpy as np
 
 from factorbus.proto import codec
 from factorbus.proto.arrays import I64
+from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import BadMessage, Problem, UnknownQuestion
+from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.service.lacking import NotInMap
 from factorbus.service.uncertain import DECODE, Uncertain, is_near
 from factorbus.solver.errors import SolverError
+from factorbus.solver.repair import repair
 
 _FORMATS = ("g2o", "tum", "kitti")
 
@@ -41,7 +45,8 @@ class Question:
 class Snapshot:
     """Copies of what some questions need, all of one revision.
 
-    uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.
+    uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
+    solver's copy of everything.
     """
 
     epoch: int
@@ -51,6 +56,7 @@ class Snapshot:
     chi2: float = 0.0
     uncertain: Uncertain | None = None
     ready: Mapping[int, bytes | Exception] = field(default_factory=dict)
+    content: Any = None
 
     @property
     def graph(self) -> Graph:
@@ -66,6 +72,8 @@ def parse(name: str, payload: bytes) -> Question:
         raise UnknownQuestion(name, f"one of {', '.join(QUESTIONS)}")
     if name in DECODE:
         return Question(name, ask=DECODE[name](payload))
+    if name == "repair":
+        return Question(name, ask=decode_ask_repair(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
         return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
@@ -92,7 +100,7 @@ def snapshot(
     if not whole and names & {"estimate", "keyframe"}:
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
-    asked = [question for question in questions if question.ask is not None]
+    asked = [question for question in questions if question.name in DECODE]
     view = solver.try_view() if any(is_near(question.ask) for question in asked) else None
     near = [question for question in asked if view is not None and is_near(question.ask)]
     ready = {}
@@ -102,7 +110,8 @@ def snapshot(
     if uncertain is None and len(near) < len(asked):
         keeps_steps = view is not None or solver.try_view() is not None
         uncertain = Uncertain(solver.factored(), epoch, revision, keeps_steps, account)
-    return Snapshot(epoch, revision, as_variables(variables), as_factors(factors), chi2, uncertain, ready)
+    content = solver.content() if "repair" in names else None
+    return Snapshot(epoch, revision, as_variables(variables), as_factors(factors), chi2, uncertain, ready, content)
 
 
 def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
@@ -112,11 +121,13 @@ def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
 
 def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
     """The solver's factor groups as what the codec takes."""
-    return tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in groups)
+    return tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale, g.ids) for g in groups)
 
 
 def answer(question: Question, taken: Snapshot) -> bytes:
     """The answer to any question but stats and chi2 against batch.  Raises Problem, SolverError."""
+    if question.name == "repair":
+        return _repaired(taken, question.ask)
     if question.ask is not None:
         ready = taken.ready.get(id(question))
         if isinstance(ready, Exception):
@@ -136,6 +147,26 @@ def answer(question: Question, taken: Snapshot) -> bytes:
             "format": question.format,
             "text": _text(question.format, taken.graph.batch),
         }
+    )
+
+
+def _repaired(taken: Snapshot, ask: AskRepair) -> bytes:
+    """On the thread that answers, which may take seconds: nobody else waits for it."""
+    started = time.perf_counter()
+    found = repair(taken.content, ask.factors, ask.probability)
+    variables = as_variables(found.groups) if ask.values else ()
+    return encode_repaired(
+        Repaired(
+            taken.epoch,
+            taken.revision,
+            found.false,
+            found.distance,
+            found.suspects,
+            found.before,
+            found.after,
+            time.perf_counter() - started,
+            variables,
+        )
     )
 
 

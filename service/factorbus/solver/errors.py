@@ -17,6 +17,10 @@
     ├── BadSight               bad_sight               a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
     ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
+    ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
+    ├── NotInMap               unknown_variable        a change of a variable that the map does not have
+    ├── InUse                  in_use                  variables to be removed alone that other factors are on
+    ├── BadWeight              bad_weight              a weight that is not positive
     ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
     └── Underconstrained       underconstrained        a variable that the factors leave free to move
 
@@ -180,6 +184,50 @@ class NotPositiveDefinite(SolverError):
             f"{where}: the information matrix has the eigenvalue {smallest:.3g}, wanted all positive; it is the upper "
             "triangle, row by row, of the inverse of the measurement's covariance",
             where=where,
+        )
+
+
+class UnknownFactor(SolverError):
+    code = "unknown_factor"
+
+    def __init__(self, factor: int, following: int) -> None:
+        seen = "it has been removed" if 0 <= factor < following else f"the next one will be {following}"
+        super().__init__(
+            f"there is no factor {factor}: {seen}; ids are told in the answer to an insert, and in ask/graph",
+            factor=factor,
+        )
+
+
+class NotInMap(SolverError):
+    code = "unknown_variable"
+
+    def __init__(self, key: int, change: str) -> None:
+        super().__init__(
+            f"{change}: there is no variable {printed(key)}, or not any more; ask/estimate has those there are", key=key
+        )
+
+
+class InUse(SolverError):
+    code = "in_use"
+
+    def __init__(self, key: int, factor: int, described: str, count: int) -> None:
+        super().__init__(
+            f"{printed(key)} is not to be removed alone: factor {factor}, {described}, is on it ({count} such in all); "
+            "remove these as well, or say that everything on it goes",
+            key=key,
+            factor=factor,
+            count=count,
+        )
+
+
+class BadWeight(SolverError):
+    code = "bad_weight"
+
+    def __init__(self, factor: int, seen: float) -> None:
+        super().__init__(
+            f"weight of factor {factor}: seen {seen:g}, wanted a finite number above 0; to count it for nothing, "
+            "remove it",
+            factor=factor,
         )
 
 

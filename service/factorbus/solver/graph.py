@@ -3,6 +3,9 @@
 
 A `Mark` is how much of everything was in use at some moment; `forget` goes back to it.  Nothing that was there then
 has been moved, so going back is setting counts and clearing the keys that came after.
+
+A factor's id is the number of factors that the map took in before it, and stays with it when others are removed: the
+ids of the first rows are listed, those of the rows behind them follow each other without gaps.
 """
 
 from typing import TypeAlias
@@ -36,6 +39,8 @@ class Graph:
         self.payload: F64 = np.empty(256)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(64, np.int64)
+        self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
+        self.id_shift = 0  # of a later row: its id less its number
         self._rows = Rows()
 
     @property
@@ -61,6 +66,7 @@ class Graph:
         other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
         other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
         other.fac = self.fac[:factors].copy()
+        other.ids, other.id_shift = self.ids.copy(), self.id_shift
         return other
 
     def reserve_variables(self, more: int, size: int) -> None:
@@ -91,6 +97,32 @@ class Graph:
         """Bytes in use of all arenas."""
         variables, factors, values, payload, columns, _ = self.counts.tolist()
         return 8 * (variables * (at.V_WIDTH + 1) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
+
+    @property
+    def next_id(self) -> int:
+        """The id that the next factor gets."""
+        return int(self.counts[at.FACTORS]) + self.id_shift
+
+    def name_factors(self, ids: I64, following: int) -> None:
+        """The factors that are there have these ids, ascending; the next one gets `following`."""
+        self.ids, self.id_shift = ids, following - ids.size
+
+    def ids_of(self, rows: I64) -> I64:
+        """The ids of the factors in these rows of `fac`."""
+        named = self.ids.size
+        if not named:
+            return rows + self.id_shift
+        return np.where(rows < named, self.ids[np.minimum(rows, named - 1)], rows + self.id_shift)
+
+    def rows_of(self, ids: I64) -> I64:
+        """The rows of the factors with these ids; −1 where there is none."""
+        named, count = self.ids.size, int(self.counts[at.FACTORS])
+        later = ids - self.id_shift
+        found = np.where((later >= named) & (later < count), later, -1)
+        if named:
+            place = np.minimum(np.searchsorted(self.ids, ids), named - 1)
+            found = np.where(self.ids[place] == ids, place, found)
+        return found
 
     def find(self, key: int) -> int:
         """Index of the variable `key`, or −1."""
@@ -134,7 +166,8 @@ class Graph:
             numbers = self.payload[rows[:, at.F_AT, None] + np.arange(width)]
             measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
             own = scale[:, 0].copy() if loss else None
-            groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own))
+            ids = self.ids_of(np.flatnonzero(label == code))
+            groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, ids))
         return groups
 
     def factors_of(self, variable: int) -> list[str]:

@@ -63,7 +63,7 @@ class Group:
 class FactorGroup:
     """Factors of one kind with one loss, in the order of their ids.
 
-    keys (m, arity), measured (m, size), information (m, triangle); with a loss its scale (m,).
+    keys (m, arity), measured (m, size), information (m, triangle); with a loss its scale (m,).  ids (m,), ascending.
     """
 
     kind: str
@@ -72,3 +72,4 @@ class FactorGroup:
     information: F64
     loss: str = ""
     scale: F64 | None = None
+    ids: I64 | None = None

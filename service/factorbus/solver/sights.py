@@ -56,7 +56,7 @@ def asleep(graph: Graph) -> list[tuple[int, str, str]]:
         row, status = find_lost(False, row + 1, last, graph.var, graph.fac, graph.values, graph.payload)
         if row < 0:
             return found
-        found.append((int(row), graph.describe(graph.fac[row]), REASONS[int(status)]))
+        found.append((int(graph.ids_of(np.array([row]))[0]), graph.describe(graph.fac[row]), REASONS[int(status)]))
 
 
 def why_asleep(graph: Graph, factor: int) -> str:

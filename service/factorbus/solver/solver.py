@@ -1,7 +1,7 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -10,9 +10,11 @@ import numpy as np
 from factorbus.solver import errors, sights
 from factorbus.solver.admission import admit, try_admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
+from factorbus.solver.changes import ChangeLike, collect, unchanged
 from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
 from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.upkeep import Upkeep
+from factorbus.solver.edited import edited
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
@@ -39,6 +41,7 @@ _FEW = 8
 # lately: a try that fails costs two linearisations, one that does not saves a factorisation.
 _LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 _REUSE = 0.05
+_POLISH = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +106,7 @@ class Solver:
         except BaseException:
             self._graph.forget(mark)
             raise
-        return mark[at.FACTORS]
+        return mark[at.FACTORS] + self._graph.id_shift
 
     def try_stage(self, raw: bytes, groups: I64) -> int | None:
         """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
@@ -111,7 +114,8 @@ class Solver:
         groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
         caller's word: they are not checked again.
         """
-        return try_admit(self._graph, raw, groups)
+        first = try_admit(self._graph, raw, groups)
+        return None if first is None else first + self._graph.id_shift
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
@@ -179,6 +183,32 @@ class Solver:
         made._graph.take(with_points(self._graph, picked))
         return made, made.step()
 
+    def with_changes(
+        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
+    ) -> tuple["Solver", int, StepReport, dict[str, int]]:
+        """A solver of the same map with `changes` made, in their order, and then `batch` added; this one stays.
+
+        Gives it, the id of the first factor of `batch`, the report of its first step, and what was changed.  That step
+        relinearises everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
+        Raises as `changes.collect`, `stage` and `step` do.
+        """
+        edits = collect(self._graph, changes)
+        made = Solver(self._options)
+        made._graph.take(edited(self._graph, edits))
+        variables, factors = made.variable_count, made.factor_count
+        first = made._graph.next_id if batch is None else made.stage(batch)
+        new = made.variable_count - variables, made.factor_count - factors
+        report = replace(made.step(settle), new_variables=new[0], new_factors=new[1])
+        return made, first, report, edits.counted
+
+    def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
+        """Take over the first so many variables and factors of `other`, as they are; the first step of a new solver."""
+        edits = unchanged(other._graph)
+        edits.stays[variables:] = False
+        edits.kept[factors:] = False
+        self._graph.take(edited(other._graph, edits))
+        return self.step()
+
     def asleep(self) -> list[tuple[int, str, str]]:
         """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
         return sights.asleep(self._graph)
@@ -194,6 +224,10 @@ class Solver:
         """
         picked = None if variables is None else np.arange(min(variables, self.variable_count))
         return self._graph.variables(picked), self._graph.factors(factors)
+
+    def content(self) -> Graph:
+        """A copy of everything, as of the last step, for computations elsewhere."""
+        return self._graph.copied()
 
     def dump(self) -> State:
         """All that later steps depend on, as of the last step: `load` it into a solver with the same options.
@@ -293,7 +327,7 @@ class Solver:
             options.tol if self._mode.updates else options.tolerance, options.negligible, options.max_iterations
         )
         if settle:
-            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
+            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH)
         system.begin(suspects, watch)
         course = None
         if self._mode.batch_every and not batch:

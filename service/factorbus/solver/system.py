@@ -108,6 +108,12 @@ class System:
         self.factor.moved()
         self._have_lambda, self._spare_is_here = True, False
 
+    def anew(self) -> None:
+        """Λ and η at the present point: what the factors measure, or weigh, is other than it was."""
+        self._have_lambda, self._spare_is_here = False, False
+        self.have_lambda()
+        self.blocks.swap_eta()
+
     def end(self, old: int) -> I64:
         """The variables whose values have other bits than at `begin`, and those from index `old` on."""
         count = int(self.graph.counts[at.VARIABLES])

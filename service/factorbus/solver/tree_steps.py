@@ -25,6 +25,7 @@ from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
+_POLISH = 4
 
 
 class TreeSteps:
@@ -136,7 +137,7 @@ class TreeSteps:
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = Rule(options.tolerance, options.negligible, options.max_iterations)
         if settle:
-            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations)
+            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH)
         course = minimise(system, chi2, 0.0, rule)
         if course.iterations or not settle:
             self._tree.move_all()

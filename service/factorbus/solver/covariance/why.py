@@ -20,18 +20,6 @@ _NOTHING = 1e-9
 _STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)
 
 
-class UnknownFactor(errors.SolverError):
-    """A factor that the map does not have."""
-
-    code = "unknown_factor"
-
-    def __init__(self, factor: int, count: int) -> None:
-        super().__init__(
-            f"there is no factor {factor}; the map has {count}, from 0 on, in the order they were accepted",
-            factor=factor,
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class FactorAccount:
     """One factor at the estimate.
@@ -94,13 +82,12 @@ class VariableAccount:
 
 
 def why_factor(blocks: Blocks, factor: int) -> FactorAccount:
-    """Raises UnknownFactor."""
+    """Of the factor with this id.  Raises UnknownFactor."""
     graph = blocks.factored.graph
-    count = int(graph.counts[at.FACTORS])
-    if not 0 <= factor < count:
-        raise UnknownFactor(factor, count)
-    T = judge_rows(blocks, factor, factor + 1).predicted[0]
-    return _account(blocks, factor, linearised(graph, factor, factor + 1), T)
+    row = int(graph.rows_of(np.array([factor]))[0])
+    if row < 0:
+        raise errors.UnknownFactor(factor, graph.next_id)
+    return _why_row(blocks, row)
 
 
 def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAccount:
@@ -112,9 +99,9 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
     fixed = bool(row[at.V_COLUMN] < 0)
     covariance = blocks.of(np.array([variable]))[0, : kind.dim, : kind.dim]
     fac = graph.fac[: graph.counts[at.FACTORS]]
-    ids = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)).tolist()
-    factors = [why_factor(blocks, factor) for factor in ids]
-    pivot, conditioning = (0.0, 1.0) if fixed else _pivot(blocks, variable, ids)
+    rows = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)).tolist()
+    factors = [_why_row(blocks, each) for each in rows]
+    pivot, conditioning = (0.0, 1.0) if fixed else _pivot(blocks, variable, rows)
     linearised_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
     value = graph.values[row[at.V_AT] : row[at.V_AT] + kind.size].copy()
     sigmas = np.sqrt(np.diag(covariance))
@@ -122,6 +109,11 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
         int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearised_step,
         changed, seen, factors,
     )  # fmt: skip
+
+
+def _why_row(blocks: Blocks, row: int) -> FactorAccount:
+    T = judge_rows(blocks, row, row + 1).predicted[0]
+    return _account(blocks, row, linearised(blocks.factored.graph, row, row + 1), T)
 
 
 def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, float]:
@@ -142,9 +134,9 @@ def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, fl
     return float(pivots.min()), float((pivots**2 / diagonal).min())
 
 
-def _account(blocks: Blocks, factor: int, linear: Linear, T: F64) -> FactorAccount:
+def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccount:
     graph = blocks.factored.graph
-    row = graph.fac[factor]
+    row, factor = graph.fac[place], int(graph.ids_of(np.array([place]))[0])
     kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
     d = kind.dim
     r, W, T = linear.r[0, :d].copy(), linear.W[0, :d, :d], T[:d, :d]

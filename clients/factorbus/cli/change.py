@@ -1,0 +1,141 @@
+"""`factorbus change`: take something out of a map on the bus, count it differently, hold it."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from factorbus.cli.exits import OK
+from factorbus.cli.options import DEFAULT_ENDPOINT, json_option, zenoh_option
+from factorbus.cli.screen import document, table
+
+F = TypeVar("F", bound=Callable[..., Any])
+_COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
+
+
+@click.group()
+def command() -> None:
+    """Change what the map NAME on the bus has. A factor is called by its id, a variable by its key.
+
+    All of it happens or none; the map is solved anew without what is gone.
+
+    \b
+    factorbus change remove warehouse 17 18 x12
+    factorbus change loss warehouse dcs 1.0 21
+    factorbus change fix warehouse x0
+    """
+
+
+def _changing(command: F) -> F:
+    """NAME, --connect, --timeout, --settle and --json."""
+    for option in (
+        json_option,
+        zenoh_option,
+        click.option("--settle", is_flag=True, help="Iterate until converged afterwards."),
+        click.option("--timeout", "timeout_s", type=float, default=30.0, show_default=True, help="Seconds to wait."),
+        click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
+        click.argument("name"),
+    ):
+        command = option(command)
+    return command
+
+
+@command.command("remove")
+@_changing
+@click.argument("what", nargs=-1, required=True)
+@click.option("--alone", is_flag=True, help="Refuse if any other factor is on the variables.")
+def remove_command(name: str, what: tuple[str, ...], alone: bool, **how: Any) -> int:
+    """Remove factors (ids: 17) and variables (keys: x12), these with every factor on them.
+
+    \b
+    factorbus change remove warehouse 17 18
+    factorbus change remove warehouse x12 --alone
+    """
+    from factorbus.client import Changes
+
+    ids, names = [int(each) for each in what if each.isdecimal()], [each for each in what if not each.isdecimal()]
+    changes = Changes()
+    if ids:
+        changes.remove_factors(ids)
+    if names:
+        changes.remove_variables(*names, alone=alone)
+    return _make(name, changes, **how)
+
+
+@command.command("loss")
+@_changing
+@click.argument("loss")
+@click.argument("scale", type=float)
+@click.argument("factors", nargs=-1, required=True, type=int)
+def loss_command(name: str, loss: str, scale: float, factors: tuple[int, ...], **how: Any) -> int:
+    """Give factors a robust LOSS of a SCALE in standard deviations, or take it away with `none`.
+
+    \b
+    factorbus change loss warehouse dcs 1.0 21 22
+    factorbus change loss warehouse none 0 21
+    """
+    from factorbus.client import Changes
+
+    return _make(name, Changes().loss(factors, "" if loss == "none" else loss, scale), **how)
+
+
+@command.command("weigh")
+@_changing
+@click.argument("weight", type=float)
+@click.argument("factors", nargs=-1, required=True, type=int)
+def weigh_command(name: str, weight: float, factors: tuple[int, ...], **how: Any) -> int:
+    """Multiply the information of factors by WEIGHT: below 1 they count for less.
+
+    \b
+    factorbus change weigh warehouse 0.1 21 22
+    """
+    from factorbus.client import Changes
+
+    return _make(name, Changes().weigh(factors, weight), **how)
+
+
+@command.command("fix")
+@_changing
+@click.argument("keys", nargs=-1, required=True)
+def fix_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
+    """Hold variables where they are.
+
+    \b
+    factorbus change fix warehouse x0
+    """
+    from factorbus.client import Changes
+
+    return _make(name, Changes().fix(*keys), **how)
+
+
+@command.command("free")
+@_changing
+@click.argument("keys", nargs=-1, required=True)
+def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
+    """Estimate fixed variables again.
+
+    \b
+    factorbus change free warehouse x7
+    """
+    from factorbus.client import Changes
+
+    return _make(name, Changes().free(*keys), **how)
+
+
+def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:
+    """Send it, and say what came of it."""
+    from factorbus.client import connect as open_bus
+
+    with (
+        open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        bus.map(name, mirror=False, create=False) as joined,
+    ):
+        accepted = joined.change(changes, settle=settle)
+    report = accepted.report
+    counted = {what: report[what] for what in _COUNTS if report.get(what)}
+    if as_json:
+        document({"revision": accepted.revision, "chi2": report.get("chi2")} | counted)
+    else:
+        rows = [(what.replace("_", " "), str(count)) for what, count in counted.items()]
+        table([*rows, ("χ²", f"{report.get('chi2', float('nan')):.6g}")], title=f"At revision {accepted.revision}")
+    return OK

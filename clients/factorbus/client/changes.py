@@ -1,0 +1,103 @@
+"""Putting together changes of what a map has: taking out, counting differently, holding.
+
+    kitchen.change(Changes().remove_factors([17, 18]).loss([21], "dcs", 1.0).fix("x0"))
+
+A factor is called by its id: `first_factor` of the answer to the insert that brought it, and on from there in the order
+of the batch; `Map.graph` tells the ids of all.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorbus.client.draft import Draft, Key
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.asking import Repaired
+from factorbus.proto.kinds import LOSSES
+from factorbus.proto.messages import Accepted, Batch, Change, Variables
+from factorbus.proto.problems import BadLoss, BadShape
+from factorbus.proto.symbols import parse_symbol
+
+
+class Changes:
+    """Changes to be made together or not at all, in this order.  Every method returns the same object, to be chained.
+
+    Raises BadSymbol, BadShape, BadLoss.
+    """
+
+    def __init__(self) -> None:
+        self._changes: list[Change] = []
+
+    def remove_factors(self, factors: Iterable[int]) -> "Changes":
+        """These factors go."""
+        return self._add(Change("remove_factors", _ids(factors)))
+
+    def remove_variables(self, *keys: Key, alone: bool = False) -> "Changes":
+        """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
+        return self._add(Change("remove_variables", keys=_keys(keys), alone=alone))
+
+    def undo(self, batch: Batch | Draft, accepted: Accepted) -> "Changes":
+        """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
+        batch = batch.batch() if isinstance(batch, Draft) else batch
+        brought = [group.keys for group in batch.variables]
+        first = accepted.first_factor
+        self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
+        return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
+
+    def loss(self, factors: Iterable[int], name: str, scale: ArrayLike = 1.0) -> "Changes":
+        """These factors have this loss from now on, its scale (one, or one for each) in standard deviations; "" is none."""
+        ids = _ids(factors)
+        if name and name not in LOSSES:
+            raise BadLoss("changes", repr(name), f"one of {', '.join(LOSSES)}, or an empty string")
+        return self._add(Change("loss", ids, loss=name, scale=_each("scale", scale, ids) if name else None))
+
+    def weigh(self, factors: Iterable[int], weight: ArrayLike) -> "Changes":
+        """The information matrices of these factors are multiplied by this (one, or one for each)."""
+        ids = _ids(factors)
+        return self._add(Change("weigh", ids, weight=_each("weight", weight, ids)))
+
+    def fix(self, *keys: Key) -> "Changes":
+        """These variables are held where they are."""
+        return self._add(Change("fix", keys=_keys(keys)))
+
+    def free(self, *keys: Key) -> "Changes":
+        """These variables are estimated again."""
+        return self._add(Change("free", keys=_keys(keys)))
+
+    def place(self, groups: Iterable[Variables]) -> "Changes":
+        """Variables go to the values in `groups`, as in an estimate; the map goes on from there."""
+        for group in groups:
+            self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values))
+        return self
+
+    def repair(self, repaired: Repaired, loss: tuple[str, float] | None = None) -> "Changes":
+        """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
+        if loss is None:
+            self.remove_factors(repaired.factors.tolist())
+        else:
+            self.loss(repaired.factors.tolist(), *loss)
+        return self.place(repaired.variables)
+
+    def listed(self) -> tuple[Change, ...]:
+        """What has been put together so far."""
+        return tuple(self._changes)
+
+    def _add(self, change: Change) -> "Changes":
+        self._changes.append(change)
+        return self
+
+
+def _ids(factors: Iterable[int]) -> I64:
+    return np.array(list(factors), np.int64)
+
+
+def _keys(keys: Sequence[Key]) -> I64:
+    return np.array([parse_symbol(key) if isinstance(key, str) else key for key in keys], np.int64)
+
+
+def _each(name: str, numbers: ArrayLike, ids: I64) -> F64:
+    given = np.array(numbers, np.float64)
+    if given.shape not in ((), ids.shape):
+        raise BadShape(f"changes: {name}", f"shape {given.shape}", f"one number, or {ids.size}")
+    return np.broadcast_to(given, ids.shape)

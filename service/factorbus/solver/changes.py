@@ -1,0 +1,242 @@
+"""Changes of a graph that are no additions, checked and collected: what is to stay, and how.  `edited` makes them.
+
+    remove_factors     factors (n,)                     these factors go
+    remove_variables   keys (n,), alone                 these variables go, and every factor on them; with `alone` it is
+                                                        refused where another factor than those removed is on them
+    loss               factors (n,), loss, scale (n,)   these factors have this loss from now on; "": none
+    weigh              factors (n,), weight (n,)        Ω becomes w Ω
+    fix, free          keys (n,)                        variables are held where they are; or estimated again
+    place              kind, keys (n,), values          variables of one kind go to these values (n, size), also those
+                                                        that are fixed; the estimate goes on from there
+
+Changes are made one after the other: what the first has removed the second cannot name.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSSES
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+
+CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place")
+_NONE = np.empty(0, np.int64)
+_QUATERNION_TOLERANCE = 1e-3
+
+
+class ChangeLike(Protocol):
+    """One change; fields that its kind has no use for are not looked at."""
+
+    @property
+    def change(self) -> str: ...
+    @property
+    def factors(self) -> I64 | None: ...
+    @property
+    def keys(self) -> I64 | None: ...
+    @property
+    def loss(self) -> str: ...
+    @property
+    def scale(self) -> F64 | None: ...
+    @property
+    def weight(self) -> F64 | None: ...
+    @property
+    def alone(self) -> bool: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def values(self) -> F64 | None: ...
+
+
+@dataclass(slots=True)
+class Edits:
+    """What is to become of each variable (n,) and each factor (m,) of a graph.
+
+    stays, kept: whether it is there afterwards   free: whether a variable is estimated
+    loss, scale: code of the loss and its scale   weight: what Ω is multiplied by   values: as in the graph
+    counted: what is to be told of it
+    """
+
+    stays: np.ndarray
+    free: np.ndarray
+    kept: np.ndarray
+    loss: I64
+    scale: F64
+    weight: F64
+    values: F64
+    counted: dict[str, int] = field(default_factory=dict)
+
+
+def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
+    """`changes` in their order.
+
+    Raises UnknownKind, UnknownFactor, NotInMap, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
+    NotFinite, BadQuaternion.
+    """
+    edits = unchanged(graph)
+    before = edits.free.copy()
+    touched = np.zeros(edits.kept.size, bool)
+    for change in changes:
+        make = _MAKE.get(change.change)
+        if make is None:
+            raise errors.UnknownKind("change", change.change, CHANGES)
+        make(graph, edits, change, touched)
+    edits.counted = {
+        "removed_variables": int(np.count_nonzero(~edits.stays)),
+        "removed_factors": int(np.count_nonzero(~edits.kept)),
+        "edited_factors": int(np.count_nonzero(touched & edits.kept)),
+        "fixed_variables": int(np.count_nonzero(edits.stays & before & ~edits.free)),
+        "freed_variables": int(np.count_nonzero(edits.stays & ~before & edits.free)),
+        "placed_variables": sum(
+            change.keys.size for change in changes if change.change == "place" and change.keys is not None
+        ),
+    }
+    return edits
+
+
+def unchanged(graph: Graph) -> Edits:
+    """Everything as it is."""
+    variables, factors = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
+    fac, var = graph.fac[:factors], graph.var[:variables]
+    loss = fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
+    scale = np.zeros(factors)
+    robust = np.flatnonzero(loss != at.NO_LOSS)
+    kinds = fac[robust, at.F_KIND].tolist()
+    widths = [FACTOR_KIND_OF_CODE[code].size + FACTOR_KIND_OF_CODE[code].triangle for code in kinds]
+    scale[robust] = graph.payload[fac[robust, at.F_AT] + np.array(widths, np.int64)]
+    return Edits(
+        np.ones(variables, bool),
+        var[:, at.V_COLUMN] >= 0,
+        np.ones(factors, bool),
+        loss,
+        scale,
+        np.ones(factors),
+        graph.values[: graph.counts[at.VALUES]],
+    )
+
+
+def _remove_factors(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+    edits.kept[_factors(graph, edits, change)] = False
+
+
+def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+    gone = _variables(graph, edits, change)
+    edits.stays[gone] = False
+    fac = graph.fac[: edits.kept.size]
+    left = edits.stays[fac[:, at.F_I]] & ((fac[:, at.F_J] < 0) | edits.stays[fac[:, at.F_J]])
+    if change.alone and (on_them := np.flatnonzero(edits.kept & ~left)).size:
+        row = on_them[0]
+        end = at.F_I if not edits.stays[fac[row, at.F_I]] else at.F_J
+        key, factor = int(graph.keys[fac[row, end]]), int(graph.ids_of(on_them[:1])[0])
+        raise errors.InUse(key, factor, graph.describe(fac[row]), on_them.size)
+    edits.kept &= left
+
+
+def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+    rows = _factors(graph, edits, change)
+    code = at.NO_LOSS
+    if change.loss:
+        if change.loss not in LOSSES:
+            raise errors.BadLoss("change loss", f"the loss {change.loss!r:.40}", f"none, or one of {', '.join(LOSSES)}")
+        scale = _numbers("loss", "scale", change.scale, rows.size)
+        if (bad := np.flatnonzero(~(np.isfinite(scale) & (scale > 0.0)))).size:
+            wanted = "a finite number above 0, standard deviations"
+            raise errors.BadLoss(f"change loss of factor {_id(graph, rows, bad)}", f"{scale[bad[0]]:g}", wanted)
+        code, edits.scale[rows] = LOSSES[change.loss], scale
+    edits.loss[rows] = code
+    touched[rows] = True
+
+
+def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+    rows = _factors(graph, edits, change)
+    weight = _numbers("weigh", "weight", change.weight, rows.size)
+    if (bad := np.flatnonzero(~(np.isfinite(weight) & (weight > 0.0)))).size:
+        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]))
+    np.multiply.at(edits.weight, rows, weight)
+    touched[rows] = True
+
+
+def _fix(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+    edits.free[_variables(graph, edits, change)] = False
+
+
+def _free(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+    edits.free[_variables(graph, edits, change)] = True
+
+
+def _place(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+    picked, kind = _variables(graph, edits, change), VARIABLE_KINDS.get(change.kind)
+    if kind is None:
+        raise errors.UnknownKind("variable", change.kind, tuple(VARIABLE_KINDS))
+    for v in picked[graph.var[picked, at.V_KIND] != kind.code].tolist():
+        seen = VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].name
+        raise errors.KindMismatch(int(graph.keys[v]), "change place", seen, kind.name)
+    values = change.values
+    if values is None or values.shape != (picked.size, kind.size):
+        seen = "none" if values is None else " × ".join(map(str, values.shape))
+        raise errors.BadShape("change place values", seen, f"{picked.size} × {kind.size}")
+    edits.values = edits.values.copy()
+    edits.values[graph.var[picked, at.V_AT, None] + np.arange(kind.size)] = _checked(kind.name, picked, values, graph)
+
+
+def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
+    """Values as variables keep them.  Raises NotFinite, BadQuaternion."""
+    keys, values = graph.keys[picked], values.copy()
+    for row in np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist():
+        raise errors.NotFinite(f"the value of {kind} {errors.printed(int(keys[row]))}")
+    if kind == "se3":
+        norms = np.linalg.norm(values[:, 3:], axis=1)
+        for row in np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE).tolist():
+            raise errors.BadQuaternion(f"{kind} {errors.printed(int(keys[row]))}", float(norms[row]))
+        values[:, 3:] /= norms[:, None]
+    if kind in ("se2", "idp"):
+        angle = 2 if kind == "se2" else 3
+        values[:, angle] -= 2 * np.pi * np.floor((values[:, angle] + np.pi) / (2 * np.pi))
+    return values
+
+
+_MAKE = {
+    "remove_factors": _remove_factors,
+    "remove_variables": _remove_variables,
+    "loss": _set_loss,
+    "weigh": _weigh,
+    "fix": _fix,
+    "free": _free,
+    "place": _place,
+}
+
+
+def _factors(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
+    """Rows of the factors that a change names.  Raises UnknownFactor."""
+    ids = _NONE if change.factors is None else change.factors
+    rows = graph.rows_of(ids)
+    missing = np.flatnonzero([row < 0 or not edits.kept[row] for row in rows.tolist()])
+    if missing.size:
+        raise errors.UnknownFactor(int(ids[missing[0]]), graph.next_id)
+    return rows
+
+
+def _variables(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
+    """Indices of the variables that a change names.  Raises NotInMap."""
+    keys = _NONE if change.keys is None else change.keys
+    found = np.array([graph.find(key) for key in keys.tolist()], np.int64)
+    missing = np.flatnonzero([v < 0 or not edits.stays[v] for v in found.tolist()])
+    if missing.size:
+        raise errors.NotInMap(int(keys[missing[0]]), change.change)
+    return found
+
+
+def _numbers(change: str, name: str, given: F64 | None, count: int) -> F64:
+    if given is None or given.shape != (count,):
+        seen = "none" if given is None else " × ".join(map(str, given.shape))
+        raise errors.BadShape(f"change {change} {name}", seen, f"{count}, one for each factor")
+    return given
+
+
+def _id(graph: Graph, rows: I64, bad: I64) -> int:
+    return int(graph.ids_of(rows[bad[:1]])[0])
