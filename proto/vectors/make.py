@@ -19,9 +19,11 @@ import numpy as np
 
 from factorbus.proto import asking, codec
 from factorbus.proto import asking_codec as asked
+from factorbus.proto import repair_codec as repairs
 from factorbus.proto.messages import (
     Accepted,
     Batch,
+    Change,
     Chi2,
     Delta,
     Estimate,
@@ -41,6 +43,8 @@ _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f
 _COLUMNS |= dict.fromkeys(("others", "dims", "other_dims", "landmarks", "sightings", "candidates"), "i64")
 _COLUMNS |= dict.fromkeys(("covariance", "distance", "threshold", "gain", "distances"), "f64")
 _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
+# Of changes and repairs, §17.
+_COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
 
 
 def main() -> None:
@@ -63,12 +67,14 @@ def vectors() -> dict[str, bytes]:
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
+        "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
         "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
         "estimate_empty": codec.encode_estimate(Estimate(7, 2, ())),
         "delta": codec.encode_delta(Delta(7, 2, 1, (pair[1],), report)),
         "graph": codec.encode_graph(graph),
+        "graph_ids": codec.encode_graph(Graph(7, 3, Batch(pair, (_odometry(0)._replace(ids=np.array([4])),)))),
         "chi2": codec.encode_chi2(Chi2(7, 2, 0.25)),
         "chi2_batch": codec.encode_chi2(Chi2(7, 2, 0.25, 0.125, "w1", 0.5)),
         "job": codec.encode_job(Job("j1", "batch", codec.encode_graph(graph))),
@@ -124,7 +130,30 @@ def _about_uncertainty() -> dict[str, bytes]:
         "ask_why": asked.encode_ask_why(asking.AskWhy(key=x[1])),
         "ask_why_factor": asked.encode_ask_why(asking.AskWhy(factor=0)),
         "why": asked.encode_why(asking.Why(7, 2, {}, account, {"strategy": "tree", "because": "2 variables bent"})),
+        "ask_repair": repairs.encode_ask_repair(asking.AskRepair(np.array([4, 17]), 0.95, values=True)),
+        "repaired": repairs.encode_repaired(
+            asking.Repaired(
+                7, 2, np.array([17]), np.array([250.5]), 2, 300.25, 12.5, 0.5,
+                (_poses(first=1, values=[[1.5, 0.25, 0.125]]),),
+            )
+        ),
     }  # fmt: skip
+
+
+def _changes() -> tuple[Change, ...]:
+    x = np.array([symbol("x", i) for i in range(1, 3)])
+    ids = np.array([4, 17])
+    return (
+        Change("remove_factors", ids),
+        Change("remove_variables", keys=x, alone=True),
+        Change("remove_variables", keys=x[:1]),
+        Change("loss", ids, loss="dcs", scale=np.array([1.0, 2.5])),
+        Change("loss", ids[:1]),
+        Change("weigh", ids, weight=np.array([0.5, 0.25])),
+        Change("fix", keys=x),
+        Change("free", keys=x[:1]),
+        Change("place", keys=x[:1], kind="se2", values=np.array([[1.5, 0.25, 0.125]])),
+    )
 
 
 def described(data: bytes) -> str:

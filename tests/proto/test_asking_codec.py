@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factorbus.proto import asking_codec as codec
+from factorbus.proto import repair_codec
 from factorbus.proto.asking import AskCovariance, Covariances
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import symbol
@@ -30,6 +31,8 @@ CODECS: dict[str, tuple[Callable[[Any], bytes], Callable[[bytes], Any]]] = {
     "associated": (codec.encode_associated, codec.decode_associated),
     "ask_why": (codec.encode_ask_why, codec.decode_ask_why),
     "why": (codec.encode_why, codec.decode_why),
+    "ask_repair": (repair_codec.encode_ask_repair, repair_codec.decode_ask_repair),
+    "repaired": (repair_codec.encode_repaired, repair_codec.decode_repaired),
 }
 VECTORS = sorted(name for name in GOLDEN if any(name.startswith(known) for known in CODECS))
 

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.kinds import CHANGES, FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import (
     Accepted,
     Batch,
+    Change,
     Chi2,
     Delta,
     Estimate,
@@ -148,10 +149,36 @@ def factors(draw: st.DrawFn) -> Factors:
     )
 
 
+@st.composite
+def changes(draw: st.DrawFn) -> Change:
+    name = draw(st.sampled_from(sorted(CHANGES)))
+    of, count = CHANGES[name], draw(st.integers(0, 3))
+    named = draw(arrays("<i8", (count,), elements=st.integers(0, 2**62)))
+    numbers = arrays("<f8", (count,), elements=DOUBLES)
+    if of.names == "keys":
+        if of.numbers:
+            kind = VARIABLE_KINDS[draw(st.sampled_from(sorted(VARIABLE_KINDS)))]
+            values = draw(arrays("<f8", (count, kind.size), elements=DOUBLES))
+            return Change(name, keys=named, kind=kind.name, values=values)
+        return Change(name, keys=named, alone=name == "remove_variables" and draw(st.booleans()))
+    if of.numbers == "weight":
+        return Change(name, named, weight=draw(numbers))
+    if of.numbers and draw(st.booleans()):
+        return Change(name, named, loss=draw(st.sampled_from(LOSSES)), scale=draw(numbers))
+    return Change(name, named)
+
+
 BATCHES = st.builds(Batch, st.lists(variables(), max_size=3).map(tuple), st.lists(factors(), max_size=3).map(tuple))
 VALUES = st.lists(variables(valued=True), max_size=3).map(tuple)
 MESSAGES = {
-    "insert": st.builds(Insert, st.integers(1, 2**63 - 1), BATCHES, st.booleans(), NUMBERS),
+    "insert": st.builds(
+        Insert,
+        st.integers(1, 2**63 - 1),
+        BATCHES,
+        st.booleans(),
+        NUMBERS,
+        changes=st.lists(changes(), max_size=3).map(tuple),
+    ),
     "accepted": st.builds(Accepted, NUMBERS, NUMBERS, NUMBERS, NUMBERS, NUMBERS, REPORTS),
     "estimate": st.builds(Estimate, NUMBERS, NUMBERS, VALUES),
     "delta": st.builds(Delta, NUMBERS, NUMBERS, NUMBERS, VALUES, REPORTS),

@@ -46,6 +46,7 @@ def test_every_code_is_explained() -> None:
         messages.Optimum,
         messages.Variables,
         messages.Factors,
+        messages.Change,
     ],
 )
 def test_every_field_is_explained(message: Any) -> None:

@@ -46,7 +46,7 @@ class Changes:
         return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
 
     def loss(self, factors: Iterable[int], name: str, scale: ArrayLike = 1.0) -> "Changes":
-        """These factors have this loss from now on, its scale (one, or one for each) in standard deviations; "" is none."""
+        """These factors have this loss from now on ("": none); scale: one, or one for each, standard deviations."""
         ids = _ids(factors)
         if name and name not in LOSSES:
             raise BadLoss("changes", repr(name), f"one of {', '.join(LOSSES)}, or an empty string")

@@ -15,6 +15,8 @@ _MOST_DAMPING = 1e12
 # A predicted decrease below this share of χ², or below this, may be lost in the rounding of χ² itself.
 _ROUNDING = 1e-11
 _ROUNDING_FLOOR = 1e-12
+# Below these δ, too, is rounding: a settled map that is settled again does not move.
+_EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
 
 class Problem(Protocol):
@@ -54,7 +56,7 @@ class Rule:
     """When to stop: the next step would lower χ² by less than `tolerance` χ² + `floor`; or after `limit` tries.
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
-    polish: so many steps more at most, below what χ² can show, while each is to gain a quarter of the one before.
+    polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
     """
 
     tolerance: float
@@ -151,7 +153,7 @@ def _polish(problem: Problem, course: Course, most: int) -> None:
     last = math.inf
     for _ in range(most):
         decrease = problem.decrease()
-        if not 0.0 < decrease <= 0.25 * last:
+        if decrease <= _EXACT * course.chi2 + _EXACT_FLOOR or not decrease <= 0.9 * last:
             return
         reached = problem.linearise_at(problem.step())
         if not _is_rounding(reached - course.chi2, course.chi2):

@@ -189,6 +189,7 @@ def _graduate(problem: _Problem, begin: F64) -> tuple[F64, int]:
 
 def weigh(s: F64, bound: F64, mu: float) -> F64:
     """The weight of a factor that is off by s, with c² = bound.  (11.3)"""
-    middle = np.sqrt(bound * mu * (mu + 1.0) / np.maximum(s, 1e-300)) - mu
-    weights = np.where(s >= (mu + 1.0) / mu * bound, 0.0, np.where(s <= mu / (mu + 1.0) * bound, 1.0, middle))
+    low, high = mu / (mu + 1.0) * bound, (mu + 1.0) / mu * bound
+    middle = np.sqrt(bound * mu * (mu + 1.0) / np.clip(s, low, high)) - mu
+    weights = np.where(s >= high, 0.0, np.where(s <= low, 1.0, middle))
     return np.clip(weights, _LEAST, 1.0)

@@ -41,7 +41,7 @@ _FEW = 8
 # lately: a try that fails costs two linearisations, one that does not saves a factorisation.
 _LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 _REUSE = 0.05
-_POLISH = 4
+_POLISH = 100
 
 
 @dataclass(frozen=True, slots=True)

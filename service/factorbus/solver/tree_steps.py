@@ -25,7 +25,7 @@ from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
-_POLISH = 4
+_POLISH = 100
 
 
 class TreeSteps:

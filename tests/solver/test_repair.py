@@ -1,0 +1,121 @@
+"""False loop closures are found and taken out: a map that they have bent gets straight again."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from factorbus.proto.messages import Batch, Change, Factors
+from factorbus.simulate import manhattan
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.kernels._jit import DISABLED
+from factorbus.solver.repair import find_loops, repair, weigh
+
+POSES = 60 if DISABLED else 400
+
+
+def streets(seed: int, share: float, poses: int = POSES) -> Iterator[tuple[Batch, dict[int, np.ndarray], list[int]]]:
+    """(batch, true values of what is new, which of its factors are false); `share` of the closures are."""
+    rng = np.random.default_rng(seed)
+    for number, step in enumerate(manhattan(poses, seed, loop_gap=20)):
+        truth = {k: row for g in step.truth for k, row in zip(g.keys.tolist(), g.values, strict=True)}
+        groups, count = list(step.batch.factors), step.batch.factor_count
+        loops = sum(int((np.abs(g.keys[:, 1] - g.keys[:, 0]) != 1).sum()) for g in groups)
+        wrong = int(rng.binomial(loops, share / (1 - share))) if loops else 0
+        if wrong:
+            last = int(groups[0].keys[0].max())
+            ends = np.column_stack([last - number + rng.integers(0, number - 10, wrong), np.full(wrong, last)])
+            z = np.column_stack([rng.normal(0, 1, (wrong, 2)), rng.uniform(-np.pi, np.pi, wrong)])
+            groups.append(Factors("between_se2", ends, z, np.repeat(groups[0].information[:1], wrong, 0)))
+        yield Batch(step.batch.variables, tuple(groups)), truth, list(range(count, count + wrong))
+
+
+def driven(seed: int, share: float) -> tuple[Solver, dict[int, np.ndarray], set[int]]:
+    """A map of the streets, what is true, and the ids of what is false."""
+    solver, truth, false = Solver(Options()), {}, set()
+    for batch, true, wrong in streets(seed, share):
+        first = solver.stage(batch)
+        solver.step()
+        truth |= true
+        false |= {first + each for each in wrong}
+    solver.step(settle=True)
+    return solver, truth, false
+
+
+def error_of(solver: Solver, truth: dict[int, np.ndarray]) -> float:
+    """Root mean square distance from the truth, after the best rigid motion, metres."""
+    found = {k: row for g in solver.estimate() for k, row in zip(g.keys.tolist(), g.values, strict=True)}
+    p, q = (np.array([each[key][:2] for key in truth]) for each in (found, truth))
+    p, q = p - p.mean(axis=0), q - q.mean(axis=0)
+    U, _, Vt = np.linalg.svd(p.T @ q)
+    R = Vt.T @ np.diag([1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
+    return float(np.sqrt(((p @ R.T - q) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_three_of_ten_closures_false_are_found_and_the_drive_is_as_good_as_without(seed: int) -> None:
+    clean, truth, none = driven(seed, 0.0)
+    solver, _, false = driven(seed, 0.3)
+    assert not none
+    assert len(false) > POSES // 20
+    right = error_of(clean, truth)
+    assert error_of(solver, truth) > 5 * right, "without repair it visibly is not"
+    found = repair(solver.content())
+    taken = set(found.false.tolist())
+    assert false <= taken
+    assert len(taken - false) <= 0.05 * found.suspects
+    assert found.after < found.before
+    assert (found.distance > 0).all()
+    placed = [Change("place", keys=g.keys, kind=g.kind, values=g.values) for g in found.groups]
+    repaired, *_ = solver.with_changes([Change("remove_factors", found.false), *placed], settle=True)
+    assert error_of(repaired, truth) < 1.2 * right
+
+
+def test_a_map_without_false_closures_loses_next_to_none() -> None:
+    solver, _, _ = driven(3, 0.0)
+    found = repair(solver.content(), probability=0.9999)
+    assert found.false.size <= 1
+    assert found.after == pytest.approx(found.before, rel=0.05)
+
+
+def test_only_those_named_are_looked_at() -> None:
+    solver, _, false = driven(1, 0.3)
+    named = np.array(sorted(false))[:4]
+    found = repair(solver.content(), named)
+    assert found.suspects == 4
+    assert set(found.false.tolist()) <= set(named.tolist())
+    with pytest.raises(errors.UnknownFactor):
+        repair(solver.content(), np.array([10**9]))
+    with pytest.raises(errors.BadOption):
+        repair(solver.content(), probability=1.0)
+
+
+def test_the_graph_that_is_looked_at_stays_as_it_is() -> None:
+    solver, _, _ = driven(1, 0.3)
+    before = solver.content()
+    repair(before)
+    assert before.values.tobytes() == solver.content().values.tobytes()
+    assert before.payload.tobytes() == solver.content().payload.tobytes()
+    assert before.fac.tobytes() == solver.content().fac.tobytes()
+
+
+def test_loops_are_what_does_not_join_anything_new() -> None:
+    solver, _, _ = driven(2, 0.3)
+    graph, loops = solver.content(), set(find_loops(solver.content()).tolist())
+    ends = graph.fac[: graph.counts[1], 1:3]
+    odometry = set(np.flatnonzero(np.abs(ends[:, 1] - ends[:, 0]) == 1).tolist())
+    assert loops == set(range(len(ends))) - odometry
+
+
+def test_an_empty_map_has_nothing_to_repair() -> None:
+    found = repair(Solver(Options()).content())
+    assert (found.suspects, found.false.size, found.before) == (0, 0, 0.0)
+
+
+def test_weights_fall_from_one_to_nothing_and_get_sharper() -> None:
+    s, bound = np.linspace(0.0, 40.0, 400), np.full(400, 10.0)
+    for mu in (0.01, 1.0, 100.0):
+        weights = weigh(s, bound, mu)
+        assert (np.diff(weights) <= 0).all()
+        assert ((weights > 0) & (weights <= 1)).all()
+    np.testing.assert_array_equal(weigh(s, bound, 1e9) > 0.5, s < bound)
