@@ -62,7 +62,9 @@ def decode_repaired(data: bytes, limits: Limits = ANSWER_LIMITS) -> Repaired:
         factors,
         distance,
         fields.integer("", content, "suspects"),
-        *(fields.number("", content, name) for name in ("before", "after", "seconds")),
+        fields.number("", content, "before"),
+        fields.number("", content, "after"),
+        fields.number("", content, "seconds"),
         read_values(content),
     )
 

@@ -1,0 +1,147 @@
+"""Inserts that change what a map has, among others: steps of their own, refused whole, the same when folded again."""
+
+import numpy as np
+import pytest
+
+from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.service.arrival import read_again, read_insert
+from factorbus.service.config import Limits
+from factorbus.service.events import Arrived, Judged, Outcome, Stepped, Waiting
+from factorbus.service.fold import Folder
+from factorbus.service.questions import Question
+from factorbus.solver import Options, Solver
+
+EPOCH = 9
+
+
+def pose(n: int, x: float = 1.0) -> Batch:
+    keys = np.array([symbol("x", n)])
+    if n == 0:
+        return Batch((Variables("se2", keys, np.zeros((1, 3)), fixed=True),))
+    z, information = np.array([[x, 0.0, 0.1]]), np.array([[100.0, 0, 0, 100, 0, 400]])
+    return Batch(
+        (Variables("se2", keys),), (Factors("between_se2", np.array([[keys[0] - 1, keys[0]]]), z, information),)
+    )
+
+
+def waiting(content: Batch | tuple[Change, ...], sequence: int, client: str = "a") -> Waiting:
+    batch, changes = (content, ()) if isinstance(content, Batch) else (Batch(), content)
+    message = codec.encode_insert(Insert(sequence, batch, changes=changes))
+    arrived = read_insert(None, client, message, REQUEST_LIMITS, 0.0)
+    assert isinstance(arrived, Arrived)
+    return Waiting(client, sequence, len(message), arrived.digest, arrived.content, [], message)
+
+
+def gone(*names: int) -> tuple[Change, ...]:
+    return (Change("remove_variables", keys=np.array([symbol("x", n) for n in names])),)
+
+
+class Broken(Solver):
+    """One whose changes fail in a way that nobody thought of."""
+
+    def with_changes(self, *arguments: object, **more: object) -> object:  # type: ignore[override]
+        raise ZeroDivisionError("a fault of the solver")
+
+
+def make(folder: Folder | None = None, solver: type[Solver] = Solver) -> Folder:
+    folder = folder or Folder(lambda: solver(Options()), EPOCH, Limits())
+    for n in range(5):
+        list(folder.fold([waiting(pose(n), n + 1)]))
+    return folder
+
+
+def came(folder: Folder, *inserts: Waiting) -> tuple[list[Judged], list[Stepped]]:
+    events, _ = folder.fold_whole(inserts)
+    return [e for e in events if isinstance(e, Judged)], [e for e in events if isinstance(e, Stepped)]
+
+
+def outcomes(judged: list[Judged]) -> list[Outcome]:
+    return [outcome for each in judged for outcome in each.outcomes]
+
+
+def keys_in(folder: Folder) -> list[int]:
+    taken = folder.snapshot([Question("estimate")])
+    return sorted(int(key) - symbol("x", 0) for group in taken.variables for key in group.keys)
+
+
+def test_a_change_is_a_step_of_its_own_whose_delta_has_everything() -> None:
+    folder = make()
+    inserts = [waiting(pose(5), 6), waiting(gone(3, 4, 5), 7), waiting(pose(3), 8), waiting(pose(4), 9)]
+    judged, steps = came(folder, *inserts)
+    answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
+    assert [(a.sequence, a.revision, a.first_factor, a.folded) for a in answers] == [
+        (6, 6, 4, 1),
+        (7, 7, 5, 1),
+        (8, 8, 5, 2),
+        (9, 8, 6, 2),
+    ]
+    deltas = [codec.decode_delta(step.delta) for step in steps]
+    assert [(delta.previous, delta.revision) for delta in deltas] == [(5, 6), (0, 7), (7, 8)]
+    assert sorted(int(k) - symbol("x", 0) for g in deltas[1].variables for k in g.keys) == [0, 1, 2]
+    assert answers[1].report["removed_variables"] == 3
+    assert answers[1].report["removed_factors"] == 3
+    assert keys_in(folder) == [0, 1, 2, 3, 4]
+    assert folder.size == (5, 4)
+
+
+def test_what_cannot_be_changed_is_refused_and_its_neighbours_go_on() -> None:
+    folder = make()
+    unknown = (Change("remove_factors", np.array([77])),)
+    alone = (gone(4)[0]._replace(alone=True),)
+    judged, _ = came(folder, waiting(unknown, 6), waiting(pose(5), 7), waiting(gone(2), 8), waiting(alone, 9))
+    codes = [getattr(o.answer, "code", "accepted") for o in outcomes(judged)]
+    assert codes == ["unknown_factor", "accepted", "underconstrained", "in_use"]
+    assert keys_in(folder) == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_fault_in_a_change_leaves_the_map_as_it_was() -> None:
+    folder = make(solver=Broken)
+    judged, steps = came(folder, waiting(gone(4), 6))
+    assert [o.answer.code for o in outcomes(judged)] == ["internal"]
+    assert steps == []
+    assert keys_in(folder) == [0, 1, 2, 3, 4]
+    judged, _ = came(folder, waiting(pose(5), 7))
+    assert codec.decode_accepted(outcomes(judged)[0].answer).revision == 6
+
+
+def test_the_same_folds_give_the_same_bits_again() -> None:
+    """As a restart folds them: from the bytes of the messages."""
+    folds = [[waiting(pose(n), n + 1)] for n in range(5)]
+    folds += [[waiting(pose(5), 6), waiting(gone(5), 7), waiting(pose(5, 1.2), 8)]]
+    folds += [
+        [waiting((Change("weigh", np.array([2]), weight=np.array([0.5])), Change("fix", keys=gone(1)[0].keys)), 9)]
+    ]
+    folds += [[waiting(pose(6), 10)]]
+    first, second = (Folder(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
+    for inserts in folds:
+        _, steps = came(first, *inserts)
+        again = []
+        for insert in inserts:
+            digest, content = read_again(insert.message)
+            again.append(Waiting(insert.client, insert.sequence, insert.size, digest, content, [], insert.message))
+        events = list(second.fold_again(again, rebuilt=False))
+        deltas = [codec.decode_delta(e.delta) for e in events if isinstance(e, Stepped)]
+        for one, other in zip([codec.decode_delta(step.delta) for step in steps], deltas, strict=True):
+            assert (one.previous, one.revision, one.report["chi2"]) == (
+                other.previous,
+                other.revision,
+                other.report["chi2"],
+            )
+            assert [g.values.tobytes() for g in one.variables] == [g.values.tobytes() for g in other.variables]
+    assert first.revision == second.revision
+
+
+@pytest.mark.parametrize("mode", ["tree", "inc-l"])
+def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
+    folder = make(Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
+    came(folder, waiting(gone(4), 6))
+    again = Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
+    again.load(folder.dump())
+    for each in (folder, again):
+        judged, _ = came(each, waiting(pose(4), 7))
+        assert codec.decode_accepted(outcomes(judged)[0].answer).first_factor == 4
+    one, other = (each.snapshot([Question("estimate")]).variables for each in (folder, again))
+    assert [g.values.tobytes() for g in one] == [g.values.tobytes() for g in other]
