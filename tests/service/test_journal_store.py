@@ -1,6 +1,8 @@
 """Journals on disk: what is written is read, what is wrong is found, and a folder has one owner."""
 
 import os
+import random
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -13,16 +15,17 @@ import pytest
 
 from factorbus.journal import chain
 from factorbus.journal.bundle import export_map, import_map
-from factorbus.journal.digest import digest_of
+from factorbus.journal.digest import sealed
+from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, NoJournal
-from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Fold
+from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, Fold
 from factorbus.journal.snapshots import file_of, read_snapshot, remove_strangers, write_snapshot
 from factorbus.journal.store import FORM, NAME, Saved, Store, create, open_store
 
 
 def entry(client: str, sequence: int, message: bytes = b"hello") -> Entry:
-    return Entry(client, sequence, digest_of(message), ACCEPTED, sequence, 10 * sequence, 1, b"", message)
+    return sealed(Entry(client, sequence, 0, ACCEPTED, sequence, 10 * sequence, 1, b"", message))
 
 
 def fold(number: int, *entries: Entry) -> Fold:
@@ -33,7 +36,7 @@ def fold(number: int, *entries: Entry) -> Fold:
 def store(tmp_path: Path) -> Store:
     made = create(tmp_path / "m", "m", "inc-l", {"mode": "inc-l", "tol": 1e-3}, 77, "commit")
     made.append([fold(1, entry("a", 1), entry("b", 1)), fold(2, entry("a", 2, b"more"))])
-    made.append([fold(3, entry("a", 3)._replace(outcome=REFUSED, problem=b"why"), entry("b", 2))])
+    made.append([fold(3, sealed(entry("a", 3)._replace(outcome=REFUSED, problem=b"why")), entry("b", 2))])
     return made
 
 
@@ -58,7 +61,7 @@ def test_clients_are_where_they_were_and_the_one_heard_last_comes_last(store: St
         ("b", 3, [1, 2]),
     ]
     assert [s.client for s in store.senders(1, 1, 5)] == ["b"]
-    store.begin_epoch(78, "a test")
+    store.begin("commit", Epoch(78, 4, "a test"))
     assert store.senders(store.header().epochs[-1].fold, 10, 10) == []
     store.append([fold(4, entry("a", 1))])
     assert [(s.client, s.next) for s in store.senders(4, 10, 10)] == [("a", 2)]
@@ -75,10 +78,13 @@ def test_a_transaction_is_there_wholly_or_not_at_all(store: Store) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        ("UPDATE entry SET message = x'00' WHERE number = 3", "insert 2 of client a has other bytes"),
+        ("UPDATE entry SET message = x'00' WHERE number = 3", "insert 2 of client a is not what was written"),
+        ("UPDATE entry SET revision = 9 WHERE number = 3", "insert 2 of client a is not what was written"),
+        ("UPDATE entry SET outcome = 1 WHERE number = 3", "insert 2 of client a is not what was written"),
         ("DELETE FROM fold WHERE number = 2", "fold 2 is missing"),
         ("DELETE FROM entry WHERE number = 3", "client a has number 3 after 1"),
         ("UPDATE entry SET fold = 9 WHERE number = 5", "fold 9, which is missing"),
+        ("UPDATE entry SET client = 'c' WHERE number = 3", "insert 2 of client c is not what was written"),
         ("UPDATE fold SET revision = 0 WHERE number = 3", "goes back from revision 2 to 0"),
     ],
 )
@@ -103,6 +109,103 @@ def test_a_page_of_nonsense_is_damage_and_not_a_map(store: Store) -> None:
     with pytest.raises(JournalDamaged):
         list(again.folds())
     assert list(again.check())
+
+
+def long_journal(folder: Path) -> Store:
+    """Twenty transactions, of one to four folds each, in the log and not in the database yet."""
+    made = create(folder, "m", "inc-l", {}, 77, "commit")
+    number = 0
+    for turn in range(20):
+        more = range(number + 1, number + 2 + turn % 4)
+        made.append([fold(n, entry("a", n, bytes([n]) * (n * 37 % 5000))) for n in more])
+        number = more[-1]
+    return made
+
+
+def test_a_log_cut_anywhere_is_a_journal_of_whole_transactions(tmp_path: Path) -> None:
+    made = long_journal(tmp_path / "m")
+    whole = list(made.folds())
+    ends = [0, *(fold_.number for fold_ in whole)]
+    content = made.path.with_name("journal.db-wal").read_bytes()
+    chance, seen = random.Random(3), set[int]()
+    for n in range(40):
+        end = len(content) - chance.randrange(200) if n < 10 else chance.randrange(32, len(content))
+        cut = tmp_path / f"cut{n}"
+        cut.mkdir()
+        shutil.copyfile(made.path, cut / NAME)
+        (cut / "journal.db-wal").write_bytes(content[:end] + chance.randbytes(chance.choice((0, 100, 5000))))
+        again = open_store(cut)
+        assert list(again.folds()) == whole[: again.last().fold]
+        assert list(again.check()) == []
+        assert again.last().fold in ends
+        seen.add(again.last().fold)
+        again.append([fold(again.last().fold + 1, entry("b", 1))])
+        again.close()
+    assert len(seen) > 5
+    made.close()
+
+
+def test_a_page_torn_while_the_log_was_put_into_the_database_is_whole_again(tmp_path: Path) -> None:
+    """What a power cut in the middle of that leaves: half of a page in the database, and all of the log."""
+    made = long_journal(tmp_path / "m")
+    whole = list(made.folds())
+    log = made.path.with_name("journal.db-wal").read_bytes()
+    made.close()  # puts it in
+    content, chance = made.path.read_bytes(), random.Random(5)
+    pages = len(content) // 4096
+    for n, page in enumerate([pages - 1, *chance.sample(range(pages), 10)]):
+        torn = tmp_path / f"torn{n}"
+        torn.mkdir()
+        half = 4096 * page + 512 * chance.randrange(1, 8)
+        (torn / NAME).write_bytes(
+            content[:half] + chance.randbytes(4096 * (page + 1) - half) + content[4096 * (page + 1) :]
+        )
+        (torn / "journal.db-wal").write_bytes(log)
+        again = open_store(torn)
+        assert list(again.folds()) == whole
+        assert list(again.check()) == []
+        again.close()
+
+
+def test_a_torn_page_without_a_log_is_never_taken_for_the_journal(tmp_path: Path) -> None:
+    """A disk that lost what it had confirmed: damage, or every bit is there (the page's free part was torn)."""
+    made = long_journal(tmp_path / "m")
+    whole = list(made.folds())
+    made.close()
+    content, chance, found = made.path.read_bytes(), random.Random(6), 0
+    for n in range(60):
+        page, torn = chance.randrange(len(content) // 4096), tmp_path / f"torn{n}"
+        torn.mkdir()
+        half = 4096 * page + 512 * chance.randrange(8)
+        junk = chance.choice((bytes(4096), chance.randbytes(4096)))[: 4096 * (page + 1) - half]
+        (torn / NAME).write_bytes(content[:half] + junk + content[4096 * (page + 1) :])
+        try:
+            again = open_store(torn)
+        except JournalDamaged:
+            found += 1
+            continue
+        said = list(again.check())
+        found += bool(said)
+        try:
+            came = list(again.folds())
+            again.header()
+        except JournalDamaged:
+            assert said
+        else:
+            assert came == whole or said
+        again.close()
+    assert found > 20
+
+
+def test_a_journal_that_was_not_finished_is_not_there(tmp_path: Path) -> None:
+    made = create(tmp_path / "m", "m", "inc-l", {}, 7, "commit")
+    made.close()
+    for begun in (".making-n", ".dropped-n-12ab"):
+        shutil.copytree(tmp_path / "m", tmp_path / begun)
+    assert maps_in(tmp_path, NAME) == ["m"]
+    assert sorted(path.name for path in left_behind(tmp_path)) == [".dropped-n-12ab", ".making-n"]
+    create(tmp_path / "n", "n", "inc-l", {}, 7, "commit").close()
+    assert maps_in(tmp_path, NAME) == ["m", "n"]
 
 
 def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """A process that has everything imported and compiled, and forks services: so that many can be killed in a short time.
 
-    python journal_nursery.py FOLDER [SETTING=VALUE ...]     reads `start ENDPOINT`; prints `born PID`, `ready ENDPOINT`
+    python journal_nursery.py     reads `start ENDPOINT SETTINGS-AS-JSON`; prints `born PID`, `ready ENDPOINT`
 
-It forks before anything of Zenoh is there; the children are services like any other, with a journal in FOLDER.
+It forks before anything of Zenoh is there; the children are services like any other, with a journal.
 """
 
 import json
@@ -20,19 +20,21 @@ from factorbus.service.config import Config, checked
 
 def main() -> None:
     """Fork a service for every line, until there are no more."""
-    folder, *settings = sys.argv[1:]
-    given = {name: json.loads(value) for name, _, value in (text.partition("=") for text in settings)}
     logging.basicConfig(level=logging.INFO, format="%(process)d %(message)s")
     solver.warm()
     idp.warm()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
     print("nursery", flush=True)
     for line in sys.stdin:
-        endpoint = line.split()[1]
+        word, *rest = line.split(maxsplit=2)
+        if word == "quiet":
+            print("quiet", flush=True)
+            continue
+        endpoint, given = rest[0], json.loads(rest[1])
         pid = os.fork()
         if pid == 0:
             os.close(0)
-            run(checked(Config(listen=(endpoint,), journal=folder, warm=False, create=("m",), **given)))
+            run(checked(Config(listen=(endpoint,), warm=False, create=("m",), **given)))
         print("born", pid, flush=True)
 
 

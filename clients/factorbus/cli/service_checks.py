@@ -41,6 +41,9 @@ def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
         state = "fail" if resident > limit else "warn"
         mend = "drop or move a map, or give it more (limits.memory_bytes): beyond the limit inserts are refused"
         yield state, f"{resident >> 20} MiB of memory, {limit >> 20} MiB allowed", mend
+    for row in account["maps"]:
+        if why := row.get("journal", {}).get("problem"):
+            yield "fail", why, "make room or make it writable: the map goes on by itself"
     if not account["ready"]:
         yield "warn", "alive, but not ready", "it is starting or stopping: look again"
     if (version := account["version"]) != __version__:

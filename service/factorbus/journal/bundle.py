@@ -8,9 +8,10 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from factorbus.journal.folders import IMPORTING, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
 from factorbus.journal.snapshots import file_of
-from factorbus.journal.store import NAME, open_store
+from factorbus.journal.store import NAME, open_store, what_reading_failed_with
 
 _PIECE = 32 << 20
 _TABLE = "CREATE TABLE piece (fold INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
@@ -36,6 +37,7 @@ def export_map(folder: Path, file: Path) -> None:
                 if _put(database, each.fold, file_of(folder, each.fold)):
                     break
         beside.rename(file)
+        sync_folder(file.absolute().parent)
     except (sqlite3.Error, OSError) as error:
         beside.unlink(missing_ok=True)
         raise JournalFailed(file, str(error)) from None
@@ -50,7 +52,7 @@ def import_map(file: Path, folder: Path) -> None:
         raise NoJournal(file)
     if folder.exists():
         raise JournalFailed(folder, "there is a map of that name; drop it, or give another name")
-    beside = folder.with_name(f".importing-{folder.name}")
+    beside = folder.with_name(f"{IMPORTING}{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:
         beside.mkdir(parents=True)
@@ -63,9 +65,12 @@ def import_map(file: Path, folder: Path) -> None:
             database.execute("DROP TABLE IF EXISTS piece")
             database.execute("UPDATE header SET value = ? WHERE name = 'map'", (folder.name,))
         _check(beside)
+        sync_folder(beside)
         beside.rename(folder)
+        sync_folder(folder.parent)
     except sqlite3.DatabaseError as error:
-        raise JournalDamaged(file, str(error)) from None
+        problem = what_reading_failed_with(file, error)
+        raise (problem if isinstance(problem, JournalDamaged) else JournalFailed(folder, str(error))) from None
     except OSError as error:
         raise JournalFailed(folder, str(error)) from None
     finally:

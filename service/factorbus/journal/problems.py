@@ -45,6 +45,19 @@ class JournalDamaged(Problem):
         )
 
 
+class JournalUnreadable(Problem):
+    """The journal is there, and the disk does not give it."""
+
+    code = "journal_unreadable"
+
+    def __init__(self, where: Path, reason: str) -> None:
+        super().__init__(
+            f"the journal {where} cannot be read ({reason}); nothing was changed. Look at the disk, the room on it and "
+            "who owns the folder, and start the service again",
+            reason=reason,
+        )
+
+
 class JournalVersion(Problem):
     """The journal was written by a version whose form this one does not read."""
 

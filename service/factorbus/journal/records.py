@@ -14,7 +14,7 @@ class Entry(NamedTuple):
     """One insert, in its place.
 
     revision, first_factor, together: of the answer, where it was accepted; problem: the bytes of the one it was
-    refused with.  digest: of `message`.
+    refused with.  digest: of all the rest (`digest.sealed`).
     """
 
     client: str

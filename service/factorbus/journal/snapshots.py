@@ -7,7 +7,9 @@ arrays                 one after the other, without the zero bytes at their ends
 digest  32 bytes       BLAKE2b of all before
 """
 
+import errno
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from hashlib import blake2b
 from pathlib import Path
@@ -15,6 +17,8 @@ from typing import Any
 
 import msgpack
 import numpy as np
+
+from factorbus.journal.folders import sync_folder
 
 _MAGIC = b"FBSNAP01"
 _BLOCK = 1 << 20
@@ -36,6 +40,7 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
     ]
     head: Any = msgpack.packb({"state": tree, "arrays": rows})
     beside = path.with_suffix(".part")
+    _check_room(path, len(head) + sum(map(len, packed)))
     digest, size = blake2b(digest_size=32), 0
     try:
         with beside.open("wb") as file:
@@ -47,7 +52,7 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
             file.flush()
             os.fsync(file.fileno())
         beside.rename(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError:
         beside.unlink(missing_ok=True)
         raise
@@ -105,9 +110,8 @@ def _arrays(rows: list[dict[str, Any]], data: memoryview) -> Iterator[np.ndarray
         yield array
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _check_room(path: Path, size: int) -> None:
+    """A snapshot only makes a restart quick: it must not take the room that the journal needs.  Raises OSError."""
+    free = shutil.disk_usage(path.parent).free
+    if free < 2 * size:
+        raise OSError(errno.ENOSPC, f"it has {size} bytes and {free} are free; there must be as much again", str(path))

@@ -5,6 +5,8 @@ Written by one process, and read by others at the same time (WAL).  One transact
 """
 
 import json
+import os
+import shutil
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,12 +15,17 @@ from typing import Any, NamedTuple
 
 from factorbus.journal import chain
 from factorbus.journal.digest import digest_of
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalVersion, NoJournal
+from factorbus.journal.folders import UNFINISHED, sync_folder
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
 from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
 
 NAME = "journal.db"
-FORM = 1
+FORM = 2  # 1: an entry's digest was of its message only
 _APPLICATION = 0x46427573  # "FBus"
+_LOG_BYTES = 64 << 20  # what a log that was longer is cut to, once it is in the database
+# Ways to open it for reading.  The last: where no file can be made beside it, which the log of a database needs.
+_AS_IT_IS = "ro&immutable=1"
+_WAYS_TO_READ = ("ro", _AS_IT_IS)
 _SYNCHRONOUS = {"none": "OFF", "group": "FULL", "commit": "FULL"}
 _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -153,16 +160,20 @@ class Store:
             self._db.executemany("DELETE FROM snapshot WHERE fold = ?", old)
         return [fold for (fold,) in old]
 
-    def set(self, **values: Any) -> None:
-        """Change the header.  Raises JournalFailed."""
+    def begin(self, durability: str, epoch: Epoch | None = None) -> None:
+        """Somebody is at work with it from now on, in a new epoch if there is one.  Raises JournalFailed."""
         with self._writing():
-            self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
+            if epoch is not None:
+                self._db.execute(
+                    "INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)",
+                    (epoch.epoch, epoch.fold, epoch.because),
+                )
+            self._set({"clean": "0", "durability": durability})
 
-    def begin_epoch(self, epoch: int, because: str) -> None:
-        """From the next fold on the map is in another epoch.  Raises JournalFailed."""
+    def end(self) -> None:
+        """It is left in order: nothing that was answered is missing.  Raises JournalFailed."""
         with self._writing():
-            (fold,) = self._db.execute("SELECT COALESCE(MAX(number), 0) + 1 FROM fold").fetchone()
-            self._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)", (epoch, fold, because))
+            self._set({"clean": "1"})
 
     def probe(self) -> None:
         """Can something be written again, and some room be had?  Raises JournalFailed."""
@@ -222,13 +233,14 @@ class Store:
         try:
             yield
         except sqlite3.DatabaseError as error:
-            raise JournalDamaged(self.path, str(error)) from None
+            raise what_reading_failed_with(self.path, error) from None
+
+    def _set(self, values: dict[str, str]) -> None:
+        self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
 
     def _checked(self, entry: Entry) -> Entry:
-        if digest_of(entry.message) != entry.digest:
-            raise JournalDamaged(
-                self.path, f"insert {entry.sequence} of client {entry.client} has other bytes than came"
-            )
+        if digest_of(entry) != entry.digest:
+            raise JournalDamaged(self.path, f"insert {entry.sequence} of client {entry.client} is not what was written")
         return entry
 
     def _sender(self, name: str, first_fold: int, most: int) -> Sender:
@@ -258,48 +270,88 @@ class Store:
 
 
 def create(folder: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> Store:
-    """A new journal in `folder`, which is made.  Raises JournalFailed."""
-    path = folder / NAME
+    """A new journal in `folder`, which is made: it is there whole or not at all.  Raises JournalFailed."""
+    beside = folder.with_name(f"{UNFINISHED}{folder.name}")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        store = Store(path, _connect(path, "rwc", durability), True)
-        with store._writing():
-            for statement in _SCHEMA.split(";"):
-                store._db.execute(statement)
-            store._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, 1, 'created')", (epoch,))
-            values = {"map": name, "mode": mode, "options": json.dumps(options), "durability": durability, "clean": "0"}
-            store._db.executemany("INSERT INTO header VALUES (?, ?)", list(values.items()))
-            store._db.execute(f"PRAGMA application_id = {_APPLICATION}")
-            store._db.execute(f"PRAGMA user_version = {FORM}")
+        shutil.rmtree(beside, ignore_errors=True)
+        beside.mkdir(parents=True)
+        _fill(beside / NAME, name, mode, options, epoch, durability)
+        sync_folder(beside)
+        beside.rename(folder)
+        sync_folder(folder.parent)
+        return open_store(folder, durability)
     except (OSError, sqlite3.Error) as error:
-        raise JournalFailed(path, str(error)) from None
-    return store
+        shutil.rmtree(beside, ignore_errors=True)
+        raise JournalFailed(folder / NAME, str(error)) from None
 
 
 def open_store(folder: Path, durability: str = "commit", read_only: bool = False) -> Store:
     """The journal in `folder`.  One that cannot be written is opened for reading: `writable` says so.
 
-    Raises NoJournal, JournalDamaged, JournalVersion.
+    Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable.
     """
-    path = folder / NAME
+    path, ways = folder / NAME, _WAYS_TO_READ if read_only else ("rw", *_WAYS_TO_READ)
     if not path.is_file():
         raise NoJournal(path)
+    why = ""
+    for way in ways:
+        if way == _AS_IT_IS and _has_log(path):
+            continue
+        try:
+            connection = _connect(path, way, durability)
+            return Store(path, connection, way == "rw" and _is_writable(path, connection))
+        except sqlite3.DatabaseError as error:
+            if isinstance(problem := what_reading_failed_with(path, error), JournalDamaged):
+                raise problem from None
+            why = why or str(error)
+    raise JournalUnreadable(path, why)
+
+
+def what_reading_failed_with(path: Path, error: sqlite3.Error) -> JournalDamaged | JournalUnreadable:
+    """Is it the journal that is wrong, or what it is on?"""
+    if (getattr(error, "sqlite_errorcode", 0) & 0xFF) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+        return JournalDamaged(path, str(error))
+    return JournalUnreadable(path, str(error))
+
+
+def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:
+    store = Store(path, _connect(path, "rwc", durability), True)
     try:
-        connection = _connect(path, "ro" if read_only else "rw", durability)
-        _check_form(path, connection)
-        writable = not read_only and _is_writable(connection)
-    except sqlite3.DatabaseError as error:
-        raise JournalDamaged(path, str(error)) from None
-    return Store(path, connection, writable)
+        with store._writing():
+            for statement in _SCHEMA.split(";"):
+                store._db.execute(statement)
+            store._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, 1, 'created')", (epoch,))
+            store._set(
+                {"map": name, "mode": mode, "options": json.dumps(options), "durability": durability, "clean": "0"}
+            )
+            store._db.execute(f"PRAGMA application_id = {_APPLICATION}")
+            store._db.execute(f"PRAGMA user_version = {FORM}")
+    finally:
+        store.close()
+
+
+def _has_log(path: Path) -> bool:
+    """Is there something that is not in the database yet?"""
+    try:
+        return path.with_name(f"{path.name}-wal").stat().st_size > 0
+    except OSError:
+        return False
 
 
 def _connect(path: Path, mode: str, durability: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
         f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False, timeout=10.0
     )
-    if mode != "ro":
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute(f"PRAGMA synchronous = {_SYNCHRONOUS[durability]}")
+    try:
+        if mode in ("rw", "rwc"):
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute(f"PRAGMA synchronous = {_SYNCHRONOUS[durability]}")
+            connection.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
+        if mode != "rwc":
+            _check_form(path, connection)
+    except BaseException:
+        connection.close()
+        raise
     return connection
 
 
@@ -307,12 +359,15 @@ def _check_form(path: Path, connection: sqlite3.Connection) -> None:
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (form,) = connection.execute("PRAGMA user_version").fetchone()
     if application != _APPLICATION:
-        raise JournalDamaged(path, "it is a database of something else, or was never finished")
+        raise JournalDamaged(path, "it is a database of something else")
     if form != FORM:
         raise JournalVersion(path, form, FORM)
 
 
-def _is_writable(connection: sqlite3.Connection) -> bool:
+def _is_writable(path: Path, connection: sqlite3.Connection) -> bool:
+    # SQLite opens for reading what cannot be opened for writing, and says nothing until something is written.
+    if not os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK):
+        return False
     try:
         connection.execute("BEGIN IMMEDIATE")
         connection.execute("ROLLBACK")

@@ -184,6 +184,11 @@ class Admission:
         """Refuse everything new with `problem`, its numbers not used up, until this is called with None."""
         self._blocked = problem
 
+    @property
+    def blocked(self) -> bool:
+        """Is everything new refused?"""
+        return self._blocked is not None
+
     def restore(self, name: str, following: int, answered: Iterable[tuple[int, int, object]], now: float) -> None:
         """`name` was here before: it has to send `following` next, and has had answers, (sequence, digest, answer)."""
         client = _Client(following, heard=now, seen=now)

@@ -99,6 +99,7 @@ def _serve(
             for name in config.create:
                 shell.create(name, None)
             shell.vitals.health.open = True
+            shell.tick()  # so that the first who asks is told of all maps
             endpoints = bus.endpoints()
             if library is not None:
                 library.say(f"process {os.getpid()} on {socket.gethostname()}, {' '.join(endpoints)}")
@@ -134,7 +135,7 @@ class Shell:
         self._senders: dict[str, tuple[str, str]] = {}  # keys of inserts taken apart before
         self._stopping = False
         self._outbox, self._desk, self._answers = Lane("outbox"), Lane("desk"), Lanes("answers", _ANSWERERS)
-        self.vitals = Vitals(config, self._service, {"outbox": self._outbox, "desk": self._desk})
+        self.vitals = Vitals(config, self._service, {"outbox": self._outbox, "desk": self._desk}, self._hosts)
         self._worker_rows: list[dict[str, Any]] = []
         self.vitals.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()
@@ -196,12 +197,15 @@ class Shell:
         """Time went by."""
         for found in list(self._maps.values()):
             found.host.tick()
-        stuck = self.vitals.look({name: found.host for name, found in list(self._maps.items())})
+        stuck = self.vitals.look()
         if stuck != self._stuck:
             self._desk.hand(self._show, stuck ^ self._stuck, stuck)
             self._stuck = stuck
         self._desk.hand(self._jobs.tick)
         self._desk.hand(self._look_for_workers)
+
+    def _hosts(self) -> dict[str, Host]:
+        return {name: found.host for name, found in list(self._maps.items())}
 
     def close(self) -> None:
         """Withdraw, finish everything accepted, answer it, and undeclare."""
@@ -461,7 +465,6 @@ class Shell:
         self._leaving.remove(found)
         found.host.end(keep=False)
         self._outbox.hand(found.place.close)  # behind the map's last publications
-        self.vitals.forget(found.host.core.name)
         self._desk.hand(give_back)
         if self._library is not None:
             try:

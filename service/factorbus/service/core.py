@@ -92,7 +92,8 @@ class MapCore:
 
     def created(self) -> list[Effect]:
         """The map is on the bus: new, or as it was before."""
-        return [self._event("opened" if self.revision else "created")]
+        happened: list[Effect] = [self._event("opened" if self.revision else "created")]
+        return [*happened, self._event("blocked")] if self._admission.blocked else happened
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
@@ -158,7 +159,8 @@ class MapCore:
     def block(self, problem: Problem, now: float) -> list[Effect]:
         """The journal cannot be written: nothing new is taken in, and what has not gone to the solver is refused."""
         self._admission.block(problem)
-        return self._go_on(self._count_refused(self._admission.take_back(problem, given=False)), now)
+        effects = self._count_refused(self._admission.take_back(problem, given=False))
+        return self._go_on([*effects, self._event("blocked")], now)
 
     def unkept(self, problem: Problem, now: float) -> list[Effect]:
         """The same, and what came of Runs since the last `kept` did not happen: the solver is to go back."""
@@ -166,11 +168,12 @@ class MapCore:
         effects = self._count_refused(self._admission.take_back(problem, given=True))
         self._unjudged = self._unjudged_bytes = 0
         self._must_reload = True
-        return self._go_on(effects, now)
+        return self._go_on([*effects, self._event("blocked")], now)
 
-    def unblock(self) -> None:
+    def unblock(self) -> list[Effect]:
         """The journal can be written again."""
         self._admission.block(None)
+        return [self._event("unblocked")]
 
     def restore(
         self, senders: Iterable[tuple[str, int, Iterable[tuple[int, int, object]]]], restored: Restored

@@ -4,7 +4,8 @@ Alive: every thread that maps depend on has come to what it was handed within `s
 queue of the thread itself, behind all its other work, and noted when the thread comes to it; a timer that only proves
 that time passes proves nothing.  A solver that does not come out of a step is silent, however busy it is.
 
-Ready: alive, with everything declared that was configured, and not stopping.
+Ready: alive, with everything declared that was configured, not stopping, and able to take inserts into every map: not
+while a journal cannot be written.
 """
 
 import time
@@ -36,10 +37,11 @@ class Pulse:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """What was seen at `at` (time.monotonic): seconds that each thread was silent."""
+    """What was seen at `at` (time.monotonic): seconds that each thread was silent; why a map takes nothing in."""
 
     at: float
     silent_s: Mapping[str, float] = field(default_factory=dict)
+    closed: Mapping[str, str] = field(default_factory=dict)
 
 
 class Health:
@@ -69,6 +71,12 @@ class Health:
         """Nobody is stuck."""
         return not self.stuck()
 
+    def lacking(self) -> list[str]:
+        """What keeps it from being ready."""
+        closed = [f"map {name} takes nothing: {why}" for name, why in self._signs.closed.items()]
+        stuck = [f"stuck: {', '.join(names)}"] if (names := self.stuck()) else []
+        return [*stuck, *closed, *([] if self.open else ["not open"])]
+
     def ready(self) -> bool:
-        """Alive and open."""
-        return self.open and self.alive()
+        """Alive and open, for every map."""
+        return not self.lacking()

@@ -78,8 +78,8 @@ class Host:
         self._pulse = Pulse(self._runs.put)
         self._thread = threading.Thread(target=self._solve_all, name=f"solver {core.name}", daemon=True)
         self._thread.start()
-        if self._keeper is not None:
-            self._keeper.start()
+        if self._keeper is not None and (problem := self._keeper.start()) is not None:
+            core.block(problem, time.monotonic())  # it has nothing yet that would come of it; `created` tells
 
     def created(self) -> None:
         """The map is on the bus."""
@@ -145,6 +145,11 @@ class Host:
         if self._keeper is not None:
             self._keeper.close(self._folder.dump if keep else None)
 
+    @property
+    def unwritable(self) -> str:
+        """Why the journal cannot be written at the moment, and nothing is taken in; empty: it can."""
+        return self._keeper.problem if self._keeper is not None else ""
+
     def journal(self) -> dict[str, Any]:
         """What ask/stats says of the journal, if there is one."""
         return {} if self._keeper is None else {"journal": self._keeper.stats()}
@@ -172,7 +177,8 @@ class Host:
     def unblocked(self) -> None:
         """It can again."""
         with self._lock:
-            self.core.unblock()
+            effects = self.core.unblock()
+        self._perform(effects)
 
     def _perform(self, effects: list[Effect]) -> None:
         if effects and isinstance(run := effects[-1], Run):

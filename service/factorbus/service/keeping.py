@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
 from factorbus.journal import chain
-from factorbus.journal.digest import digest_of
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalVersion, NoJournal
+from factorbus.journal.digest import sealed
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
 from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import Last, Saved, Store, open_store
@@ -76,6 +76,7 @@ class _After:
 @dataclass(frozen=True, slots=True)
 class _Noted:
     saved: Saved
+    life: int
 
 
 class _Reloaded:
@@ -114,17 +115,18 @@ class Keeper:
 
     def __init__(
         self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot_s: float,
-        fingerprint: str,
+        fingerprint: str, begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._listener = store, listener
         self._folder, self._durability = store.path.parent, durability
         self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
-        self._fingerprint = fingerprint
+        self._fingerprint, self._begin, self._begun = fingerprint, begin, False
         self._last, self._number = last, last.fold
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._problem: JournalFailed | None = None
         self._snapshot = _Snapshot(snapshot_s)
+        self._life = 0  # counts how often the solver went back to where the journal ends
         self._commits, self._commit_s, self._longest_s, self._inserts = 0, 0.0, 0.0, 0
         self._thread = threading.Thread(target=self._run, name=f"journal {self._folder.name}", daemon=True)
 
@@ -133,12 +135,13 @@ class Keeper:
         """Whether what is folded is told only when `Listener.kept` is called."""
         return self._durability == "commit"
 
-    def start(self) -> None:
-        """Begin writing."""
-        if not self._store.writable:
-            self._problem = JournalFailed(self._store.path, "it is read-only")
-            self._listener.blocked(self._problem)
+    def start(self) -> JournalFailed | None:
+        """Begin writing, with what `begin` writes; gives why that cannot be done: then `unblocked` tells when it is."""
+        if (problem := self._try_to_begin()) is not None:
+            log.error("%s", problem)
+        self._problem = problem
         self._thread.start()
+        return problem
 
     def hand(self, inserts: Sequence[Waiting], events: Events) -> None:
         """Write down that `inserts` were folded, and what came of it."""
@@ -157,6 +160,7 @@ class Keeper:
     def reloaded(self, last: Last) -> None:
         """The solver is where the journal ends."""
         self._number = last.fold
+        self._life += 1
         self._items.put(_Reloaded())
 
     def wants_snapshot(self) -> bool:
@@ -167,8 +171,14 @@ class Keeper:
         """Write `state`, which is that after all that was handed in so far; on a thread of its own."""
         plan, fold = self._snapshot, self._number
         plan.steps_s, plan.copying_s = 0.0, copying_s
-        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, fold), name="snapshot", daemon=True)
+        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, fold, self._life), name="snapshot")
+        plan.thread.daemon = True
         plan.thread.start()
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be written at the moment; empty: it can."""
+        return str(problem.detail["reason"]) if (problem := self._problem) is not None else ""
 
     def stats(self) -> dict[str, Any]:
         """What ask/stats says of the journal."""
@@ -181,6 +191,7 @@ class Keeper:
             "commit_ms": 1e3 * self._commit_s,
             "longest_commit_ms": 1e3 * self._longest_s,
             "snapshot_fold": self._snapshot.fold,
+            "blocked": int(self._problem is not None),
             "problem": self._problem.message if self._problem else "",
         }
 
@@ -194,9 +205,9 @@ class Keeper:
         if self._problem is None and self._store.writable:
             try:
                 if dump is not None and self._snapshot.steps_s > 0.1 * self._snapshot.every_s:
-                    self._write_snapshot(dump(), self._number)
+                    self._write_snapshot(dump(), self._number, self._life)
                 self._note_snapshots()
-                self._store.set(clean="1")
+                self._store.end()
             except JournalFailed as problem:
                 log.error("%s", problem)
         self._store.close()
@@ -204,7 +215,7 @@ class Keeper:
     # ---- on the journal's thread ------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        if not self._store.writable:
+        if self._problem is not None:
             self._wait_until_writable()
         while (batch := self._next_batch()) is not None:
             if (problem := self._write(batch)) is None:
@@ -215,7 +226,8 @@ class Keeper:
                 self._wait_until_writable()
             else:
                 self._listener.blocked(problem)
-                self._try_again(batch)
+                if not self._try_again(batch):
+                    return
 
     def _next_batch(self) -> list[Any] | None:
         """All that waits; None: there is nothing, and nothing will come."""
@@ -257,7 +269,7 @@ class Keeper:
             elif isinstance(item, _Folded) and self.waits:
                 self._listener.kept(item.events)
             elif isinstance(item, _Noted):
-                self._note(item.saved)
+                self._note(item)
         return None
 
     def _append(self, folds: list[Fold]) -> None:
@@ -299,16 +311,17 @@ class Keeper:
                 item.call()
         self._recovered()
 
-    def _try_again(self, batch: list[Any]) -> None:
-        """What has been told has to be written, if there is any way."""
+    def _try_again(self, batch: list[Any]) -> bool:
+        """What has been told has to be written, if there is any way; False: there is none, nor for what comes after."""
         pause_s, longest_s = _PAUSES_S
         while self._write(batch) is not None:
             if self._ending.wait(pause_s):
                 lost = sum(len(item.inserts) for item in batch if isinstance(item, _Folded))
-                log.error("%s: %d inserts that were answered are not written", self._store.path, lost)
-                return
+                log.error("%s: %d inserts and more that were answered are not written", self._store.path, lost)
+                return False
             pause_s = min(2 * pause_s, longest_s)
         self._recovered()
+        return True
 
     def _recovered(self) -> None:
         self._problem = None
@@ -317,26 +330,36 @@ class Keeper:
 
     def _is_writable(self) -> bool:
         try:
-            if not self._store.writable:
+            if not self._begun:
                 self._reopen()
             self._store.probe()
-        except (JournalFailed, JournalDamaged, JournalVersion, NoJournal) as problem:
+        except (JournalFailed, JournalDamaged, JournalUnreadable, JournalVersion, NoJournal) as problem:
             log.debug("still not: %s", problem)
             return False
-        return self._store.writable
+        return self._try_to_begin() is None
+
+    def _try_to_begin(self) -> JournalFailed | None:
+        """Write what has to be there before anything else, unless it is; gives why that cannot be done."""
+        if not self._store.writable:
+            return JournalFailed(self._store.path, "it is read-only")
+        if not self._begun:
+            try:
+                self._begin(self._store)
+            except JournalFailed as problem:
+                return problem
+            self._begun = True
+        return None
 
     def _reopen(self) -> None:
-        opened = open_store(self._folder, self._durability)
-        if opened.writable:
-            self._store.close()
-            self._store = opened
-        else:
-            opened.close()
-            raise JournalFailed(opened.path, "it is read-only")
+        # The old one is closed first: in one process, what is open for reading keeps all others from writing.
+        self._store.close()
+        self._store = open_store(self._folder, self._durability)
+        if not self._store.writable:
+            raise JournalFailed(self._store.path, "it is read-only")
 
     # ---- snapshots --------------------------------------------------------------------------------------------------
 
-    def _write_snapshot(self, state: dict[str, Any], fold: int) -> None:
+    def _write_snapshot(self, state: dict[str, Any], fold: int, life: int) -> None:
         """On a thread of its own; the journal's thread notes it behind the fold that it was made after."""
         started = time.perf_counter()
         path = file_of(self._folder, fold)
@@ -346,10 +369,14 @@ class Keeper:
             log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
             return
         log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
-        self._items.put(_Noted(Saved(fold, self._fingerprint, size)))
+        self._items.put(_Noted(Saved(fold, self._fingerprint, size), life))
 
-    def _note(self, saved: Saved) -> None:
-        """A snapshot counts once it is noted."""
+    def _note(self, noted: _Noted) -> None:
+        """A snapshot counts once it is noted; one of folds that did not happen must not."""
+        saved = noted.saved
+        if noted.life != self._life:
+            file_of(self._folder, saved.fold).unlink(missing_ok=True)
+            return
         try:
             old = self._store.add_snapshot(saved, _KEPT_SNAPSHOTS)
         except JournalFailed as problem:
@@ -364,7 +391,7 @@ class Keeper:
         """Those that were written while the journal's thread ended."""
         while not self._items.empty():
             if isinstance(item := self._items.get(), _Noted):
-                self._note(item.saved)
+                self._note(item)
 
 
 def _fold(item: _Folded, last: Last) -> Fold:
@@ -383,10 +410,9 @@ def _fold(item: _Folded, last: Last) -> Fold:
 
 
 def _entry(insert: Waiting, outcome: Outcome, judged: Judged) -> Entry:
-    place = insert.client, insert.sequence, digest_of(insert.message)
     if isinstance(outcome.answer, bytes):
         answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, b""
     else:
         tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
         answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)
-    return Entry(*place, *answer, insert.message)
+    return sealed(Entry(insert.client, insert.sequence, 0, *answer, insert.message))

@@ -4,14 +4,15 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from factorbus.journal.folders import GONE, left_behind, maps_in, sync_folder
 from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalFailed
-from factorbus.journal.records import Header
+from factorbus.journal.records import Epoch, Header
 from factorbus.journal.snapshots import remove_strangers
 from factorbus.journal.store import NAME, Last, Store, create, open_store
 from factorbus.service.config import Config, Limits
@@ -43,10 +44,12 @@ class Library:
 
     def __init__(self, owned: Owned, config: Config) -> None:
         self._owned, self._config = owned, config
+        for path in left_behind(owned.folder):
+            shutil.rmtree(path, ignore_errors=True)
 
     def names(self) -> list[str]:
         """The maps that there are."""
-        return sorted(path.parent.name for path in self._owned.folder.glob(f"*/{NAME}") if path.is_file())
+        return maps_in(self._owned.folder, NAME)
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name."""
@@ -63,7 +66,6 @@ class Library:
     def make(self, name: str, mode: str, limits: Limits) -> "Kept":
         """A new map, and its journal.  Raises JournalFailed."""
         where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
-        remove_strangers(where, set())
         folder = make_folder(mode, {}, epoch, limits)
         store = create(where, name, mode, folder.options(), epoch, self._config.durability)
         return Kept(store, store.header(), folder, Recovered(store.last(), True, 0, 0), self._config)
@@ -80,9 +82,10 @@ class Library:
     def remove(self, name: str) -> None:
         """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises JournalFailed."""
         path = self._owned.folder / name
-        gone = self._owned.folder / f".dropped-{name}-{secrets.token_hex(4)}"
+        gone = self._owned.folder / f"{GONE}{name}-{secrets.token_hex(4)}"
         try:
             path.rename(gone)
+            sync_folder(self._owned.folder)
             shutil.rmtree(gone)
         except OSError as error:
             raise JournalFailed(path, str(error)) from None
@@ -99,9 +102,15 @@ class Library:
 class Kept:
     """A map with its journal, open: what a host and its core are to begin with."""
 
-    def __init__(self, store: Store, header: Header, folder: Folder, recovered: Recovered, config: Config) -> None:
-        self.store, self.header, self.folder, self.recovered = store, header, folder, recovered
-        self._config = config
+    def __init__(
+        self, store: Store, header: Header, folder: Folder, recovered: Recovered, config: Config,
+        epoch: Epoch | None = None,
+    ) -> None:  # fmt: skip
+        """epoch: a new one, which is not in the journal yet."""
+        self.store, self.folder, self.recovered = store, folder, recovered
+        self.header = replace(header, epochs=(*header.epochs, epoch)) if epoch else header
+        self._config, self._epoch = config, epoch
+        folder.enter(self.header.epoch)
 
     def restore(self, core: MapCore) -> None:
         """Tell `core` how the map is."""
@@ -119,7 +128,7 @@ class Kept:
         config = self._config
         return Keeper(
             self.store, self.recovered.last, listener, config.durability, config.group_s, config.snapshot_s,
-            fingerprint(),
+            fingerprint(), lambda store: store.begin(config.durability, self._epoch),
         )  # fmt: skip
 
     def reload(self, folder: Folder) -> Last:
@@ -152,24 +161,21 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
     started, header = time.perf_counter(), store.header()
     folder = make_folder(header.mode, header.options, header.epoch, limits)
     recovered = recover(store, folder, fingerprint())
-    remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
     if store.writable:
-        for because in _reasons_for_an_epoch(header, recovered):
-            store.begin_epoch(secrets.randbits(62) | 1, because)
-            log.warning("%s: a new epoch, because %s", store.path, because)
-        store.set(clean="0", durability=config.durability)
-        header = store.header()
-        folder.enter(header.epoch)
+        remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
+    epoch = None
+    if because := _reason_for_an_epoch(header, recovered):
+        epoch = Epoch(secrets.randbits(62) | 1, recovered.last.fold + 1, because)
+        log.warning("%s: a new epoch, because %s", store.path, because)
     log.info(
         "map %s is back at revision %d in %.2f s: snapshot %d and %d folds after it", header.map,
         recovered.last.revision, time.perf_counter() - started, recovered.from_fold, recovered.folds,
     )  # fmt: skip
-    return Kept(store, header, folder, recovered, config)
+    return Kept(store, header, folder, recovered, config, epoch)
 
 
-def _reasons_for_an_epoch(header: Header, recovered: Recovered) -> Iterator[str]:
+def _reason_for_an_epoch(header: Header, recovered: Recovered) -> str:
     """Clients must not go on from what is not there any more."""
     if header.durability != "commit" and not header.clean:
-        yield f"it was not closed in order, and durability {header.durability} does not keep what was answered last"
-    elif not recovered.same:
-        yield "values have other bits than they had: another version or machine made them"
+        return f"it was not closed in order, and durability {header.durability} does not keep what was answered last"
+    return "" if recovered.same else "values have other bits than they had: another version or machine made them"

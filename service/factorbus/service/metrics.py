@@ -14,7 +14,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NamedTuple
 
 from factorbus.service.config import BadConfig
-from factorbus.service.health import Health
 from factorbus.service.vitals import Vitals
 
 log = logging.getLogger(__name__)
@@ -222,9 +221,9 @@ def _handler(vitals: Vitals) -> type[BaseHTTPRequestHandler]:
                 case "/metrics":
                     self._say(200, CONTENT_TYPE_LATEST, generate_latest(registry))
                 case "/live":
-                    self._say(*_word(vitals.health, vitals.health.alive()))
+                    self._say(*_word([f"stuck: {', '.join(names)}"] if (names := vitals.health.stuck()) else []))
                 case "/ready":
-                    self._say(*_word(vitals.health, vitals.health.ready()))
+                    self._say(*_word(vitals.health.lacking()))
                 case _:
                     self._say(404, _TEXT, b"there are /metrics, /live and /ready\n")
 
@@ -241,8 +240,5 @@ def _handler(vitals: Vitals) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
-def _word(health: Health, well: bool) -> tuple[int, str, bytes]:
-    if well:
-        return 200, _TEXT, b"ok\n"
-    stuck = health.stuck()
-    return 503, _TEXT, (f"stuck: {', '.join(stuck)}\n" if stuck else "not open\n").encode()
+def _word(lacking: list[str]) -> tuple[int, str, bytes]:
+    return (503, _TEXT, f"{'; '.join(lacking)}\n".encode()) if lacking else (200, _TEXT, b"ok\n")

@@ -19,27 +19,27 @@ Chapters = dict[str, Callable[[], Any]]
 class Vitals:
     """Of one service.  `look` is for the thread that ticks; the rest may be called from any."""
 
-    def __init__(self, config: Config, service: str, lanes: Mapping[str, Lane]) -> None:
+    def __init__(
+        self, config: Config, service: str, lanes: Mapping[str, Lane], hosts: Callable[[], Mapping[str, Host]]
+    ) -> None:
+        """hosts: the maps there are at the moment."""
         self.health = Health(config.stuck_s)
         self.memory = Memory(config.limits.memory_bytes)
         self.chapters: Chapters = {}
         self._service, self._started = service, time.monotonic()
         self._pulses = {name: Pulse(lane.hand) for name, lane in lanes.items()}
-        self._hosts: Mapping[str, Host] = {}
-
-    def look(self, hosts: Mapping[str, Host]) -> set[str]:
-        """Measure memory, feel every pulse; returns the maps whose solver is stuck."""
         self._hosts = hosts
+
+    def look(self) -> set[str]:
+        """Measure memory, feel every pulse; returns the maps whose solver is stuck."""
+        hosts = self._hosts()
         self.memory.look()
         now = time.monotonic()
         lanes = {name: pulse.silent_s(now) for name, pulse in self._pulses.items()}
         solvers = {name: host.silent_s() for name, host in hosts.items()}
-        self.health.seen(Signs(now, lanes | {f"solver {name}": seconds for name, seconds in solvers.items()}))
+        closed = {name: why for name, host in hosts.items() if (why := host.unwritable)}
+        self.health.seen(Signs(now, lanes | {f"solver {name}": seconds for name, seconds in solvers.items()}, closed))
         return {name for name, seconds in solvers.items() if seconds > self.health.stuck_s}
-
-    def forget(self, name: str) -> None:
-        """The map is gone, and with it, now and not at the next look, its memory."""
-        self._hosts = {each: host for each, host in self._hosts.items() if each != name}
 
     def account(self) -> dict[str, Any]:
         """What admin/stats says, and what the metrics are made of."""
@@ -53,9 +53,10 @@ class Vitals:
             "alive": self.health.alive(),
             "ready": self.health.ready(),
             "stuck": self.health.stuck(),
+            "lacking": self.health.lacking(),
             "silent_s": self.health.silent_s(),
             "memory": {"resident_bytes": self.memory.resident, "limit_bytes": self.memory.limit},
             "kernels_compiled_s": compiled_seconds(),
-            "maps": [host.account() for host in list(self._hosts.values())],
+            "maps": [host.account() for host in self._hosts().values()],
             **{name: read() for name, read in self.chapters.items()},
         }
