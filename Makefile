@@ -10,7 +10,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help pictures setup demo test test-data test-kernels test-faults lint check crash bench wheel clean
+.PHONY: help pictures docs setup demo test test-data test-kernels test-faults lint check crash bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -18,12 +18,12 @@ help: ## this list
 setup: $(READY_DEV) ## system package, virtual environment, the project with all its extras
 
 $(READY): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz
+	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway
 	@touch $@
 
 # bench: other libraries to compare with, which the tests have as oracles.
 $(READY_DEV): pyproject.toml $(SETUP)
-	@bash deploy/setup/environment.sh $(VENV) service,viz,watch,record,gateway,ros2,dev,bench
+	@bash deploy/setup/environment.sh $(VENV) service,viz,watch,record,gateway,ros2,dev,bench,docs
 	@touch $(READY) $@
 
 demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as processes on the bus
@@ -64,9 +64,16 @@ crash: $(READY_DEV) ## a service with a journal is killed 150 times; nothing ans
 bench: $(READY_DEV) ## the measurements, each with what it is held against
 	@$(BIN)/factorbus bench all $(ARGS)
 
-pictures: $(READY_DEV) ## draw the picture of the README again
+docs: $(READY_DEV) ## build the site into out/docs, and check every link in it
+	@$(BIN)/python docs/machinery/build.py out/docs
+
+pictures: $(READY_DEV) ## draw the pictures of the README and the site again
 	@$(BIN)/factorbus simulate manhattan --poses 1500 --seed 7 --out $(BIN)/../town.g2o
 	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --out docs/town.png
+	@$(BIN)/factorbus simulate manhattan --poses 800 --seed 7 --out $(BIN)/../town.g2o
+	@$(BIN)/factorbus plot map $(BIN)/../town.g2o --solve --ellipses 40 --out docs/figures/town-map.png
+	@for what in sparsity tree drive; do $(BIN)/factorbus plot $$what $(BIN)/../town.g2o --out docs/figures/town-$$what.png; done
+	@$(BIN)/factorbus demo monocular --frames 120 --points 200 --plot docs/figures/rays.png
 
 wheel: $(READY_DEV) ## build the wheel and try it in a clean virtual environment
 	@bash deploy/setup/try-wheel.sh $(BIN)/python

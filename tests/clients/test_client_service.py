@@ -256,19 +256,3 @@ def test_the_client_is_light(tmp_path: Path) -> None:
     seconds, heavy = zip(*(run.stdout.split("\n")[:2] for run in runs), strict=True)
     assert set(heavy) == {""}
     assert min(map(float, seconds)) < 0.25
-
-
-def test_the_guide_works_as_written(service: Service, tmp_path: Path) -> None:
-    guide = (Path(__file__).parents[2] / "clients" / "README.md").read_text()
-    blocks = [part.split("```")[0] for part in guide.split("```python\n")[1:]]
-    assert len(blocks) == 4
-    said = []
-    for block in blocks:
-        script = tmp_path / "block.py"
-        script.write_text(block.replace("tcp/127.0.0.1:7447", service.endpoint))
-        done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
-        said.append(done.stdout)
-    assert "unknown_variable" in said[1]
-    assert said[2].rstrip().endswith("False")
-    assert said[3] == "2\n[1. 0. 0.]\n"

@@ -1,6 +1,7 @@
 """Every code that the source can give has a page."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -41,12 +42,12 @@ def test_every_code_has_a_page() -> None:
     assert given - set(pages) == set(), "write what these mean, and what to do, into clients/factorbus/cli/codes.md"
     assert "failed" in pages  # what an error without a code is shown as
     assert list(pages) == sorted(pages)
+    headings = re.findall(r"^## (\w+)$", (ROOT / "clients/factorbus/cli/codes.md").read_text(encoding="utf-8"), re.M)
+    assert len(headings) == len(pages), "a code has two pages: of which one is shown"
     assert all(len(text) > 40 for text in pages.values())
 
 
 def test_codes_of_the_wire_contract_have_pages() -> None:
-    import re
-
     text = (ROOT / "proto" / "README.md").read_text(encoding="utf-8")
     section = text[text.index("## 11. Problems") : text.index("## 12.")]
     told = {code for row in re.findall(r"^\| (`.*?) \|", section, re.M) for code in re.findall(r"`([a-z_]+)`", row)}

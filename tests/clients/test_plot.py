@@ -83,6 +83,12 @@ def test_a_drive_shows_every_step_by_what_it_did() -> None:
     marks = {line.get_label(): len(line.get_xdata()) for line in times.lines if "(" in str(line.get_label())}
     assert marks == {"extend (30)": 30, "omega (9)": 9, "full (1)": 1}
     assert figure.axes[2].lines[0].get_ydata()[-1] == pytest.approx(0.02)
+    work = np.stack([np.arange(1, 41), np.full(40, 3), np.eye(40)[7]], axis=1).astype(float)
+    worked = drive_figure(Course(course.chi2, course.step_ms, work=work), ["tree"] * 40).axes[3]
+    marks = {line.get_label(): line.get_xdata().tolist() for line in worked.lines}
+    assert (len(marks["eliminated"]), marks["relinearised"]) == (40, [8]), (
+        "steps that relinearised nothing have no mark"
+    )
 
 
 def test_ellipses_hold_95_percent_of_what_a_covariance_says() -> None:
@@ -123,7 +129,9 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("arguments", [["map"], ["map", "--solve"], ["drive"], ["sparsity"]])
+@pytest.mark.parametrize(
+    "arguments", [["map"], ["map", "--solve", "--ellipses", "9"], ["drive"], ["sparsity"], ["tree"]]
+)
 def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["plot", *arguments, str(town)]) == OK
@@ -133,7 +141,10 @@ def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, ca
     svg = tmp_path / "picture.svg"
     assert main(["plot", *arguments, str(town), "--out", str(svg)]) == OK
     text = svg.read_text()
-    assert {"map": "odometry alone", "drive": "batch optimum", "sparsity": "fill-in"}[arguments[0]] in text
+    assert {"map": "odometry alone", "drive": "relinearised", "sparsity": "fill-in", "tree": "last loop"}[
+        arguments[0]
+    ] in text
+    assert ("95 % of where it may be (9)" in text) == ("--ellipses" in arguments)
 
 
 def test_odometry_is_reckoned_and_not_the_files_values(town: Path, tmp_path: Path) -> None:

@@ -67,6 +67,19 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
             for key in keys.tolist()
         ]
         assert sum(each["chi2"] for each in explained) == pytest.approx(2 * joined.chi2().chi2, rel=1e-9)
+        # What is said of certainty is what the map says when it is asked itself.
+        covariances = joined.doubt.covariance()
+        for each in explained:
+            np.testing.assert_allclose(
+                each["sigmas"], np.sqrt(np.diag(covariances[each["key"]])), rtol=1e-9, atol=1e-15
+            )
+        spread = get(f"{root}/ellipses")
+        assert spread["revision"] == snapshot.revision
+        xx, xy, xz, yy, yz, zz = np.transpose(spread["covariances"])
+        assert not np.any([xz, yz, zz])
+        for key, *local in zip(spread["keys"], xx + yy, xx * yy - xy * xy, strict=True):
+            block = covariances[key][:2, :2]  # turned into the map: the same trace and determinant
+            np.testing.assert_allclose(local, [np.trace(block), np.linalg.det(block)], rtol=1e-9, atol=1e-15)
 
 
 def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:
@@ -77,9 +90,14 @@ def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:
     draft.between_se2("x0", "x4", (2.0, 0, 0), sigmas=(0.3, 0.3, 0.1))
     with connect(endpoint, client="robot") as bus, bus.map("wrong") as joined:
         joined.insert(draft, settle=True)
+        joined_chi2 = joined.chi2().chi2
     said = get(f"{gateway}/api/maps/wrong/variables/x4")
     assert said["factors"][0]["keys"] == ["x0", "x4"]
     assert "between_se2 (x0, x4) contradicts the rest" in said["text"]
+    assert "without it χ² would fall by" in said["text"]
+    loop, odometry = said["factors"]
+    assert 0 < loop["known"] < 0.5 < odometry["known"] < 1
+    assert loop["without"] == pytest.approx(joined_chi2, rel=1e-6), "odometry alone contradicts nothing"
     assert "fixed" in get(f"{gateway}/api/maps/wrong/variables/x0")["text"]
 
 
@@ -150,18 +168,25 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
             page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
             assert page.evaluate("window.factorbus.placeOf('x40')")[:2] == joined.estimate["x40"][:2].tolist()
             assert where != page.evaluate("window.factorbus.placeOf('x40')")
-            page.wait_for_function(f"window.factorbus.closures.revision === {joined.estimate.revision}", timeout=60_000)
+            for what in ("closures", "ellipses"):
+                page.wait_for_function(
+                    f"window.factorbus.{what}.revision === {joined.estimate.revision}", timeout=60_000
+                )
             after = picture_of(page)
             assert (before != after).any(axis=2).mean() > 0.005
             assert share_of(after, style.ESTIMATE) > 3e-4
             assert share_of(after, style.POINTS) > 5e-5
+            assert share_of(after, style.DOUBT) > 5e-5
             x, y = page.evaluate("window.factorbus.pixelOf('x40')")
             box = page.locator("#map").bounding_box()
             page.mouse.click(box["x"] + x, box["y"] + y)
             page.wait_for_selector("#panel h2")
             name = page.inner_text("#panel h2")
             assert np.hypot(*(joined.estimate[name][:2] - joined.estimate["x40"][:2])) < 1.0
-            assert f"{name} is a pose in the plane, held by" in page.inner_text("#panel")
+            panel = page.inner_text("#panel")
+            assert f"{name} is a pose in the plane, held by" in panel
+            assert "Its place is known to" in panel
+            assert "last step of the map: batch: asked to settle" in panel
             factors = sum(int((g.keys == keys_of(name)).any(axis=1).sum()) for g in joined.graph().batch.factors)
             assert page.locator("#panel tr").count() == factors + 1
             page.screenshot(path=tmp_path / "page.png")  # for whoever wants to look

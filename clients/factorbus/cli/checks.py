@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from factorbus.cli.exits import EXTRAS, Stopped, lacking
-from factorbus.cli.options import DEFAULT_ENDPOINT
+from factorbus.cli.options import USUAL_ENDPOINT
 from factorbus.cli.version import LIBRARIES, installed
 from factorbus.proto.problems import Problem
 from factorbus.proto.version import __version__
@@ -88,7 +88,7 @@ def cache() -> Finding:
 
 def port() -> Finding:
     """the usual port"""
-    number = int(DEFAULT_ENDPOINT.rpartition(":")[2])
+    number = int(USUAL_ENDPOINT.rpartition(":")[2])
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -99,7 +99,7 @@ def port() -> Finding:
     from factorbus.client import connect
 
     try:
-        with connect(DEFAULT_ENDPOINT, client="doctor", timeout_s=3) as bus:
+        with connect(USUAL_ENDPOINT, client="doctor", timeout_s=3) as bus:
             return Finding("port", "ok", f"{number} is taken by a factorbus service with {len(bus.maps())} maps")
     except Problem:
         mend = f"stop what listens there (ss -ltnp 'sport = :{number}'), or factorbus serve --listen tcp/127.0.0.1:7448"

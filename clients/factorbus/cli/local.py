@@ -4,9 +4,13 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from factorbus.cli.drive import Compared, Stepped
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
+from factorbus.solver.covariance.blocks import Blocks
 
 
 class LocalMap:
@@ -76,6 +80,21 @@ def chi2_unsolved(batches: Iterable[Batch]) -> float:
     for batch in batches:
         solver.stage(batch)
     return solver.step().chi2
+
+
+def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
+    """Key → covariance of its tangent, of some variables of a graph, linearised at the values that it has.
+
+    Raises SolverError.
+    """
+    solver = Solver(Options(mode="inc-l", max_iterations=0))
+    solver.stage(graph)
+    solver.step()
+    blocks = Blocks(solver.factored())
+    place = {key: at for at, key in enumerate(blocks.factored.graph.keys[: blocks.factored.count].tolist())}
+    found = blocks.of(np.array([place[key] for key in keys.tolist()], np.int64))
+    dims = blocks.factored.dims
+    return {key: block[: dims[place[key]], : dims[place[key]]] for key, block in zip(keys.tolist(), found, strict=True)}
 
 
 def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:

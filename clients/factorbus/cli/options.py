@@ -1,5 +1,6 @@
 """Options that several commands have."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -8,7 +9,9 @@ import click
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+# Where a service listens that is told nothing else, and where everybody looks for one that is told nothing else.
+USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
+DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
 MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "tree")
 WORLDS = ("manhattan", "city-trees", "sphere")
@@ -58,3 +61,15 @@ def _folder_exists(_ctx: click.Context, parameter: click.Parameter, path: Path |
     if path is not None and path.is_dir():
         raise click.BadParameter(f"{path} is a folder; wanted the name of a file", param=parameter)
     return path
+
+
+def ellipses_option(count: int) -> Callable[[F], F]:
+    """--ellipses."""
+    return click.option(
+        "--ellipses",
+        type=click.IntRange(0, 2000),
+        default=count,
+        show_default=True,
+        metavar="N",
+        help="Show for so many poses and points where they may be, with 95 %.",
+    )

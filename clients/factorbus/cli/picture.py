@@ -9,7 +9,7 @@ import numpy as np
 from factorbus.cli.columns import merged
 from factorbus.cli.drive import Compared
 from factorbus.proto.messages import Batch, Variables
-from factorbus.viz import Course, Odometry, loops_of, save_map
+from factorbus.viz import Course, Odometry, Spread, loops_of, save_map
 
 
 def draw(
@@ -20,8 +20,12 @@ def draw(
     title: str,
     subtitle: str = "",
     truth: Sequence[Variables] = (),
+    spread: Spread | None = None,
 ) -> None:
-    """Odometry, estimate, truth, loop closures, and below them how the drive went, into the file `path`."""
+    """Odometry, estimate, truth, loop closures, and below them how the drive went, into the file `path`.
+
+    spread: where some of the estimate may be.
+    """
     graph = merged(batches)
     save_map(
         path,
@@ -30,6 +34,7 @@ def draw(
         truth=truth,
         loops=loops_of(graph),
         course=course,
+        spread=spread,
         title=title,
         subtitle=subtitle,
     )
@@ -43,9 +48,13 @@ def reckoned(graph: Batch) -> tuple[Variables, ...]:
 
 
 def course_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> Course:
-    """χ² and time of every step, and χ² of the batch optimum where it was found."""
+    """χ², time and work of every step, and χ² of the batch optimum where it was found."""
+    names = ("new_variables", "eliminated", "relinearised")
+    work = np.array([[report[name] for name in names] for report in reports], float).reshape(-1, 3)
+    work[:, 0] = work[:, 0].cumsum()
     return Course(
         np.array([report["chi2"] for report in reports]),
         np.array([report["step_ms"] for report in reports]),
         np.array([(each.revision, each.batch) for each in compared]).reshape(-1, 2),
+        work,
     )

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import ModeChoice, out_option
+from factorbus.cli.options import ModeChoice, ellipses_option, out_option
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -25,6 +25,7 @@ def command() -> None:
     factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --out warehouse.svg
     factorbus plot drive town.g2o
     factorbus plot sparsity town.g2o
+    factorbus plot tree town.g2o
     """
 
 
@@ -39,21 +40,25 @@ def _out(what: str) -> Callable[[F], F]:
 @command.command("map")
 @_source
 @click.option("--solve", is_flag=True, help="Draw the optimum of the graph, found here, instead of the file's values.")
+@ellipses_option(0)
 @_out("map")
-def map_command(source: str, connect: str | None, solve: bool, out: Path | None) -> None:
+def map_command(source: str, connect: str | None, solve: bool, ellipses: int, out: Path | None) -> None:
     """Trajectory, landmarks, loop closures, and where odometry alone would have led.
 
     \b
     factorbus plot map intel --solve --out intel.pdf
+    factorbus plot map victoria_park --solve --ellipses 60
+    factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
     """
     from factorbus.cli.picture import draw
-    from factorbus.cli.plot_source import graph_of, solved
+    from factorbus.cli.plot_source import graph_of, solved, spread_in
     from factorbus.viz import Course
 
     drawn = _ready(lambda: graph_of(source, connect), out)
     drawn = solved(drawn) if solve else drawn
     path = drawn.file("map", out)
-    draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about)
+    spread = spread_in(drawn, connect, ellipses) if ellipses else None
+    draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)
     click.echo(path)
 
 
@@ -117,6 +122,28 @@ def sparsity_command(source: str, connect: str | None, out: Path | None) -> None
 
     path = drawn.file("sparsity", out)
     save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
+    click.echo(path)
+
+
+@command.command("tree")
+@_source
+@_out("tree")
+def tree_command(source: str, connect: str | None, out: Path | None) -> None:
+    """The elimination tree of Λ, and what of it the last loop closure makes anew.
+
+    \b
+    factorbus plot tree intel
+    """
+    from factorbus.cli.plot_source import graph_of
+
+    require("service", "factorbus plot tree")
+    drawn = _ready(lambda: graph_of(source, connect), out)
+    from factorbus.cli.sparsity import last_loop, pattern_of
+    from factorbus.viz import save, tree_figure
+
+    path = drawn.file("tree", out)
+    pattern = pattern_of(drawn.graph)
+    save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
     click.echo(path)
 
 

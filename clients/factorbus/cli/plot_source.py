@@ -8,6 +8,7 @@ from factorbus.proto.messages import Batch, Variables
 
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
+    from factorbus.viz import Spread
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,27 @@ def solved(drawn: Drawn) -> Drawn:
     groups = tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in result.values)
     about = f"χ² {result.chi2:.6g} after {result.iterations} iterations"
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
+
+
+def spread_in(drawn: Drawn, connect: str | None, most: int) -> "Spread":
+    """Where about `most` poses, and points, may be: asked of the map on the bus, or computed at the values drawn.
+
+    Raises Stopped, SolverError, Problem.
+    """
+    from factorbus.cli.exits import require
+    from factorbus.viz import spread_of
+    from factorbus.viz.certainty import blocks_of, chosen
+
+    keys = chosen(drawn.graph.variables, most)
+    if connect is not None:
+        from factorbus.client import connect as connected
+
+        with connected(connect, client="plot") as bus, bus.map(drawn.name, create=False, mirror=False) as joined:
+            return spread_of(drawn.graph.variables, blocks_of(joined.doubt.covariance(keys.tolist())))
+    require("service", "--ellipses of a file")
+    from factorbus.cli.local import covariances_at
+
+    return spread_of(drawn.graph.variables, covariances_at(drawn.graph, keys))
 
 
 def _from_bus(name: str, endpoint: str) -> Drawn:

@@ -9,7 +9,7 @@ from factorbus.cli.children import READY
 from factorbus.cli.exits import input_file, require
 from factorbus.cli.logs import begin, log_option
 from factorbus.cli.notify import Notifier
-from factorbus.cli.options import DEFAULT_ENDPOINT
+from factorbus.cli.options import USUAL_ENDPOINT
 
 
 @click.command()
@@ -17,7 +17,7 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
     "--listen",
     multiple=True,
     metavar="ENDPOINT",
-    help=f"Where clients connect; port 0: any free one.  [default: {DEFAULT_ENDPOINT}]",
+    help=f"Where clients connect; port 0: any free one.  [default: {USUAL_ENDPOINT}]",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="A Zenoh router to meet clients and workers at.")
 @click.option(

@@ -8,7 +8,7 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Batch
 from factorbus.solver.ordering import order
-from factorbus.viz import Pattern
+from factorbus.viz import Pattern, loops_of
 
 
 def pattern_of(graph: Batch) -> Pattern:
@@ -30,6 +30,7 @@ def pattern_of(graph: Batch) -> Pattern:
     fill, nnz_r = _eliminate(dims[perm], eliminated)
     return Pattern(
         n,
+        order=perm,
         inserted=pairs,
         eliminated=eliminated,
         fill=fill,
@@ -37,6 +38,17 @@ def pattern_of(graph: Batch) -> Pattern:
         nnz_r=nnz_r,
         nnz_unordered=_eliminate(dims, pairs)[1],
     )
+
+
+def last_loop(graph: Batch, pattern: Pattern) -> I64:
+    """The columns, as they are eliminated, of the free ends of the loop closure that came last; none where there is
+    none."""
+    loops = loops_of(graph)
+    if not len(loops):
+        return np.empty(0, np.int64)
+    keys = np.sort(np.concatenate([keys for _, keys in _free(graph)]))
+    ends = loops[np.argmax(loops.max(axis=1))]
+    return np.flatnonzero(np.isin(keys[pattern.order], ends))
 
 
 def _blocks(graph: Batch) -> tuple[I64, I64]:

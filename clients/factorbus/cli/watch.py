@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT, out_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, ellipses_option, out_option
 
 
 @click.command()
@@ -21,6 +21,7 @@ from factorbus.cli.options import DEFAULT_ENDPOINT, out_option
 @click.option(
     "--rate", type=click.FloatRange(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second."
 )
+@ellipses_option(60)
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(
@@ -31,6 +32,7 @@ def command(
     web_port: int,
     data_port: int,
     rate: float,
+    ellipses: int,
     until: int | None,
     until_eof: bool,
 ) -> None:
@@ -59,7 +61,7 @@ def command(
         stop_on_signals(until_eof) as stop,
         connect(endpoint, client="watcher") as bus,
         bus.map(map_name, create=False) as joined,
-        Lookout(joined) as lookout,
+        Lookout(joined, ellipses=ellipses) as lookout,
     ):
         try:
             where = _open(view, save, serving or not _has_display(), web_port, data_port)

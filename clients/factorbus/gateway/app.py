@@ -4,7 +4,7 @@
 |---|---|
 | / | the page: the list of maps, and a map by `#name` |
 | /api/maps | the maps of the service |
-| /api/maps/NAME/estimate, /graph, /stats, /closures | JSON |
+| /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
 | /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
@@ -32,6 +32,7 @@ from factorbus.gateway.documents import estimate, groups
 from factorbus.gateway.explain import explain
 from factorbus.gateway.live import follow
 from factorbus.gateway.maps import Maps
+from factorbus.proto.asking import AskWhy
 from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.viz.closures import closures_of
 
@@ -53,6 +54,7 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         f"{one}/estimate": _estimate,
         f"{one}/graph": _graph,
         f"{one}/closures": _closures,
+        f"{one}/ellipses": _ellipses,
         f"{one}/stats": _stats,
         f"{one}/export": _export,
         f"{one}/variables/{{key}}": _variable,
@@ -104,6 +106,15 @@ async def _closures(maps: Maps, request: Request) -> Response:
     return JSONResponse({"revision": graph.revision, "keys": keys, "misfit": found.misfit.tolist()})
 
 
+async def _ellipses(maps: Maps, request: Request) -> Response:
+    """Covariances of places (m²): xx xy xz yy yz zz."""
+    async with maps.using(request.path_params["name"]) as joined:
+        revision, spread = await maps.spread(joined)
+    keys = [format_symbol(key) for key in spread.keys.tolist()]
+    upper = spread.covariances.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    return JSONResponse({"revision": revision, "keys": keys, "covariances": upper.tolist()})
+
+
 async def _stats(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         stats = await asyncio.wrap_future(joined.map.ask.stats(None))
@@ -121,8 +132,8 @@ async def _export(maps: Maps, request: Request) -> Response:
 async def _variable(maps: Maps, request: Request) -> Response:
     key = parse_symbol(request.path_params["key"])
     async with maps.using(request.path_params["name"]) as joined:
-        graph = await maps.graph(joined)
-    return JSONResponse(await asyncio.to_thread(explain, graph, key))
+        why = await asyncio.wrap_future(joined.map.doubt.ask.why(AskWhy(key), None))
+    return JSONResponse(explain(why))
 
 
 async def _live(maps: Maps, socket: WebSocket) -> None:

@@ -1,90 +1,87 @@
-"""What holds a variable where it is: its factors, how well each fits, and the same in words."""
+"""What holds a variable where it is: the service's own account of it (`ask/why`), and the same in words."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.messages import Factors, Graph
-from factorbus.proto.problems import Problem
+from factorbus.proto.asking import Why
 from factorbus.proto.symbols import format_symbol
-from factorbus.viz.residuals import Values, factor_chi2
 
-_WORDS = {"se2": "a pose in the plane", "se3": "a pose in space", "point2": "a point", "point3": "a point in space"}
+_WORDS = {
+    "se2": "a pose in the plane",
+    "se3": "a pose in space",
+    "point2": "a point",
+    "point3": "a point in space",
+    "idp": "a feature of inverse depth",
+}
 _DOUBTFUL = 2.0
 
 
-class NotInMap(Problem):
-    """A question about a variable that the map does not have."""
+def explain(why: Why) -> dict[str, Any]:
+    """{key, kind, value, fixed, revision, sigmas, conditioning, chi2, factors, step, text} of one variable; its worst
+    factors first.
 
-    code = "unknown_variable"
-
-
-def explain(graph: Graph, key: int) -> dict[str, Any]:
-    """{key, kind, value, fixed, revision, chi2, factors, text} of one variable; its worst factors first.
-
-    A factor has kind, keys, chi2 = rᵀ Ω r, and misfit = √(chi2 / dim): about 1 where the information is right.
-    Raises NotInMap.
+    sigmas: standard deviations in its tangent space, metres and radians.  A factor has id, kind, keys, chi2 = rᵀ Ω r,
+    misfit = √(chi2 / dim): about 1 where the information is right; known: the share of what it measures that is known
+    from it and not from the others; without: by how much χ² would fall without it, null: nothing else measures it.
     """
-    kind, value, fixed = _find(graph, key)
-    values = Values(graph.batch.variables)
-    rows = [row for group in graph.batch.factors for row in _rows(group, key, values)]
-    rows.sort(key=lambda row: -(row["chi2"] if row["chi2"] is not None else -1.0))
-    name = format_symbol(key)
+    account = why.variable
+    rows = sorted(map(_row, account["factors"]), key=lambda row: -row["chi2"])
+    name = format_symbol(account["key"])
     return {
         "key": name,
-        "kind": kind,
-        "value": value,
-        "fixed": fixed,
-        "revision": graph.revision,
-        "chi2": sum(row["chi2"] or 0.0 for row in rows),
+        "kind": account["kind"],
+        "value": account["value"],
+        "fixed": account["fixed"],
+        "revision": why.revision,
+        "sigmas": account["sigmas"],
+        "conditioning": account["conditioning"],
+        "chi2": sum(row["chi2"] for row in rows),
         "factors": rows,
-        "text": _text(name, kind, fixed, rows),
+        "step": f"{why.step['strategy']}: {why.step['because']}" if why.step else "",
+        "text": _text(name, account, rows),
     }
 
 
-def _find(graph: Graph, key: int) -> tuple[str, list[float], bool]:
-    for group in graph.batch.variables:
-        at = np.flatnonzero(group.keys == key)
-        if at.size and group.values is not None:
-            return group.kind, group.values[at[0]].tolist(), group.fixed
-    raise NotInMap(f"the map has no {format_symbol(key)} at revision {graph.revision}")
+def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "id": factor["factor"],
+        "kind": factor["kind"],
+        "keys": [format_symbol(key) for key in factor["keys"]],
+        "chi2": factor["chi2"],
+        "misfit": math.sqrt(factor["chi2"] / factor["dims"]),
+        "known": factor["influence"] / factor["dims"],
+        "without": factor["without"],
+    }
 
 
-def _rows(group: Factors, key: int, values: Values) -> list[dict[str, Any]]:
-    here = np.flatnonzero((group.keys == key).any(axis=1))
-    some = Factors(group.kind, group.keys[here], group.measured[here], group.information[here])
-    dim = FACTOR_KINDS[group.kind].dim if group.kind in FACTOR_KINDS else 1
-    rows = []
-    for keys, chi2 in zip(some.keys.tolist(), factor_chi2(some, values).tolist(), strict=True):
-        known = chi2 == chi2  # not NaN: a kind of factor that came after this page
-        rows.append(
-            {
-                "kind": group.kind,
-                "keys": [format_symbol(each) for each in keys],
-                "chi2": chi2 if known else None,
-                "misfit": (chi2 / dim) ** 0.5 if known else None,
-            }
-        )
-    return rows
-
-
-def _text(name: str, kind: str, fixed: bool, rows: list[dict[str, Any]]) -> str:
-    """In a sentence or three."""
-    what = f"{name} is {_WORDS.get(kind, f'of kind {kind}')}"
-    if fixed:
+def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]]) -> str:
+    """In a sentence or four."""
+    what = f"{name} is {_WORDS.get(account['kind'], 'of kind ' + account['kind'])}"
+    if account["fixed"]:
         return f"{what}, and fixed: it is not estimated. {len(rows)} factors lead away from it."
     if not rows:
         return f"{what}, and no factor holds it."
     others = sorted({key for row in rows for key in row["keys"]} - {name})
     held = f"{what}, held by {len(rows)} factor{'s' if len(rows) > 1 else ''}"
     held += f" to {', '.join(others[:4])}{' and others' if len(others) > 4 else ''}." if others else "."
-    worst = rows[0]
-    if worst["misfit"] is None:
-        return held
+    return f"{held} {_certainty(account)}{_fit(rows[0])}"
+
+
+def _certainty(account: Mapping[str, Any]) -> str:
+    """How well it is known, where its tangent is metres and radians."""
+    sigmas, kind = account["sigmas"], account["kind"]
+    if kind not in _WORDS or kind == "idp":
+        return ""
+    places, turns = (sigmas[:2], sigmas[2:]) if kind in ("se2", "point2") else (sigmas[:3], sigmas[3:])
+    turned = f" and {math.degrees(max(turns)):.2g}°" if turns else ""
+    return f"Its place is known to {max(places):.2g} m{turned} (one standard deviation). "
+
+
+def _fit(worst: dict[str, Any]) -> str:
+    by = f"{worst['misfit']:.1f} of its standard deviations"
     if worst["misfit"] > _DOUBTFUL:
-        return (
-            f"{held} {worst['kind']} ({', '.join(worst['keys'])}) contradicts the rest: it misses by "
-            f"{worst['misfit']:.1f} of its standard deviations."
-        )
-    return f"{held} All agree: the worst misses by {worst['misfit']:.1f} of its standard deviations."
+        without = "" if worst["without"] is None else f"; without it χ² would fall by {worst['without']:.3g}"
+        ends = ", ".join(worst["keys"])
+        return f"{worst['kind']} ({ends}) contradicts the rest: it misses by {by}{without}."
+    return f"All agree: the worst misses by {by}."

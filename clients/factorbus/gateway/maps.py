@@ -7,16 +7,22 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from factorbus.client import Bus, Map
-from factorbus.proto.messages import Graph
+from factorbus.proto.asking import Covariances
+from factorbus.proto.messages import Graph, Variables
+from factorbus.viz import Spread, spread_of
+from factorbus.viz.certainty import blocks_of, chosen
+
+_ELLIPSES = 60  # of so many poses, and so many points
 
 
 @dataclass(slots=True)
 class Joined:
-    """A map, how many look at it, and the last graph that was asked for."""
+    """A map, how many look at it, the last graph that was asked for, and the last covariances."""
 
     map: Map
     lookers: int = 0
     graph: Graph | None = None
+    covariances: Covariances | None = None
     asking: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
@@ -44,6 +50,17 @@ class Maps:
             if have is None or (have.epoch, have.revision) != (mirror.epoch, mirror.revision):
                 joined.graph = have = await asyncio.wrap_future(joined.map.ask.graph(None))
         return have
+
+    async def spread(self, joined: "Joined") -> tuple[int, Spread]:
+        """The revision, and where some variables may be in it; asked for once.  Raises Refused, Unavailable."""
+        async with joined.asking:
+            snapshot, have = joined.map.estimate.snapshot(), joined.covariances
+            variables = [Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items()]
+            if have is None or (have.epoch, have.revision) != (snapshot.epoch, snapshot.revision):
+                keys = chosen(variables, _ELLIPSES).tolist()
+                asked = joined.map.doubt.ask.covariance("diagonal", keys, None, None)
+                joined.covariances = have = await asyncio.wrap_future(asked)
+        return have.revision, spread_of(variables, blocks_of(have))
 
     def _enter(self, name: str) -> "Joined":
         with self._lock:

@@ -7,6 +7,7 @@ from factorbus.viz.files import BadPicture, checked_ending, save
 from factorbus.viz.odometry import Odometry, loops_of
 from factorbus.viz.picture import map_figure, save_map
 from factorbus.viz.sparsity import Pattern, sparsity_figure
+from factorbus.viz.tree import tree_figure
 
 __all__ = [
     "BadPicture",
@@ -22,4 +23,5 @@ __all__ = [
     "save_map",
     "sparsity_figure",
     "spread_of",
+    "tree_figure",
 ]

@@ -13,11 +13,13 @@ def _none() -> F64:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Per step of a drive: chi2 (n,) and step_ms (n,), either may be empty.
+    """Per step of a drive: chi2 (n,), step_ms (n,), work (n, 3); each may be empty.
 
+    work: variables in the map, eliminated, relinearised.
     optimum (m, 2): steps and the χ² of the batch optimum at them.
     """
 
     chi2: F64 = field(default_factory=_none)
     step_ms: F64 = field(default_factory=_none)
     optimum: F64 = field(default_factory=lambda: np.empty((0, 2)))
+    work: F64 = field(default_factory=lambda: np.empty((0, 3)))

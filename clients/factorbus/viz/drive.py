@@ -1,4 +1,4 @@
-"""A drive as a picture: χ² against the batch optimum, the time of each step by what it did, and how time adds up."""
+"""A drive as a picture: χ² against the batch optimum, time by what a step did, and how much of the map it works on."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,7 @@ _LOOKS = (
 
 
 def drive_figure(course: Course, strategies: Sequence[str], title: str = "", subtitle: str = "") -> "Figure":
-    """χ², times of steps and their sum along a drive, as a matplotlib figure of its own.
+    """χ², times of steps, their sum, and the work along a drive, as a matplotlib figure of its own.
 
     strategies: what each step did, one word for each of `course.step_ms`.
     """
@@ -33,12 +33,15 @@ def drive_figure(course: Course, strategies: Sequence[str], title: str = "", sub
     from matplotlib.figure import Figure
 
     with mpl.rc_context(style.SETTINGS):
-        figure = Figure(figsize=(9.5, 8.6), layout="constrained")
-        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[1.0, 1.25, 0.7])
-        chi2_panel(top, course)
-        _times(middle, course.step_ms, np.asarray(strategies))
-        _sum(bottom, course.step_ms)
-        for axes in (top, middle):
+        figure = Figure(figsize=(9.5, 10.6 if len(course.work) else 8.6), layout="constrained")
+        heights = [1.0, 1.25, 0.7, 0.9] if len(course.work) else [1.0, 1.25, 0.7]
+        panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+        chi2_panel(panels[0], course)
+        _times(panels[1], course.step_ms, np.asarray(strategies))
+        _sum(panels[2], course.step_ms)
+        if len(course.work):
+            _work(panels[3], course.work)
+        for axes in panels[:-1]:
             axes.set_xlabel("")
         figure.suptitle(f"{title}   {subtitle}".strip(), x=0.012, ha="left", fontsize=12)
     return figure
@@ -78,4 +81,21 @@ def _sum(axes: Any, step_ms: F64) -> None:
     axes.set_title("time in the solver, added up (s)", loc="left")
     axes.set_xlabel("step")
     axes.set_ylim(bottom=0)
+    axes.margins(x=0.01)
+
+
+def _work(axes: Any, work: F64) -> None:
+    """Of how many variables there are, how many a step eliminated and relinearised."""
+    steps = np.arange(1, len(work) + 1)
+    axes.plot(steps, work[:, 0], color=style.INK, linewidth=1.2, label="in the map")
+    for column, name, colour, mark in ((1, "eliminated", style.ESTIMATE, "o"), (2, "relinearised", style.LOOPS, "D")):
+        done = work[:, column] > 0
+        axes.plot(steps[done], work[done, column], mark, markersize=2.6, color=colour, markeredgewidth=0, label=name)
+    axes.set_title("variables: in the map, and worked on by a step", loc="left")
+    axes.set_xlabel("step")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.legend(loc="upper left", ncols=3, columnspacing=1.2, handletextpad=0.3, markerscale=1.6)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high * (high / low) ** 0.25)  # room for the legend
     axes.margins(x=0.01)

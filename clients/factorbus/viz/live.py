@@ -16,7 +16,7 @@ from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
 from factorbus.viz import style
 from factorbus.viz.closures import closures_of, colours_of
-from factorbus.viz.ellipses import Spread, outlines
+from factorbus.viz.ellipses import outlines
 from factorbus.viz.geometry import Track, points_of, rays_of, segments_of, track_of, view_of
 from factorbus.viz.lookout import Look
 
@@ -56,7 +56,7 @@ class LiveView:
         self._name_plots()
         return f"http://127.0.0.1:{web_port}/?url={data.replace(':', '%3A').replace('/', '%2F').replace('+', '%2B')}"
 
-    def show(self, look: Look, spread: Spread | None = None) -> None:
+    def show(self, look: Look) -> None:
         """Log every step, and the map as it is now, unless it is large and was drawn just before."""
         now = time.time()
         for delta in look.deltas:
@@ -66,7 +66,7 @@ class LiveView:
         if now - self._drawn_at >= size / _POSITIONS_PER_S:
             self._drawn_at = now
             self._at(look.revision, now)
-            self._log_map(look, track, spread)
+            self._log_map(look, track)
             self._frame(track)
 
     def close(self) -> None:
@@ -95,7 +95,7 @@ class LiveView:
             text = f"{delta.report.get('strategy', '')}: {delta.report.get('because', '')}"
             self._to.log("log", rr.TextLog(text, level="INFO"))
 
-    def _log_map(self, look: Look, track: Track, spread: Spread | None) -> None:
+    def _log_map(self, look: Look, track: Track) -> None:
         letters = track.keys >> _LETTER_BITS
         for letter in np.unique(letters).tolist():
             places = _in_space(track.places[letters == letter])
@@ -116,10 +116,10 @@ class LiveView:
         colours = (255 * colours_of(closures.misfit)).astype(np.uint8)
         known = np.isin(closures.keys, track.keys).all(axis=1)
         self._log_lines("map/loop_closures", segments_of(track, closures.keys), colours[known])
-        if spread is not None:
+        if look.spread is not None:
             everything = track.places if len(track.keys) else points.places
-            rings = outlines(spread, view_of(everything)) if len(spread.keys) else np.empty((0, 2, 3))
-            self._log_lines("map/where_it_may_be", rings, _rgb(style.SPREAD))
+            rings = outlines(look.spread, view_of(everything)) if len(look.spread.keys) else np.empty((0, 2, 3))
+            self._log_lines("map/where_it_may_be", rings, _rgb(style.DOUBT))
 
     def _log_lines(self, path: str, lines: F64, colours: object) -> None:
         """Line strips (n, corners, 2 or 3)."""

@@ -1,30 +1,30 @@
 """A map on the bus, as those look at it who draw: what changed since they last looked, and the factors now and then.
 
 Deltas come with every step and are small.  Factors are not published; they are asked for, all of them, when there are
-new ones, and the less often the longer the answer takes.
+new ones, and the less often the longer the answer takes.  So are covariances, of some variables.
 """
 
 import threading
-import time
-from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.client import Map
+from factorbus.client import Map, Snapshot
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Delta, Factors, Graph, Variables
-
-# The share of the time that a service spends on answering with its factors is at most one in so many.
-_SPARE = 10
-_LEAST_PAUSE_S = 0.5
+from factorbus.proto.problems import Problem
+from factorbus.viz.certainty import Certainty
+from factorbus.viz.ellipses import Spread
+from factorbus.viz.polite import Polite
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
     """One look.  variables: everything, at `revision`.  deltas: the steps since the last look, oldest first; one with
-    `previous` 0 brings everything anew.  factors: those of `factors_revision`, which may be older."""
+    `previous` 0 brings everything anew.  factors: those of `factors_revision`, which may be older.  spread: where some
+    of the variables may be; None: not asked for."""
 
     epoch: int
     revision: int
@@ -33,6 +33,7 @@ class Look:
     factors: tuple[Factors, ...]
     factors_revision: int
     stale: bool
+    spread: Spread | None = None
 
     def touched(self) -> I64:
         """Keys of what the last step changed; empty after none, or after everything came anew."""
@@ -42,16 +43,18 @@ class Look:
 
 
 class Lookout:
-    """Follows a joined map that has a mirror.  One thread looks; close it, or use it in `with`."""
+    """Follows a joined map that has a mirror.  One thread looks; close it, or use it in `with`.
 
-    def __init__(self, joined: Map, with_factors: bool = True) -> None:
+    ellipses: of about how many poses, and points, to know where they may be.
+    """
+
+    def __init__(self, joined: Map, with_factors: bool = True, ellipses: int = 0) -> None:
         self._map, self._mirror = joined, joined.estimate
         self._news = threading.Event()
         self._stream = DeltaStream(self._mirror, self._news.set)
-        self._graph = Graph(0, 0, Batch())
-        self._asked: Future[Graph] | None = None
-        self._asked_at, self._next_at = 0.0, 0.0
+        self._graph = Polite(lambda: joined.ask.graph(None), Graph(0, 0, Batch()), self._news.set)
         self._with_factors = with_factors
+        self._certainty = Certainty(joined, ellipses, self._news.set) if ellipses else None
 
     def __enter__(self) -> "Lookout":
         return self
@@ -69,10 +72,12 @@ class Lookout:
         """What is to be seen now; never waits for the bus."""
         deltas = tuple(iter(self._stream.try_take, None))
         snapshot = self._mirror.snapshot()
+        graph, now = self._graph.answer, (snapshot.epoch, snapshot.revision)
         if self._with_factors:
-            self._refresh(snapshot.epoch, snapshot.revision)
-        variables = tuple(Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items())
-        graph = self._graph if self._graph.epoch == snapshot.epoch else Graph(snapshot.epoch, 0, Batch())
+            graph = self._graph.refresh(lambda had: (had.epoch, had.revision) != now)
+        variables = _groups(snapshot)
+        graph = graph if graph.epoch == snapshot.epoch else Graph(snapshot.epoch, 0, Batch())
+        spread = self._certainty.spread(*now, variables) if self._certainty else None
         return Look(
             snapshot.epoch,
             snapshot.revision,
@@ -81,27 +86,22 @@ class Lookout:
             graph.batch.factors,
             graph.revision,
             self._mirror.stale,
+            spread,
         )
 
     def last_look(self, timeout_s: float) -> Look:
         """A look with the factors of this revision or a later one, waiting for them.  Raises Refused, Unavailable."""
         if self._with_factors:
-            self._graph = self._map.graph(timeout_s)
+            self._graph.put(self._map.graph(timeout_s))
+        if self._certainty:
+            with suppress(Problem):  # a map that cannot say how certain it is can be looked at all the same
+                self._certainty.wait(_groups(self._mirror.snapshot()), timeout_s)
         return self.look()
 
     def close(self) -> None:
         """Look no more."""
         self._stream.close()
 
-    def _refresh(self, epoch: int, revision: int) -> None:
-        """Take the factors that came, and ask for newer ones if there are any and it is time."""
-        now = time.monotonic()
-        if self._asked is not None and self._asked.done():
-            asked, self._asked = self._asked, None
-            self._next_at = now + max(_LEAST_PAUSE_S, _SPARE * (now - self._asked_at))
-            if asked.exception() is None:  # otherwise the mirror says that it is stale, and it is asked again
-                self._graph = asked.result()
-        behind = (self._graph.epoch, self._graph.revision) != (epoch, revision)
-        if self._asked is None and behind and now >= self._next_at:
-            self._asked, self._asked_at = self._map.ask.graph(None), now
-            self._asked.add_done_callback(lambda _: self._news.set())
+
+def _groups(snapshot: Snapshot) -> tuple[Variables, ...]:
+    return tuple(Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items())

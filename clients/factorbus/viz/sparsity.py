@@ -17,7 +17,7 @@ _FAINTEST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """Blocks of Λ and R of n variables.
+    """Blocks of Λ and R of n variables.  order (n,): which is eliminated first, by place in the order of keys.
 
     inserted (m, 2): blocks of Λ off its diagonal, rows and columns in the order of keys.  eliminated (m, 2): the
     same blocks in the order of elimination.  fill (k, 2): blocks that R has and Λ has not, in that order.
@@ -25,6 +25,7 @@ class Pattern:
     """
 
     n: int
+    order: I64
     inserted: I64
     eliminated: I64
     fill: I64

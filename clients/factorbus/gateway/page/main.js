@@ -6,7 +6,8 @@ import { View } from "./view.js";
 const of = (id) => document.getElementById(id);
 const view = new View(of("map"), "z");
 let map = null;
-let closures = { revision: 0, keys: [], misfit: [] };
+const NOTHING = { closures: { revision: 0, keys: [], misfit: [] }, ellipses: { revision: 0, keys: [], covariances: [] } };
+let asked = NOTHING; // what is asked for now and then, and drawn with the estimate
 let drawing = false, fetching = false;
 
 // For the console, and for tests that drive the page.
@@ -14,7 +15,8 @@ window.factorbus = {
   get revision() { return map ? map.revision : 0; },
   placeOf: (key) => map && map.placeOf(key),
   pixelOf: (key) => { const place = map && map.placeOf(key); return place && view.pixelOf(place); },
-  get closures() { return closures; },
+  get closures() { return asked.closures; },
+  get ellipses() { return asked.ellipses; },
 };
 
 async function ask(path) {
@@ -30,30 +32,33 @@ function changed() {
   if (chi2 !== undefined) words.push(`χ² ${chi2.toPrecision(6)}`);
   if (ms !== undefined) words.push(`step ${ms.toFixed(2)} ms ${strategy ?? ""}`);
   of("state").textContent = map.state === "live" ? words.join(" · ") : map.state;
-  refreshClosures();
+  refresh();
   if (drawing) return;
   drawing = true;
-  requestAnimationFrame(() => { drawing = false; view.draw(map, closures); });
+  requestAnimationFrame(() => { drawing = false; view.draw(map, asked); });
 }
 
-// All factors have to be asked for: not more often than every two seconds.
-async function refreshClosures() {
-  if (fetching || closures.revision === map.revision) return;
+// All factors have to be asked for, and covariances computed: not more often than every two seconds.
+async function refresh() {
+  const old = () => Object.values(asked).some((each) => each.revision !== map.revision);
+  if (fetching || !old()) return;
   fetching = true;
   const name = map.name;
-  try {
-    const found = await ask(`/api/maps/${name}/closures`);
-    if (map.name === name) closures = found;
-  } catch (error) {
-    map.state = error.message;
+  for (const what of Object.keys(asked)) {
+    try {
+      const found = await ask(`/api/maps/${name}/${what}`);
+      if (map.name === name) asked = { ...asked, [what]: found };
+    } catch (error) {
+      of("state").title = `${what}: ${error.message}`; // the map itself is shown all the same
+    }
   }
-  setTimeout(() => { fetching = false; if (closures.revision !== map.revision) refreshClosures(); }, 2000);
-  view.draw(map, closures);
+  setTimeout(() => { fetching = false; if (old()) refresh(); }, 2000);
+  view.draw(map, asked);
 }
 
 function show(name) {
   if (map) map.close();
-  closures = { revision: 0, keys: [], misfit: [] };
+  asked = NOTHING;
   view.follow = true;
   view.chosen = null;
   location.hash = name;
@@ -69,19 +74,22 @@ function element(tag, text, ...children) {
 
 async function explain(key) {
   view.chosen = key;
-  view.draw(map, closures);
+  view.draw(map, asked);
   const panel = of("panel");
   try {
     const found = await ask(`/api/maps/${map.name}/variables/${key}`);
-    const head = element("tr", null, ...["factor", "of", "χ²", "misfit"].map((name) => element("th", name)));
+    const head = element("tr", null, ...["factor", "of", "χ²", "misfit", "known from it"].map((name) => element("th", name)));
     const rows = found.factors.map((f) => element("tr", null,
       element("td", f.kind), element("td", f.keys.join(" ")),
-      element("td", f.chi2 === null ? "?" : f.chi2.toPrecision(3)), element("td", f.misfit === null ? "?" : f.misfit.toFixed(2))));
+      element("td", f.chi2.toPrecision(3)), element("td", f.misfit.toFixed(2)),
+      element("td", f.without === null ? "all" : `${Math.round(100 * f.known)} %`)));
     panel.replaceChildren(
       element("h2", found.key),
       element("p", found.text),
       element("p", `${found.kind} (${found.value.map((v) => v.toFixed(3)).join(", ")}) at revision ${found.revision}`),
+      element("p", found.fixed ? "" : `σ ${found.sigmas.map((v) => v.toPrecision(2)).join(", ")} (in its own frame; metres, radians)`),
       element("table", null, head, ...rows),
+      element("p", `last step of the map: ${found.step}`),
     );
   } catch (error) {
     panel.replaceChildren(element("h2", key), element("p", error.message));
@@ -99,7 +107,7 @@ function hands(canvas) {
     view.follow = false;
     view.middle = [view.middle[0] - dx / view.scale, view.middle[1] + dy / view.scale];
     from = [e.clientX, e.clientY];
-    view.draw(map, closures);
+    view.draw(map, asked);
   };
   canvas.onpointerup = (e) => {
     from = null;
@@ -114,7 +122,7 @@ function hands(canvas) {
     const [x, y] = [e.offsetX - canvas.clientWidth / 2, canvas.clientHeight / 2 - e.offsetY];
     view.middle = [view.middle[0] + (x / view.scale) * (1 - 1 / by), view.middle[1] + (y / view.scale) * (1 - 1 / by)];
     view.scale *= by;
-    view.draw(map, closures);
+    view.draw(map, asked);
   };
 }
 
@@ -134,8 +142,8 @@ async function list() {
 }
 
 of("maps").onchange = (e) => show(e.target.value);
-of("plane").onchange = (e) => { view.plane = e.target.value; view.follow = true; if (map) view.draw(map, closures); };
-of("fit").onclick = () => { view.follow = true; if (map) view.draw(map, closures); };
-window.onresize = () => map && view.draw(map, closures);
+of("plane").onchange = (e) => { view.plane = e.target.value; view.follow = true; if (map) view.draw(map, asked); };
+of("fit").onclick = () => { view.follow = true; if (map) view.draw(map, asked); };
+window.onresize = () => map && view.draw(map, asked);
 hands(of("map"));
 list();

@@ -3,6 +3,8 @@
 const COLOURS = getComputedStyle(document.documentElement);
 const colour = (name) => COLOURS.getPropertyValue(`--${name}`).trim();
 const AXES = { z: [0, 1], y: [0, 2], x: [1, 2] };
+// Where the entries of a covariance are in xx xy xz yy yz zz.
+const ENTRY = [[0, 1, 2], [1, 3, 4], [2, 4, 5]];
 const REACH_PX = 14;
 
 export class View {
@@ -51,7 +53,7 @@ export class View {
     return best;
   }
 
-  draw(map, closures) {
+  draw(map, { closures, ellipses }) {
     if (this.follow || !this.scale) this.fit(map);
     const ratio = window.devicePixelRatio || 1;
     const { clientWidth: w, clientHeight: h } = this.canvas;
@@ -61,6 +63,7 @@ export class View {
     pen.scale(ratio, ratio);
     // Below everything else, so that it hides nothing.
     for (const key of map.touched) this.dot(pen, map.placeOf(key), 4, colour("touched"));
+    this.drawEllipses(pen, map, ellipses);
     this.drawClosures(pen, map, closures);
     for (const keys of map.tracks().values()) this.drawTrack(pen, map, keys);
     for (const [key, { kind }] of map.variables) {
@@ -92,6 +95,25 @@ export class View {
       });
       pen.stroke();
     }
+  }
+
+  // Each holds 95 % of where the variable may be: √5.991 standard deviations, seen in this plane.
+  drawEllipses(pen, map, { keys, covariances }) {
+    const [a, b] = AXES[this.plane];
+    pen.strokeStyle = colour("spread");
+    pen.fillStyle = `${colour("spread")}22`;
+    pen.lineWidth = 1;
+    keys.forEach((key, i) => {
+      const place = map.placeOf(key);
+      if (!place) return;
+      const [xx, xy, yy] = [ENTRY[a][a], ENTRY[a][b], ENTRY[b][b]].map((at) => covariances[i][at]);
+      const middle = (xx + yy) / 2, apart = Math.hypot((xx - yy) / 2, xy);
+      const [long, short] = [middle + apart, Math.max(middle - apart, 0)].map((each) => 2.447747 * Math.sqrt(each) * this.scale);
+      pen.beginPath();
+      pen.ellipse(...this.pixelOf(place), long, short, -Math.atan2(2 * xy, xx - yy) / 2, 0, 2 * Math.PI); // y goes down here
+      pen.fill();
+      pen.stroke();
+    });
   }
 
   dot(pen, place, radius, fill) {

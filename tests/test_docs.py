@@ -1,0 +1,103 @@
+"""The site builds without a warning, its links lead somewhere, nothing in it is fetched from elsewhere; and what its
+documents tell one to type works, typed in that order."""
+
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from walk import LANGUAGES, ROOT, agrees, blocks, walk
+
+from factorbus.cli.explain import read_pages
+
+sys.path.insert(0, str(ROOT / "docs" / "machinery"))
+TUTORIALS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "tutorials").glob("*.md"))
+CONCEPTS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "concepts").glob("*.md"))
+needs_docs = pytest.mark.skipif(
+    find_spec("sphinx") is None or find_spec("myst_parser") is None, reason="pip install 'factorbus[docs]'"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as `make docs` builds it: a warning or a broken link fails."""
+    folder = tmp_path_factory.mktemp("docs") / "site"
+    ran = subprocess.run(
+        [sys.executable, str(ROOT / "docs" / "machinery" / "build.py"), str(folder)],
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "all links lead somewhere" in ran.stdout
+    return folder
+
+
+@needs_docs
+def test_every_error_code_has_its_place_on_the_site(site: Path) -> None:
+    anchors = set(re.findall(r'id="([^"]+)"', (site / "reference" / "codes.html").read_text()))
+    assert {name.replace("_", "-") for name in read_pages()} <= anchors
+
+
+@needs_docs
+def test_the_python_api_is_there_with_its_docstrings(site: Path) -> None:
+    page = (site / "api" / "client.html").read_text()
+    for name in ("factorbus.client.connect", "factorbus.client.Draft.between_se2", "factorbus.client.Map.insert"):
+        assert f'id="{name}"' in page
+    assert "Mahalanobis" in (site / "api" / "proto.html").read_text()
+
+
+@needs_docs
+def test_a_link_that_leads_nowhere_is_found(tmp_path: Path) -> None:
+    from links import broken
+
+    (tmp_path / "index.html").write_text(
+        '<h1 id="top">a</h1><a href="#top"></a><a href="#gone"></a><a href="no.html"></a><a href="b/c.html#x"></a>'
+        '<img src="https://elsewhere.example/a.png"><a href="https://elsewhere.example"></a>'
+    )
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "c.html").write_text('<p id="y"></p><a href="../index.html#top"></a>')
+    assert len(list(broken(tmp_path))) == 4
+
+
+@needs_docs
+def test_a_borrowed_document_with_a_bad_link_is_refused() -> None:
+    from borrowed import notebook, turned
+
+    docs, readme = ROOT / "docs", ROOT / "service" / "README.md"
+    page = docs / "reference" / "service.md"
+    text = "[a](../proto/README.md#4-messages) ![b](../docs/town.png)\n```\n[c](nowhere.md)\n```\n"
+    assert turned(text, readme, page, docs).startswith("[a](wire.md#4-messages) ![b](../town.png)\n```\n[c](nowhere")
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.md"):
+        turned("[c](nowhere.md)", readme, page, docs)
+    assert notebook("# %% [markdown]\n# # Title\n# text\n\n# %%\nx = 1\n") == "# Title\ntext\n\n```python\nx = 1\n```\n"
+
+
+@needs_docs
+def test_docstrings_are_read_as_they_are_meant() -> None:
+    from docstrings import rewritten
+
+    said = rewritten(["Where `x_` is, |r| and *not* emphasis.", "", "    r = z", "", "a (n,)   of `b`s"])
+    assert said[0] == r"Where ``x_`` is, \|r\| and \*not\* emphasis."
+    assert said[2:5] == ["::", "", "        r = z"]
+    assert said[6:9] == ["::", "", "    a (n,)   of `b`s"]
+
+
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+def test_every_block_runs_as_it_stands(document: str, tmp_path: Path) -> None:
+    walk(document, tmp_path)
+
+
+@pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
+def test_no_block_is_left_out(document: str) -> None:
+    fences = re.findall(r"^```(.*)$", (ROOT / document).read_text(encoding="utf-8"), re.M)
+    assert fences[::2] == [language for language, _ in blocks(document)]
+    assert set(fences[::2]) <= LANGUAGES
+
+
+def test_what_a_document_says_is_printed_is_compared() -> None:
+    agrees("done 12 poses\n… at 1e-3", "hello\ndone 700 poses\nanything at -0.5\n")
+    with pytest.raises(AssertionError, match="wanted a line"):
+        agrees("done 12 poses", "failed 12 poses")
