@@ -198,7 +198,7 @@ class Solver:
         variables, factors = made.variable_count, made.factor_count
         first = made._graph.next_id if batch is None else made.stage(batch)
         new = made.variable_count - variables, made.factor_count - factors
-        report = replace(made.step(settle), new_variables=new[0], new_factors=new[1])
+        report = made.step(settle)._replace(new_variables=new[0], new_factors=new[1])
         return made, first, report, edits.counted
 
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
