@@ -1,7 +1,7 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
