@@ -13,14 +13,14 @@ const COLUMNS = {
   values: "f64", measured: "f64", information: "f64", scale: "f64", covariance: "f64", distance: "f64",
   threshold: "f64", gain: "f64", distances: "f64", numbers: "f64", state: "f64", pixels: "f64", y: "f64", rows: "f64",
   cross: "f64", blocks: "f64", turn: "f64", own: "f64", U: "f64", S: "f64",
+  factors: "i64", ids: "i64", weight: "f64", // §17
   plausible: "u8", matched: "u8", payload: "msgpack", ask: "msgpack", shard: "msgpack",
 };
 
 const FORMS = { i64: BigInt64Array, f64: Float64Array, u8: Uint8Array };
 
 /** A bin as the array that its field has: BigInt64Array, Float64Array, Uint8Array, or the bytes of a message. */
-export function column(name, bytes) {
-  const kind = COLUMNS[name];
+export function column(name, bytes, kind = COLUMNS[name]) {
   if (kind === undefined) throw new Error(`the contract has no column ${name}`);
   if (kind === "msgpack") return { kind, content: bytes };
   const Form = FORMS[kind];

@@ -6,6 +6,13 @@
 const text = new TextEncoder();
 const words = new TextDecoder("utf-8", { fatal: true });
 
+/** A number that is written as a float64 whatever its field is called. */
+export class Float {
+  constructor(value) {
+    this.value = value;
+  }
+}
+
 /** The value in `bytes`, which have to be one message and nothing more. Throws Error. */
 export function decode(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
@@ -110,6 +117,7 @@ export function encode(value, floats) {
     if (of === null) return head(0xc0);
     if (typeof of === "boolean") return head(of ? 0xc3 : 0xc2);
     if (typeof of === "bigint") return integer(of);
+    if (of instanceof Float) return put(9, (view) => { view.setUint8(0, 0xcb); view.setFloat64(1, of.value); });
     if (typeof of === "number") {
       if (Number.isInteger(of) && !floats.has(name)) return integer(of);
       return put(9, (view) => { view.setUint8(0, 0xcb); view.setFloat64(1, of); });
