@@ -16,6 +16,7 @@ TAGS = {"3": (2.5, 1.0), "17": (6.0, 2.5), "42": (2.5, 6.0), "dock": (-1.0, 2.5)
 CAMERA = (0.3, 0.0, math.pi / 2)
 SCALE, BEND = 1.03, 0.02
 REACH_M = 5.0
+KEYFRAMES = 1 + 4 * (STEPS + 1)
 
 
 def main() -> None:
@@ -44,9 +45,10 @@ def drive(node: ros.RosNode) -> dict[str, object]:
             transform, attached = say(node, ns, true, told)
             numbers.append(attached[0])
     last = transform.transforms[-1]
-    path, _ = node.wait_for("/factorbus/path")
-    markers, _ = node.wait_for("/factorbus/markers")
-    landmarks = next(marker for marker in markers.markers if marker.ns == "landmarks")
+    # What is drawn may be of the step before, at first.
+    while len((path := node.wait_for("/factorbus/path")[0]).poses) < KEYFRAMES:
+        pass
+    landmarks, _ = node.wait_for("/factorbus/markers")[0].markers
     return {
         "true": true,
         "told": told,
