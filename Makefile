@@ -4,13 +4,13 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 export PYTHON
 
-SETUP := deploy/setup/environment.sh deploy/setup/system.sh
+SETUP := deploy/setup/environment.sh deploy/setup/system.sh deploy/setup/browser.sh
 # Stamps: what is installed follows from pyproject.toml and the set-up scripts; only their change runs pip again.
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help pictures docs setup demo test test-data test-kernels test-faults lint check crash bench wheel clean
+.PHONY: help pictures docs setup demo live test test-data test-kernels test-faults lint check crash bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -28,6 +28,9 @@ $(READY_DEV): pyproject.toml $(SETUP)
 
 demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as processes on the bus
 	@$(BIN)/factorbus demo $(ARGS)
+
+live: $(READY) ## a graph file of yours, FILE=my.g2o, as a live map in the browser
+	@$(BIN)/factorbus replay $(FILE) --live $(ARGS)
 
 test: $(READY_DEV) ## the tests
 	@$(BIN)/factorbus warm

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,16 @@ class Process:
                 raise AssertionError(f"ended before a line {beginning!r}; {self._said()}")
             if line.startswith(beginning):
                 return line.removeprefix(beginning).split()
+
+    def said(self, beginning: str, patience_s: float = COMPILING_S) -> str:
+        """What follows `beginning` on the line of its standard error that begins so, once it is there."""
+        end = time.monotonic() + patience_s
+        while time.monotonic() < end and self._popen.poll() is None:
+            for line in self._log.read_text().splitlines(keepends=True):
+                if line.startswith(beginning) and line.endswith("\n"):
+                    return line.removeprefix(beginning).strip()
+            time.sleep(0.05)  # a file tells nobody that it has grown
+        raise AssertionError(f"no line {beginning!r}; {self._said()}")
 
     def tell(self, line: str) -> None:
         """Write a line to its standard input."""

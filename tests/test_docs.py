@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from walk import LANGUAGES, ROOT, agrees, blocks, walk
+from walk import LANGUAGES, ROOT, agrees, blocks, walk, walker
 
 from factorbus.cli.explain import read_pages
 
@@ -88,6 +88,15 @@ def test_docstrings_are_read_as_they_are_meant() -> None:
 @pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])
 def test_every_block_runs_as_it_stands(document: str, tmp_path: Path) -> None:
     walk(document, tmp_path)
+
+
+def test_the_notebooks_run_from_top_to_bottom(tmp_path: Path) -> None:
+    scripts = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
+    assert len(scripts) >= 2
+    with walker(tmp_path) as run:
+        run("bash", "factorbus serve")
+        for script in scripts:
+            assert run("bash", f"python '{script}'")
 
 
 @pytest.mark.parametrize("document", [*TUTORIALS, *CONCEPTS])

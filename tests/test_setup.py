@@ -46,6 +46,16 @@ def test_what_is_missing_is_named_with_how_to_install_it(tmp_path: Path) -> None
         assert text in ran.stderr
 
 
+def test_without_a_browser_set_up_goes_on_and_says_what_that_costs(tmp_path: Path) -> None:
+    for tool in ("bash", "id"):
+        (tmp_path / tool).symlink_to(shutil.which(tool) or "")
+    ran = run("browser.sh", PATH=str(tmp_path))
+    assert ran.returncode == 0
+    assert "there is no Chromium: the tests that look at pages will be skipped (apt-get install chromium)" in ran.stderr
+    (tmp_path / "chromium").symlink_to("/bin/true")
+    assert run("browser.sh", PATH=str(tmp_path)).stderr == ""
+
+
 def test_an_interpreter_that_is_too_old_or_not_there_is_named(tmp_path: Path) -> None:
     ran = run("environment.sh", str(tmp_path / "venv"), "dev", PYTHON="/nowhere/python3.9")
     assert ran.returncode == 1

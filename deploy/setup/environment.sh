@@ -9,6 +9,7 @@ main() {
     here=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
     python=$(interpreter)
     bash "$here/deploy/setup/system.sh" "$python"
+    [[ ,$extras, != *,dev,* ]] || bash "$here/deploy/setup/browser.sh"
     # Left half made by an interrupted run, a virtual environment has no working pip: make it anew over itself.
     if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
         echo "set-up: $("$python" --version) -> $venv" >&2

@@ -193,6 +193,24 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
             assert failures == []
 
 
+@needs_browser
+def test_a_file_of_ones_own_is_seen_live_by_one_command(spawn: Callable[..., Process], tmp_path: Path) -> None:
+    """`make live`: solver, page and robot; when the drive is over the page stays until Ctrl-C."""
+    path = tmp_path / "mine.g2o"
+    assert main(["simulate", "manhattan", "--poses", "80", "--out", str(path)]) == OK
+    process = spawn(
+        "-m", "factorbus.cli", "replay", str(path), "--live", "--port", "0", "--map", "mine", "--pace", "60"
+    )
+    address = process.said("the map, live: ")
+    with page_of(address) as page:
+        page.wait_for_function("window.factorbus.revision > 5", timeout=60_000)
+        page.wait_for_function("window.factorbus.revision === 81", timeout=60_000)
+        assert page.evaluate("window.factorbus.placeOf('x79')") is not None
+        process.said("the page stays until Ctrl-C")
+    process.signal(signal.SIGINT)
+    assert process.wait() == OK
+
+
 def keys_of(name: str) -> int:
     from factorbus.proto.symbols import parse_symbol
 

@@ -156,6 +156,14 @@ def service(
 
 
 @contextmanager
+def gateway(endpoint: str, port: int, zenoh: str = "", timeout_s: float = 60.0) -> Iterator[str]:
+    """A process that shows the maps at `endpoint` to browsers, and the address of its page."""
+    known = ("--zenoh", zenoh) if zenoh else ()
+    with child("gateway", "gateway", "--connect", endpoint, "--port", str(port), "--until-eof", *known) as process:
+        yield process.ready(timeout_s)[0]
+
+
+@contextmanager
 def worker(endpoint: str, name: str, timeout_s: float = 600.0) -> Iterator[Child]:
     """A worker process joined to `endpoint`."""
     with child(name, "work", "--connect", endpoint, "--name", name, "--until-eof") as process:

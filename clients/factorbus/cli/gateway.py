@@ -4,11 +4,12 @@ import click
 
 from factorbus.cli.children import READY
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT
+from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
 
 
 @click.command()
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@zenoh_option
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0: all of them.")
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="To listen at; 0: any free one."
@@ -17,7 +18,7 @@ from factorbus.cli.options import DEFAULT_ENDPOINT
     "--name", "names", multiple=True, metavar="NAME", help="A name by which browsers call this machine, or '*'."
 )
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
-def command(endpoint: str, host: str, port: int, names: tuple[str, ...], until_eof: bool) -> None:
+def command(endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, ...], until_eof: bool) -> None:
     """Serve maps to browsers: a page with the live map, and the same over HTTP and WebSocket, to read only.
 
     Click a pose or a landmark to see what holds it where it is. Until Ctrl-C.
@@ -35,7 +36,7 @@ def command(endpoint: str, host: str, port: int, names: tuple[str, ...], until_e
     from factorbus.gateway.server import serving
 
     hosts = ("127.0.0.1", "localhost", host, *names)
-    with stop_on_signals(until_eof) as stop, connect(endpoint, client="gateway") as bus:
+    with stop_on_signals(until_eof) as stop, connect(endpoint, client="gateway", zenoh=zenoh) as bus:
         try:
             with serving(make_app(bus, hosts), host, port) as bound:
                 click.echo(f"{READY}http://{'127.0.0.1' if host == '0.0.0.0' else host}:{bound}")

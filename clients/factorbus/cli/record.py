@@ -5,12 +5,13 @@ from pathlib import Path
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT, out_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, out_option, zenoh_option
 
 
 @click.command()
 @click.argument("map_name", metavar="MAP")
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@zenoh_option
 @out_option("--out", "out", "The recording.  [default: MAP.mcap here]", "FILE.mcap")
 @click.option(
     "--every",
@@ -23,7 +24,9 @@ from factorbus.cli.options import DEFAULT_ENDPOINT, out_option
 )
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
-def command(map_name: str, endpoint: str, out: Path | None, every_s: float, until: int | None, until_eof: bool) -> None:
+def command(
+    map_name: str, endpoint: str, zenoh: str, out: Path | None, every_s: float, until: int | None, until_eof: bool
+) -> None:
     """Record MAP into an MCAP file until Ctrl-C: every step, every estimate, every factor, and a scene to look at.
 
     Foxglove opens it (3D panel: /map/scene and /tf; plots: /map/step.chi2), and any MCAP reader. What is in the map
@@ -46,7 +49,7 @@ def command(map_name: str, endpoint: str, out: Path | None, every_s: float, unti
         raise Stopped("file_exists", f"{path} is there already: give another --out, or remove it", path=str(path))
     with (
         stop_on_signals(until_eof) as stop,
-        connect(endpoint, client="recorder") as bus,
+        connect(endpoint, client="recorder", zenoh=zenoh) as bus,
         bus.map(map_name, create=False) as joined,
         Lookout(joined) as lookout,
         Recording(path) as recording,

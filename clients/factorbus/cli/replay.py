@@ -1,6 +1,7 @@
 """`factorbus replay`: a graph file or a data set through a map, pose by pose, as a robot would have sent it."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +33,9 @@ class Request:
     plot: Path | None
     client: str = "replay"
     zenoh: str = ""
+    live: bool = False
+    port: int = 8080
+    pace: float | None = None
 
     @property
     def where(self) -> str:
@@ -70,6 +74,11 @@ class Request:
 @click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
 @click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
+@click.option("--live", is_flag=True, help="Show the map in a browser as it grows; afterwards stay until Ctrl-C.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
+)
+@click.option("--pace", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
@@ -84,6 +93,7 @@ def command(as_json: bool, **asked: Any) -> None:
     \b
     factorbus replay intel
     factorbus replay intel.g2o --every 100 --plot intel.png
+    factorbus replay intel.g2o --live --pace 100
     factorbus replay intel.g2o --connect tcp/127.0.0.1:7447 --map lab --tum lab.tum
     factorbus replay intel.g2o --in-process --json
 
@@ -97,17 +107,21 @@ def command(as_json: bool, **asked: Any) -> None:
     request = Request(**asked)
     if request.in_process and request.connect:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
+    if request.in_process and request.live:
+        raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
     from factorbus.cli import screen
 
-    result = replay(request)
-    if as_json:
-        screen.document(result)
-    else:
-        screen.table(_rows(result), title=f"{request.file}, in {request.where}")
+    def told(result: dict[str, Any]) -> None:
+        if as_json:
+            screen.document(result)
+        else:
+            screen.table(_rows(result), title=f"{request.file}, in {request.where}")
+
+    replay(request, told)
 
 
-def replay(request: Request) -> dict[str, Any]:
-    """Do it, with progress on standard error; returns the document."""
+def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
+    """Do it, with progress on standard error; returns the document, and hands it to `told` while the map is there."""
     from factorbus.cli import screen
     from factorbus.cli.drive import drive
     from factorbus.cli.replay_source import source_of
@@ -115,6 +129,8 @@ def replay(request: Request) -> dict[str, Any]:
 
     if request.plot:
         require("viz", "--plot")
+    if request.live:
+        require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
     graph = read(request.file)
     for text in graph.notes:
@@ -123,15 +139,24 @@ def replay(request: Request) -> dict[str, Any]:
     with _target(request) as target:
         before = target.account()
         with screen.progress(request.file.name, graph.poses) as show:
-            driven = drive(target, steps, request.every, show)
+            driven = drive(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
-        compared = target.compared()
-        after = target.account()
         _write(request, target)
         if request.plot:
             _draw(request.plot, request.file.name, driven, target, steps)
-    measured = driven.measures()
+        result = _document(request, driven, target, steps, last, unsettled, before)
+        told(result)
+        if request.live:
+            _stay()
+    return result
+
+
+def _document(
+    request: Request, driven: Any, target: Any, steps: Any, last: Any, unsettled: float, before: Any
+) -> dict[str, Any]:
+    """What was measured."""
+    measured, after = driven.measures(), target.account()
     return {
         "file": str(request.file),
         "where": request.where,
@@ -145,7 +170,7 @@ def replay(request: Request) -> dict[str, Any]:
         "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
         "kernels_compiled_s": after["kernels_compiled_s"],
         "deltas": after["deltas"],
-        "against_batch": [each.as_dict() for each in compared],
+        "against_batch": [each.as_dict() for each in target.compared()],
     }
 
 
@@ -158,7 +183,7 @@ def _target(request: Request) -> Iterator[Any]:
 
         yield LocalMap(request.mode)
         return
-    from factorbus.cli.children import service, worker
+    from factorbus.cli.children import gateway, service, worker
     from factorbus.cli.remote import RemoteMap
     from factorbus.cli.screen import note
     from factorbus.cli.stopping import interrupt_on_sigterm
@@ -187,9 +212,31 @@ def _target(request: Request) -> Iterator[Any]:
                 REFUSED,
                 map=request.map_name,
             )
+        if request.live:
+            page = stack.enter_context(gateway(endpoint, request.port, request.zenoh))
+            note(f"the map, live: {page}/#{request.map_name}")
         target = RemoteMap(joined, request.window)
         stack.callback(target.close)
         yield target
+
+
+def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
+    """The same steps, at most so many a second."""
+    begun = time.monotonic()
+    for number, step in enumerate(steps):
+        if pace_hz is not None:
+            time.sleep(max(0.0, begun + number / pace_hz - time.monotonic()))
+        yield step
+
+
+def _stay() -> None:
+    """Until Ctrl-C or SIGTERM."""
+    from factorbus.cli.screen import note
+    from factorbus.cli.stopping import stop_on_signals
+
+    with stop_on_signals(until_eof=False) as stop:
+        note("the page stays until Ctrl-C")
+        stop.wait()
 
 
 def _write(request: Request, target: Any) -> None:

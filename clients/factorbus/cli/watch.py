@@ -8,12 +8,13 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT, ellipses_option, out_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, ellipses_option, out_option, zenoh_option
 
 
 @click.command()
 @click.argument("map_name", metavar="MAP")
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@zenoh_option
 @out_option("--save", "save", "Write a Rerun recording instead of opening a viewer.", "FILE.rrd")
 @click.option("--serve", "serving", is_flag=True, help="Serve the viewer to browsers: for machines without a display.")
 @click.option("--web-port", type=click.IntRange(1, 65535), default=9090, show_default=True, metavar="PORT")
@@ -27,6 +28,7 @@ from factorbus.cli.options import DEFAULT_ENDPOINT, ellipses_option, out_option
 def command(
     map_name: str,
     endpoint: str,
+    zenoh: str,
     save: Path | None,
     serving: bool,
     web_port: int,
@@ -59,7 +61,7 @@ def command(
     view = LiveView(map_name)
     with (
         stop_on_signals(until_eof) as stop,
-        connect(endpoint, client="watcher") as bus,
+        connect(endpoint, client="watcher", zenoh=zenoh) as bus,
         bus.map(map_name, create=False) as joined,
         Lookout(joined, ellipses=ellipses) as lookout,
     ):
