@@ -1,5 +1,6 @@
 #define _POSIX_C_SOURCE 200809L
 #include "zenoh.h"
+#include "zenoh_bytes.h"
 
 #include <netdb.h>
 #include <netinet/in.h>
@@ -20,10 +21,8 @@ enum {
     /* … what they carry, and what is declared. */
     PUT = 0x01, DEL = 0x02, QUERY = 0x03, REPLY = 0x04, ERR = 0x05,
     D_KEY = 0x00, D_SUBSCRIBER = 0x02, D_TOKEN = 0x06,
-    ID = 0x1f, F1 = 0x20, F2 = 0x40, EXTENDED = 0x80, /* of a header: which, two flags, extensions follow */
-    EXT_ID = 0x0f, EXT_BODY = 0x60, EXT_INT = 0x20, EXT_BYTES = 0x40, EXT_MORE = 0x80,
     VERSION = 9, CLIENT = 2, RESOLUTION = 0x0a, /* numbers of frames and requests have 32 bits */
-    BATCH = 65535, LEASE_MS = 10000, BEAT_MS = 2500, OPENING_MS = 10000,
+    LEASE_MS = 10000, BEAT_MS = 2500, OPENING_MS = 10000,
     KEYS = 256, LONGEST_KEY = 512, LARGEST = 256 << 20,
 };
 
@@ -42,92 +41,11 @@ struct z_session {
     uint8_t batch[BATCH];
 };
 
-/* ---- bytes ---- */
-
-typedef struct {
-    const uint8_t *at, *end;
-    bool bad;
-} reader;
-
-typedef struct {
-    uint8_t bytes[BATCH];
-    size_t size;
-    bool full;
-} writer;
-
 static int64_t now_ms(void)
 {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
     return (int64_t)now.tv_sec * 1000 + now.tv_nsec / 1000000;
-}
-
-static uint8_t byte(reader *in)
-{
-    if (in->at >= in->end) {
-        in->bad = true;
-        return 0;
-    }
-    return *in->at++;
-}
-
-/* A number, seven bits a byte, the least first; the ninth byte has eight. */
-static uint64_t number(reader *in)
-{
-    uint64_t value = 0;
-    for (int shift = 0; shift < 56; shift += 7) {
-        uint8_t next = byte(in);
-        value |= (uint64_t)(next & 0x7f) << shift;
-        if (!(next & 0x80)) return value;
-    }
-    return value | (uint64_t)byte(in) << 56;
-}
-
-static reader part(reader *in, uint64_t size)
-{
-    reader inside = {in->at, in->at, in->bad};
-    if (in->bad || size > (uint64_t)(in->end - in->at)) {
-        in->bad = inside.bad = true;
-        return inside;
-    }
-    in->at += size;
-    inside.end = in->at;
-    return inside;
-}
-
-static void put(writer *out, const void *bytes, size_t size)
-{
-    if (size > sizeof out->bytes - out->size) {
-        out->full = true;
-        return;
-    }
-    if (size > 0) memcpy(out->bytes + out->size, bytes, size);
-    out->size += size;
-}
-
-static void put_byte(writer *out, uint8_t value) { put(out, &value, 1); }
-
-static void put_number(writer *out, uint64_t value)
-{
-    for (int i = 0; i < 8 && value > 0x7f; i++, value >>= 7) put_byte(out, (uint8_t)(value | 0x80));
-    put_byte(out, (uint8_t)value);
-}
-
-static void put_key(writer *out, const char *key)
-{
-    put_number(out, 0); /* no number stands for its beginning */
-    put_number(out, strlen(key));
-    put(out, key, strlen(key));
-}
-
-static void skip_extensions(reader *in, uint8_t header)
-{
-    for (bool more = header & EXTENDED; more && !in->bad;) {
-        uint8_t extension = byte(in);
-        more = extension & EXT_MORE;
-        if ((extension & EXT_BODY) == EXT_INT) number(in);
-        if ((extension & EXT_BODY) == EXT_BYTES) part(in, number(in));
-    }
 }
 
 /* ---- the link: batches behind their length, two bytes, the lower first ---- */
