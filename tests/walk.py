@@ -5,7 +5,8 @@
     python   run as a program.
     text     what the block before it printed: every line of it, with … for anything, and any number for a number.
 
-What is said to listen or answer at the usual addresses does so at free ports instead.
+What is said to listen or answer at the usual addresses does so at free ports instead, and loads its kernels when it needs
+them.
 """
 
 import os
@@ -20,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = Path(sys.executable).parent
 ENDPOINT, PAGE, METRICS = "tcp/127.0.0.1:7447", "http://127.0.0.1:8080", "127.0.0.1:9464"
 LANGUAGES = {"bash", "python", "text"}
-# Commands that stay, and what lets them listen at any free port.
-_STAYING = {"serve": ["--listen", "tcp/127.0.0.1:0"], "work": [], "gateway": ["--port", "0"]}
+# Commands that stay, with what lets them listen at any free port and begin at once.
+_STAYING = {"serve": ["--no-warm", "--listen", "tcp/127.0.0.1:0"], "work": ["--no-warm"], "gateway": ["--port", "0"]}
 _PATIENCE_S = 100.0
 _NUMBER = re.compile(r"(?<![A-Za-z])[-+]?\d[\d,]*(?:\.\d*)?(?:e[-+]?\d+)?")
 
@@ -101,8 +102,7 @@ class _Walk:
         if name in self._running and name != "work":
             self._running.pop(name).close()
         own = self._running[name] = self._stack.enter_context(ExitStack())
-        listen = [] if "--listen" in command else _STAYING[name]
-        arguments = ["bash", "-c", f'exec {command} "$@"', "walk", *listen, "--until-eof"]
+        arguments = ["bash", "-c", f'exec {command} "$@"', "walk", *_STAYING[name], "--until-eof"]
         process = own.enter_context(
             subprocess.Popen(
                 arguments, cwd=self._folder, env=self._environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE,

@@ -85,6 +85,7 @@ def vectors() -> dict[str, bytes]:
         "ask_estimate_none": codec.encode_keys_asked(np.array([], np.int64)),
         "ask_chi2": codec.encode_map({"batch": True, "timeout_s": 10.0}),
         "ask_export": codec.encode_map({"format": "g2o"}),
+        "ask_export_kitti": codec.encode_map({"format": "kitti"}),
         "admin_create": codec.encode_map({"map": "kitchen", "mode": "auto"}),
         "event": codec.encode_map({"event": "created", "epoch": 7, "revision": 0}),
         **_about_uncertainty(),

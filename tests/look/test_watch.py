@@ -66,7 +66,7 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
 
 
 @needs_browser
-def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Process]) -> None:
+def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
     ports = ["--web-port", str(free_port()), "--data-port", str(free_port())]
     with connect(endpoint, client="robot") as bus, bus.map("served") as joined:
         for step in manhattan(poses=150, seed=2):
@@ -75,11 +75,16 @@ def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Pro
         (url,) = watcher.ready()
         with page_of(url) as page:
             end = time.monotonic() + 90
-            while share_of(picture_of(page), style.ESTIMATE) < 5e-4 and time.monotonic() < end:
+            while not is_drawn(picture_of(page)) and time.monotonic() < end:
                 page.wait_for_timeout(500)  # the viewer draws into a canvas: there is nothing else to wait on
-            assert share_of(picture_of(page), style.ESTIMATE) >= 5e-4
+            assert is_drawn(picture_of(page)), "the way, and the ellipses around it"
+            page.screenshot(path=tmp_path / "watch.png")  # for whoever wants to look
         watcher.signal(signal.SIGINT)
         assert watcher.wait() == OK
+
+
+def is_drawn(picture: np.ndarray) -> bool:
+    return share_of(picture, style.ESTIMATE) >= 5e-4 and share_of(picture, style.DOUBT) >= 1e-4
 
 
 def test_rays_point_where_the_features_angles_say_and_end_at_the_horizon() -> None:
