@@ -34,7 +34,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with processes(tmp_path_factory.mktemp("service")) as start:
-        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()[0]
+        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0").ready()[0]
 
 
 @pytest.fixture

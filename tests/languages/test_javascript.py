@@ -64,7 +64,7 @@ def spawn(tmp_path: Path) -> Iterator[Callable[..., Process]]:
 
 @pytest.mark.timeout(400)
 def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) -> None:
-    service = spawn("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()[0]
+    service = spawn("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0").ready()[0]
     gateway = spawn("-m", "factorbus.cli", "gateway", "--connect", service, "--port", "0").ready()[0]
     with connect(service, client="robot") as bus, bus.map("warehouse") as joined:
         steps = list(city_trees(poses=30, seed=1))

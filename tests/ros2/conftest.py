@@ -17,7 +17,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with processes(tmp_path_factory.mktemp("service")) as start:
-        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()[0]
+        yield start("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0").ready()[0]
 
 
 @pytest.fixture
