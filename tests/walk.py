@@ -5,8 +5,8 @@
     python   run as a program.
     text     what the block before it printed: every line of it, with … for anything, and any number for a number.
 
-What is said to listen or answer at the usual addresses does so at free ports instead, and loads its kernels when it needs
-them.
+What is said to listen or answer at the usual addresses does so at free ports instead, and loads its kernels when it
+needs them.
 """
 
 import os
