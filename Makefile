@@ -62,7 +62,7 @@ check: lint test ## lint and test: what CI runs
 
 crash: $(READY_DEV) ## a service with a journal is killed 150 times; nothing answered may be lost, nothing be there twice
 	@$(BIN)/factorbus warm
-	FACTORBUS_KILLS=$(or $(KILLS),110) $(BIN)/python -m pytest tests/system/test_journal_crash.py $(ARGS)
+	FACTORBUS_KILLS=$(or $(KILLS),110) $(BIN)/python -m pytest -s tests/system/test_journal_crash.py $(ARGS)
 
 bench: $(READY_DEV) ## the measurements, each with what it is held against
 	@$(BIN)/factorbus bench all $(ARGS)

@@ -34,6 +34,11 @@ class Process:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._popen.pid
+
     def ready(self) -> list[str]:
         """The words after `ready`: it may have to compile first."""
         return self.line("ready", COMPILING_S)

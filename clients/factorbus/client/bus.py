@@ -115,9 +115,13 @@ class Bus:
         """Create map `name`, or find it as it is if its mode is the same.  Raises Refused, Unavailable, BadName."""
         return self._admin("create", {"map": keys.checked_name("map", name), "mode": mode}, _row, timeout_s)
 
-    def drop(self, name: str, timeout_s: float | None = None) -> None:
-        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
-        self._admin("drop", {"map": keys.checked_name("map", name)}, codec.decode_map, timeout_s)
+    def drop(self, name: str, timeout_s: float | None = None, *, revision: int | None = None) -> None:
+        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName.
+
+        revision: only if it is at this one and nothing is under way; else it stays, and Refused says `moved_on`.
+        """
+        asked = {"map": keys.checked_name("map", name)}
+        self._admin("drop", asked | ({} if revision is None else {"revision": revision}), codec.decode_map, timeout_s)
 
     def close(self) -> None:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable."""

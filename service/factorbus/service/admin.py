@@ -17,6 +17,21 @@ class OtherMode(Problem):
         super().__init__(f"map {name!r} is in mode {mode}, not {wanted}; join it as {mode} or drop it", mode=mode)
 
 
+class MovedOn(Problem):
+    """The map is not at the revision that whoever wants to drop it has in mind."""
+
+    code = "moved_on"
+
+    def __init__(self, name: str, revision: int, wanted: int, waiting: int) -> None:
+        more = f" and {waiting} inserts under way" if waiting else ""
+        super().__init__(
+            f"map {name!r} is at revision {revision}{more}, not at {wanted}: it was not dropped; copy it again, or "
+            "have its front ends leave first",
+            revision=revision,
+            waiting=waiting,
+        )
+
+
 class NotHere(Problem):
     """This service does not keep maps of that name."""
 
@@ -37,9 +52,13 @@ def read_create(payload: bytes) -> tuple[str, str]:
     return _map_name(content, "create"), mode
 
 
-def read_drop(payload: bytes) -> str:
-    """The map of an admin/drop.  Raises BadMessage, BadName, TooLarge."""
-    return _map_name(codec.decode_map(payload, REQUEST_LIMITS, what="drop"), "drop")
+def read_drop(payload: bytes) -> tuple[str, int | None]:
+    """(map, revision) of an admin/drop; the revision is None if any will do.  Raises BadMessage, BadName, TooLarge."""
+    content = codec.decode_map(payload, REQUEST_LIMITS, what="drop")
+    revision = content.get("revision")
+    if revision is not None and (type(revision) is not int or revision < 0):
+        raise BadMessage("drop.revision", f"is {revision!r:.40}", "a revision, from 0")
+    return _map_name(content, "drop"), revision
 
 
 def settled_mode(mode: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from factorbus.proto import codec
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
+from factorbus.service.admin import MovedOn
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
 from factorbus.service.events import (
@@ -236,6 +237,12 @@ class MapCore:
         """Take nothing new; Drained comes when everything accepted is answered."""
         self._closing = ShuttingDown()
         return self._go_on([*self._admission.close(), self._event("stopping")], now)
+
+    def check_at(self, revision: int) -> None:
+        """Is the map at `revision`, with nothing under way that would bring it further?  Raises MovedOn."""
+        waiting = self._unjudged + self._admission.ready + self._admission.parked
+        if self.revision != revision or waiting:
+            raise MovedOn(self.name, self.revision, revision, waiting)
 
     def drop(self, now: float, why: Problem | None = None) -> list[Effect]:
         """The map is to go: what waits is refused, what the solver has is still answered."""

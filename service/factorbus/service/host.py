@@ -129,9 +129,14 @@ class Host:
             effects = self.core.stop(time.monotonic())
         self._perform(effects)
 
-    def drop(self) -> None:
-        """The map is to go; Drained is performed when the solver is done with what it has."""
+    def drop(self, revision: int | None = None) -> None:
+        """The map is to go; Drained is performed when the solver is done with what it has.
+
+        revision: only if it is there, and nothing is under way.  Raises MovedOn: then nothing has changed.
+        """
         with self._lock:
+            if revision is not None:
+                self.core.check_at(revision)
             effects = self.core.drop(time.monotonic())
         self._perform(effects)
 

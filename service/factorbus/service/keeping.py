@@ -19,16 +19,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
-from factorbus.journal import chain
-from factorbus.journal.digest import sealed
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
-from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
+from factorbus.journal.records import Fold
 from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import Last, Saved, Store, open_store
-from factorbus.proto import codec
-from factorbus.service.events import Judged, Outcome, Stepped, Waiting
+from factorbus.service.events import Judged, Stepped, Waiting
 from factorbus.service.fold import Folder
-from factorbus.solver.errors import SolverError
+from factorbus.service.writing import written
 
 log = logging.getLogger(__name__)
 
@@ -252,7 +249,7 @@ class Keeper:
         folds, last = [], self._last
         for item in batch:
             if isinstance(item, _Folded):
-                fold = _fold(item, last)
+                fold = written(item.number, item.inserts, item.events, last)
                 folds.append(fold)
                 last = Last(fold.number, fold.revision, fold.chain)
         try:
@@ -392,27 +389,3 @@ class Keeper:
         while not self._items.empty():
             if isinstance(item := self._items.get(), _Noted):
                 self._note(item)
-
-
-def _fold(item: _Folded, last: Last) -> Fold:
-    """What is written down of a Run."""
-    present, revision, rebuilt = last.chain, last.revision, False
-    outcomes: dict[int, tuple[Outcome, Judged]] = {}
-    for event in item.events:
-        if isinstance(event, Judged):
-            outcomes |= {id(outcome.insert): (outcome, event) for outcome in event.outcomes}
-            revision = max(revision, event.revision)
-        else:
-            present, revision = chain.follow(present, event.delta), event.revision
-            rebuilt = rebuilt or event.rebuilt
-    entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in item.inserts)
-    return Fold(item.number, revision, rebuilt, present, entries)
-
-
-def _entry(insert: Waiting, outcome: Outcome, judged: Judged) -> Entry:
-    if isinstance(outcome.answer, bytes):
-        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, b""
-    else:
-        tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
-        answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)
-    return sealed(Entry(insert.client, insert.sequence, 0, *answer, insert.message))

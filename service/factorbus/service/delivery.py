@@ -1,0 +1,143 @@
+"""What maps want done is done: answers, refusals and publications leave in order, and large ones hold up nobody else.
+
+A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
+not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
+lanes a second, then Zenoh closes that client's transport.
+"""
+
+import logging
+import secrets
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from factorbus.proto import codec
+from factorbus.proto.problems import Internal, Problem
+from factorbus.service.bus import Place, refuse, reply
+from factorbus.service.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
+from factorbus.service.lane import Lane, Lanes
+from factorbus.service.questions import Question, Snapshot, answer
+from factorbus.solver.errors import SolverError
+
+log = logging.getLogger(__name__)
+
+_AT_ONCE_BYTES = 64 << 10
+_MESSAGES = (Answer, Publish)
+_ANSWERERS = 4
+
+
+class Delivery:
+    """The outbox, the answering lanes, and what goes on which.
+
+    about: what this service adds to the stats of a map.  batch: finds batch optima; (asker, question, snapshot).
+    """
+
+    def __init__(self, about: Callable[[], dict[str, Any]], batch: Callable[[Asker, Question, Snapshot], None]) -> None:
+        self.outbox, self._answers = Lane("outbox"), Lanes("answers", _ANSWERERS)
+        self._about, self._batch = about, batch
+
+    def of_map(self, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
+        """For a map at `place`; `tell` adds to its stats, `drained` hears that nothing waits any more."""
+        return MapDelivery(self, place, tell, drained)
+
+    def answer(self, asker: Asker, message: bytes) -> None:
+        """Answer, however large, however slow."""
+        self._answers.hand(reply, asker, message)
+
+    def refuse(self, asker: Asker, problem: Any) -> None:
+        """The same with a problem."""
+        self._answers.hand(refuse, asker, problem)
+
+    def settle(self) -> None:
+        """Return when all answers that were handed in are sent."""
+        self._answers.settle()
+
+    def close(self) -> None:
+        """Return when everything is sent."""
+        self._answers.close()
+        self.outbox.close()
+
+    # ---- on the answering lanes: who does not take an answer holds up one of them for a second ----------------------
+
+    def tell(self, asker: Asker, content: dict[str, Any]) -> None:
+        """Answer with `content` and what the service adds."""
+        self._answers.hand(lambda: reply(asker, codec.encode_map({**content, **self._about()})))
+
+    def read(self, place: Place, read: Read, taken: Snapshot) -> None:
+        """Answer `read` from `taken`."""
+        self._answers.hand(self._read, place, read, taken)
+
+    def _read(self, place: Place, read: Read, taken: Snapshot) -> None:
+        try:
+            if read.question.name == "keyframe":
+                # Behind the delta of the same revision: a mirror that had the keyframe first would skip the delta.
+                self.outbox.hand(place.publish, "keyframe", answer(read.question, taken))
+            elif read.question.batch:
+                self._batch(read.asker, read.question, taken)
+            else:
+                reply(read.asker, answer(read.question, taken))
+        except (Problem, SolverError) as problem:
+            refuse(read.asker, problem)
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: answering %s", reference, read.question.name)
+            if read.asker is not None:
+                refuse(read.asker, Internal(reference))
+
+
+class MapDelivery:
+    """The same for one map: what its host calls.  Returns at once, except `send` where nothing goes before."""
+
+    def __init__(
+        self, all_: Delivery, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]
+    ) -> None:
+        self._all, self._place, self._tell, self._drained = all_, place, tell, drained
+
+    def perform(self, effects: list[Effect]) -> None:
+        """Hand on what a map wants done: what is to be sent in one piece to the outbox, in order."""
+        sending: list[Effect] = []
+        for effect in effects:
+            if isinstance(effect, Tell):
+                self._all.tell(effect.asker, {**effect.content, **self._tell()})
+            elif isinstance(effect, Drained):
+                self._drained()
+            else:
+                sending.append(effect)
+        if sending:
+            self._all.outbox.hand(_send, self._place, sending)
+
+    def send(self, effects: list[Effect]) -> None:
+        """On this thread, unless something else has to go before, or it is more than surely fits into Zenoh's queue.
+
+        That might wait in vain to be emptied: this thread may be the one that does it.
+        """
+        size = 0
+        for effect in effects:
+            if isinstance(effect, _MESSAGES):
+                size += len(effect.message)
+        hand = self._all.outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._all.outbox.hand
+        hand(_send, self._place, effects)
+
+    def send_both(self, asker: Asker, message: bytes, delta: bytes) -> None:
+        """What was written in one piece is small enough to be sent at once."""
+        self._all.outbox.hand_or_do(_send_both, self._place, asker, message, delta)
+
+    def answer_reads(self, reads: Sequence[Read], taken: Snapshot) -> None:
+        """Answer `reads` from `taken`, elsewhere."""
+        for read in reads:
+            self._all.read(self._place, read, taken)
+
+
+def _send(place: Place, effects: list[Effect]) -> None:
+    """On the outbox, or on the thread that made the step."""
+    for effect in effects:
+        if isinstance(effect, Answer):
+            reply(effect.asker, effect.message)
+        elif isinstance(effect, Publish):
+            place.publish(effect.channel, effect.message)
+        elif isinstance(effect, Refuse):
+            refuse(effect.asker, effect.problem)
+
+
+def _send_both(place: Place, asker: Asker, message: bytes, delta: bytes) -> None:
+    reply(asker, message)
+    place.publish("delta", delta)

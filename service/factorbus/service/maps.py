@@ -1,0 +1,211 @@
+"""The maps of a service: found on disk, made, dropped, each with its host and its place on the bus.
+
+Made and dropped on the desk only, or before it has work; looked up from any thread.
+"""
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from factorbus.journal.problems import JournalFailed
+from factorbus.proto import codec, keys
+from factorbus.proto.problems import Problem, ShuttingDown, TooLarge, UnknownMap
+from factorbus.service.admin import NotHere, OtherMode, ours, settled_mode
+from factorbus.service.bus import Bus, Place
+from factorbus.service.config import Config
+from factorbus.service.core import MapCore
+from factorbus.service.delivery import Delivery
+from factorbus.service.events import Asker
+from factorbus.service.fold import Folder
+from factorbus.service.host import Host
+from factorbus.service.lane import Lane
+from factorbus.service.library import Kept, Library, make_folder
+from factorbus.service.memory import Memory, give_back
+
+log = logging.getLogger(__name__)
+
+
+class Owned:
+    """A map, its place on the bus, and the end of it."""
+
+    def __init__(self, host: Host, place: Place) -> None:
+        self.host, self.place = host, place
+        self.drained = threading.Event()
+        self.on_drained: Callable[[], None] = self.drained.set
+
+
+class Maps:
+    """All maps of one service.  named: of the service, in tokens."""
+
+    def __init__(
+        self, bus: Bus, config: Config, named: str, library: Library | None, delivery: Delivery, desk: Lane,
+        memory: Memory,
+    ) -> None:  # fmt: skip
+        self._bus, self._config, self._service, self._library = bus, config, named, library
+        self._delivery, self._desk, self._memory = delivery, desk, memory
+        self._maps: dict[str, Owned] = {}
+        self._leaving: list[Owned] = []
+        self._unopened: dict[str, Problem] = {}  # that are on disk and cannot be trusted
+        self._stopping = False
+        self._seat = threading.Lock()  # of the one callback that may solve
+
+    def get(self, name: str) -> Owned | None:
+        """Map `name`, if it is here."""
+        return self._maps.get(name)
+
+    def hosts(self) -> dict[str, Host]:
+        """All there are, by name."""
+        return {name: found.host for name, found in list(self._maps.items())}
+
+    def missing(self, name: str) -> Problem | None:
+        """What to say of a map that is not here; None: at a router, somebody else may have it."""
+        if problem := self._unopened.get(name):
+            return problem
+        return None if self._config.connect else UnknownMap(name)
+
+    def open_kept(self) -> None:
+        """The maps that were here before.  One that cannot be trusted does not keep the others from coming back."""
+        for name in self._library.names() if self._library else []:
+            if ours(self._config.maps, name):
+                try:
+                    self._maps[name] = self._make(name, None)
+                except Problem as problem:
+                    log.error("map %s does not come back: %s", name, problem)
+                    self._unopened[name] = problem
+
+    def announce(self) -> None:
+        """Last of all: alive means askable."""
+        for found in self._maps.values():
+            found.place.announce()
+            found.host.created()
+
+    def create(self, name: str, mode: str | None) -> dict[str, Any]:
+        """The row of map `name`, made if it is not there.  mode: None for whichever it has.  Raises Problem."""
+        if found := self._maps.get(name):
+            if mode is not None and found.host.core.mode != settled_mode(mode):
+                raise OtherMode(name, found.host.core.mode, settled_mode(mode))
+            return found.host.core.row()
+        if not ours(self._config.maps, keys.checked_name("map", name)):
+            raise NotHere(name, self._config.maps)
+        if self._stopping:
+            raise ShuttingDown
+        if len(self._maps) >= self._config.limits.maps:
+            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
+        if (full := self._memory.no_room(0)) is not None:
+            raise full
+        made = self._make(name, settled_mode(mode or "auto"))
+        self._maps[name] = made
+        made.place.announce()
+        made.host.created()
+        core = made.host.core
+        log.info(
+            "map %s, mode %s, epoch %d, revision %d", name, core.mode, core.epoch, core.revision, extra={"map": name}
+        )
+        return core.row()
+
+    def drop(self, asker: Asker, name: str, revision: int | None) -> None:
+        """Drop map `name`, if it is at `revision`, and answer when it is gone.  Raises MovedOn; what is `missing`."""
+        found = self._maps.get(name)
+        if found is None:
+            raise self.missing(name) or NotHere(name, self._config.maps)
+
+        def on_drained() -> None:
+            self._desk.hand(self._dropped, asker, found)
+            found.drained.set()
+
+        before, found.on_drained = found.on_drained, on_drained
+        try:
+            found.host.drop(revision)
+        except Problem:
+            found.on_drained = before
+            raise
+        del self._maps[name]
+        self._leaving.append(found)
+        found.place.withdraw()
+
+    def show(self, changed: set[str], stuck: set[str]) -> None:
+        """Alive means askable: while its solver is stuck, a map has no token."""
+        for found in [self._maps[name] for name in changed if name in self._maps]:
+            name = found.host.core.name
+            if name in stuck:
+                log.error("map %s: its solver has been silent for %.0f s", name, found.host.silent_s())
+                found.place.withdraw()
+            else:
+                log.warning("map %s: its solver goes on", name)
+                found.place.announce()
+
+    def finish(self) -> None:
+        """Withdraw all, and return when everything accepted is answered and kept."""
+        for found in self._no_more():
+            found.place.withdraw()
+            found.host.stop()
+        for found in [*self._leaving, *self._maps.values()]:
+            found.drained.wait()
+            found.host.end()
+
+    def close(self) -> None:
+        """Undeclare what they have on the bus."""
+        for found in self._maps.values():
+            found.place.close()
+
+    def _make(self, name: str, mode: str | None) -> Owned:
+        """mode: None for that of the map which is there.  Raises Problem."""
+        core, folder, kept = self._begin(name, mode)
+        place, options = self._bus.place(name, self._service), folder.options()
+
+        def more() -> dict[str, Any]:
+            return {"options": options, **made.host.journal()}
+
+        by = self._delivery.of_map(place, more, lambda: made.on_drained())
+        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept)
+        made = Owned(host, place)
+        return made
+
+    def _begin(self, name: str, mode: str | None) -> tuple[MapCore, Folder, Kept | None]:
+        """What a map is made of, as it was or new.  Raises Problem."""
+        limits, library, now = self._config.limits, self._library, time.monotonic()
+        if problem := self._unopened.get(name):
+            raise problem
+        if library is not None and library.has(name):
+            if mode is not None and (had := library.mode(name)) != mode:
+                raise OtherMode(name, had, mode)
+            kept = library.open(name, limits)
+        elif library is not None:
+            kept = library.make(name, mode or settled_mode("auto"), limits)
+        else:
+            epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
+            return MapCore(name, mode, epoch, limits, now), make_folder(mode, {}, epoch, limits), None
+        core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now)
+        kept.restore(core)
+        return core, kept.folder, kept
+
+    def _dropped(self, asker: Asker, found: Owned) -> None:
+        name = found.host.core.name
+        self._leaving.remove(found)
+        found.host.end(keep=False)
+        self._delivery.outbox.hand(found.place.close)  # behind the map's last publications
+        self._desk.hand(give_back)
+        if self._library is not None:
+            try:
+                self._library.remove(name)
+            except JournalFailed as problem:
+                log.error("the journal of map %s stays: %s", name, problem)
+                self._delivery.refuse(asker, problem)
+                return
+        self._desk.hand(self._delivery.answer, asker, codec.encode_map({}))
+        log.info("map %s dropped", name, extra={"map": name})
+
+    def _no_more(self) -> list[Owned]:
+        """The maps there are once the desk is done with what it had: no map is created after this."""
+        reached = threading.Event()
+
+        def stop() -> None:
+            self._stopping = True
+            reached.set()
+
+        self._desk.hand(stop)
+        reached.wait()
+        return list(self._maps.values())

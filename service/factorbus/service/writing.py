@@ -1,0 +1,35 @@
+"""What is written down of a Run: its inserts in their order, what became of each, and a digest of what changed."""
+
+from collections.abc import Sequence
+
+from factorbus.journal import chain
+from factorbus.journal.digest import sealed
+from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
+from factorbus.journal.store import Last
+from factorbus.proto import codec
+from factorbus.service.events import Judged, Outcome, Stepped, Waiting
+from factorbus.solver.errors import SolverError
+
+
+def written(number: int, inserts: Sequence[Waiting], events: Sequence[Judged | Stepped], last: Last) -> Fold:
+    """What is written down of a Run."""
+    present, revision, rebuilt = last.chain, last.revision, False
+    outcomes: dict[int, tuple[Outcome, Judged]] = {}
+    for event in events:
+        if isinstance(event, Judged):
+            outcomes |= {id(outcome.insert): (outcome, event) for outcome in event.outcomes}
+            revision = max(revision, event.revision)
+        else:
+            present, revision = chain.follow(present, event.delta), event.revision
+            rebuilt = rebuilt or event.rebuilt
+    entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
+    return Fold(number, revision, rebuilt, present, entries)
+
+
+def _entry(insert: Waiting, outcome: Outcome, judged: Judged) -> Entry:
+    if isinstance(outcome.answer, bytes):
+        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, b""
+    else:
+        tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
+        answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)
+    return sealed(Entry(insert.client, insert.sequence, 0, *answer, insert.message))
