@@ -1,9 +1,11 @@
 """What is in deploy/ fits what the code has: settings, files, units, names of metrics."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from factorbus.service.histogram import Histogram
 from factorbus.service.metrics import families
 
 DEPLOY = Path(__file__).parent.parent / "deploy"
+BIN = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 NAME = re.compile(r"factorbus_[a-z0-9_]+")
 _NUMBERS = ["variables", "factors", "revision", "chi2", "clients", "waiting", "parked", "in_solver"]
 
@@ -70,3 +73,43 @@ def test_systemd_takes_the_units(tmp_path: Path) -> None:
     units = [str(each) for each in tmp_path.glob("*.service")]
     ran = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stderr) == (0, ""), ran.stderr
+
+
+@pytest.mark.skipif(shutil.which("hadolint", path=BIN) is None, reason="hadolint is not installed")
+def test_hadolint_takes_the_image() -> None:
+    # DL3008, versions of Debian packages: those of a release move with its security updates, and old ones are gone.
+    words = ["hadolint", "--no-color", "--ignore", "DL3008", str(DEPLOY / "docker" / "Dockerfile")]
+    ran = subprocess.run(words, capture_output=True, text=True, timeout=60, env={**os.environ, "PATH": BIN})
+    assert (ran.returncode, ran.stdout) == (0, "")
+
+
+@pytest.mark.skipif(shutil.which("kubernetes-validate", path=BIN) is None, reason="kubernetes-validate is missing")
+@pytest.mark.parametrize("file", sorted((DEPLOY / "kubernetes").glob("*.yaml")), ids=lambda path: path.name)
+def test_kubernetes_takes_the_manifests(file: Path) -> None:
+    words = ["kubernetes-validate", "--strict", str(file)]
+    ran = subprocess.run(words, capture_output=True, text=True, timeout=60, env={**os.environ, "PATH": BIN})
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_what_the_manifests_configure_is_a_configuration(tmp_path: Path) -> None:
+    (made,) = re.findall(r"printf '(.*?)'", (DEPLOY / "kubernetes" / "solver.yaml").read_text())
+    settings = tmp_path / "serve.toml"
+    settings.write_text(made.replace("\\n", "\n") % ("2", "factorbus-solver-2"))
+    config = load(settings, connect=("tls/router:7447",))
+    assert (config.maps, config.journal) == ("shard2-*", "/var/lib/factorbus")
+
+
+def test_compose_is_of_one_piece() -> None:
+    yaml = pytest.importorskip("yaml")
+    compose = yaml.safe_load((DEPLOY / "docker" / "compose.yaml").read_text())
+    for name, service in compose["services"].items():
+        assert {"image", "build"} & set(service), name
+        assert set(service.get("depends_on", ())) <= set(compose["services"])
+        for volume in service.get("volumes", ()):
+            source = volume.split(":")[0]
+            if source.startswith("."):  # certificates are made by whoever runs it
+                assert source == "./certificates" or (DEPLOY / "docker" / source).exists(), source
+            else:
+                assert source in compose["volumes"]
+    targets = [volume.split(":")[1] for volume in compose["services"]["solver"]["volumes"]]
+    assert load(DEPLOY / "docker" / "serve.toml").journal in targets

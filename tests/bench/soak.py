@@ -9,8 +9,8 @@ place.  What was sent and what was answered each client writes into memory that 
 memory of the service is that of a service, not that of a growing map.
 
 Lost: answered, and not in the map.  Duplicated: more factors than the poses there would have, or more inserts in the
-journal than poses.  Memory: resident, when a map has been dropped, fitted over the second half of the maps: what the allocator keeps takes
-a while to settle, and the fit from the third map on is given beside.
+journal than poses.  Memory: resident, when a map has been dropped, fitted over the second half of the maps: what the
+allocator keeps takes a while to settle; the fit from the third map on is given beside.
 Goal: nothing lost, nothing duplicated, and the memory grows by less than 32 bytes an insert.
 """
 

@@ -34,7 +34,7 @@ def main() -> None:
         pid = os.fork()
         if pid == 0:
             os.close(0)
-            run(checked(Config(listen=(endpoint,), warm=False, create=("m",), **given)))
+            run(checked(Config(**{"listen": (endpoint,), "warm": False, "create": ("m",), **given})))
         print("born", pid, flush=True)
 
 

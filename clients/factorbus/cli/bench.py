@@ -11,8 +11,8 @@ from factorbus.cli.exits import FAILED, OK, Stopped
 from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
-BENCHES = ("cholesky", "bus", "idp", "ros2")  # what `all` runs, a minute or two
-LONG = ("paper", "peers", "fuzz")  # hours (fuzz: half an hour); on request
+BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
+LONG = ("paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
 ASKED = ("ask",)  # a minute or two, most of it GTSAM's; on request
 
 
@@ -36,7 +36,10 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
     fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
-    all        cholesky, bus, idp and ros2
+    journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
+    soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
+               --inserts, --minutes
+    all        cholesky, bus, idp, ros2 and journal
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
     the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.

@@ -22,8 +22,9 @@ from factorbus.proto.keys import checked_name
 def command(name: str, folder: Path, out: Path | None) -> None:
     """Copy MAP out of a service's journal into one file: every insert, clients' places, the newest snapshot.
 
-    Also while the service is at work: the file has the map as it was at one moment. To move a map, stop the service
-    first, or what comes in meanwhile stays behind. `factorbus import` reads the file.
+    Also while the service is at work: the file has the map as it was at one moment; its revision is printed. To move a
+    map, `factorbus import` the file where it is to be, and drop the old one at that revision: if somebody inserted
+    meanwhile it stays, and you begin again (deploy/README.md).
 
     \b
     factorbus export warehouse --journal /var/lib/factorbus
@@ -32,5 +33,5 @@ def command(name: str, folder: Path, out: Path | None) -> None:
     from factorbus.journal.bundle import export_map
 
     file = out or Path(f"{checked_name('map', name)}.fbmap")
-    export_map(folder / checked_name("map", name), file)
-    click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+    revision = export_map(folder / checked_name("map", name), file)
+    click.echo(f"{file}: revision {revision}, {file.stat().st_size / 1e6:.1f} MB")

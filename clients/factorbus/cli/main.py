@@ -29,6 +29,7 @@ COMMANDS = {
     "journal": ("journal", "What a service keeps on disk: show it, check it, run it again."),
     "export": ("export", "Copy a map out of a service's journal into one file."),
     "import": ("take_in", "Put an exported map into a service's journal."),
+    "drop": ("drop", "Take a map off its service, if it is at the revision that was copied."),
     "warm": ("warm", "Compile the kernels ahead."),
     "access": ("access", "Write who may do what as a Zenoh configuration: TLS, users, access control."),
     "stats": ("stats", "What services count and time, asked over the bus."),

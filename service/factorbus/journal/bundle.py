@@ -17,8 +17,8 @@ _PIECE = 32 << 20
 _TABLE = "CREATE TABLE piece (fold INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
 
 
-def export_map(folder: Path, file: Path) -> None:
-    """The map in `folder`, as it is now, into `file`, all of it or nothing.
+def export_map(folder: Path, file: Path) -> int:
+    """The map in `folder`, as it is now, into `file`, all of it or nothing; gives the revision that it is at there.
 
     Raises NoJournal, JournalDamaged, JournalVersion, JournalFailed.
     """
@@ -33,11 +33,13 @@ def export_map(folder: Path, file: Path) -> None:
     try:
         with _opened(beside) as database:
             database.execute(_TABLE)
+            (revision,) = database.execute("SELECT COALESCE(MAX(revision), 0) FROM fold").fetchone()
             for each in saved:
                 if _put(database, each.fold, file_of(folder, each.fold)):
                     break
         beside.rename(file)
         sync_folder(file.absolute().parent)
+        return revision
     except (sqlite3.Error, OSError) as error:
         beside.unlink(missing_ok=True)
         raise JournalFailed(file, str(error)) from None

@@ -1,0 +1,34 @@
+"""`factorbus drop`: take a map off its service, for good."""
+
+import click
+
+from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
+
+
+@click.command()
+@click.argument("name", metavar="MAP")
+@click.option(
+    "--revision",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Only if the map is at this revision and nothing is under way: what `factorbus export` said.",
+)
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@zenoh_option
+@click.option(
+    "--wait", "wait_s", type=click.FloatRange(0), default=30, show_default=True, metavar="S", help="For the answer."
+)
+def command(name: str, revision: int | None, endpoint: str, zenoh: str, wait_s: float) -> None:
+    """Drop MAP, with its journal. With --revision it stays when somebody inserted meanwhile: `moved_on`, exit code 5.
+
+    The last step of moving a map: what was copied is all there is. Where access control is on, ask as an operator.
+
+    \b
+    factorbus drop old-survey
+    factorbus drop shard0-hall --revision 4711 --connect tls/router.local:7447 --zenoh ops.json5
+    """
+    from factorbus.client import connect
+
+    with connect(endpoint, client="drop", zenoh=zenoh, timeout_s=wait_s) as bus:
+        bus.drop(name, revision=revision)
+    click.echo(f"{name} is gone")
