@@ -22,7 +22,7 @@ from factorbus.cli.options import DEFAULT_ENDPOINT, ellipses_option, out_option,
 @click.option(
     "--rate", type=click.FloatRange(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second."
 )
-@ellipses_option(60)
+@ellipses_option(30)
 @click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 def command(

@@ -7,6 +7,7 @@ Everything is drawn in space; a map in the plane lies at z = 0 and is looked at 
 import os
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -22,7 +23,7 @@ from factorbus.viz.lookout import Look
 
 _LETTER_BITS = 56
 _POSITIONS_PER_S = 100_000  # what the whole map may add to a recording
-_LINE = rr.Radius.ui_points(1.2)
+_LINE, _THIN = rr.Radius.ui_points(1.2), rr.Radius.ui_points(0.6)
 _PLOTS = {
     "chi2": ("χ²", style.ESTIMATE),
     "step_ms": ("time of a step (ms)", style.LOOPS),
@@ -119,12 +120,12 @@ class LiveView:
         if look.spread is not None:
             everything = track.places if len(track.keys) else points.places
             rings = outlines(look.spread, view_of(everything)) if len(look.spread.keys) else np.empty((0, 2, 3))
-            self._log_lines("map/where_it_may_be", rings, _rgb(style.DOUBT))
+            self._log_lines("map/where_it_may_be", rings, _rgb(style.DOUBT), _THIN)
 
-    def _log_lines(self, path: str, lines: F64, colours: object) -> None:
+    def _log_lines(self, path: str, lines: F64, colours: object, width: Any = _LINE) -> None:
         """Line strips (n, corners, 2 or 3)."""
         strips = [_in_space(line) for line in lines]
-        self._to.log(path, rr.LineStrips3D(strips, colors=colours, radii=_LINE))  # type: ignore[arg-type]
+        self._to.log(path, rr.LineStrips3D(strips, colors=colours, radii=width))  # type: ignore[arg-type]
 
     def _name_plots(self) -> None:
         for name, (title, colour) in _PLOTS.items():
