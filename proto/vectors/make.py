@@ -66,8 +66,12 @@ def vectors() -> dict[str, bytes]:
         "insert_without_values": codec.encode_insert(Insert(2, Batch((_poses(first=2),), (_odometry(1),)), epoch=7)),
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
+        "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
+        "insert_marginalise": codec.encode_insert(
+            Insert(9, Batch(), epoch=7, changes=(Change("marginalise", keys=np.array([symbol("x", 1)])),))
+        ),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
         "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
@@ -194,6 +198,31 @@ def _every_kind() -> Batch:
         Factors("bearing_range_se2", np.array([[x, l]]), np.array([[0.25, 2.5]]), unit2),
     )
     return Batch(variables, factors)
+
+
+def _other_kinds() -> Batch:
+    """Positions, headings, attitudes, ranges, bearings, linear factors."""
+    x, y, l, p = (symbol(letter, 1) for letter in "xylp")
+    unit1, unit2, unit3, unit6 = (np.array([np.eye(r)[np.triu_indices(r)]]) for r in (1, 2, 3, 6))
+    here, turned = [1.0, 2.0, 0.5], [1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8]
+    H2, H3 = np.diag([1.0, 2.0, 0.5]).ravel().tolist(), np.diag([1.0, 2.0, 0.5, 4.0, 0.25, 8.0]).ravel().tolist()
+    b2, b3 = [0.125, 0.25, -0.5], [0.125, 0.25, -0.5, 0.0, 1.0, 0.75]
+    return Batch(
+        factors=(
+            Factors("position_se2", np.array([[x]]), np.array([[4.0, 5.0, 0.5, 0.25]]), unit2),
+            Factors("position_se3", np.array([[y]]), np.array([[4.0, 5.0, 6.0, 0.5, 0.25, 0.125]]), unit3),
+            Factors("heading_se2", np.array([[x]]), np.array([[0.75]]), unit1),
+            Factors("attitude_se3", np.array([[y]]), np.array([[0.5, 0.0, -9.75, 0.0, 0.0, -1.0]]), unit3),
+            Factors("range_se2", np.array([[x, l]]), np.array([[2.5]]), unit1),
+            Factors("range_se3", np.array([[y, p]]), np.array([[3.5]]), unit1),
+            Factors("bearing_se2", np.array([[x, l]]), np.array([[-0.25]]), unit1),
+            Factors("bearing_se3", np.array([[y, p]]), np.array([[0.0, 3.0, 4.0]]), unit3),
+            Factors("linear_se2", np.array([[x]]), np.array([[*here, *H2, *b2]]), unit3),
+            Factors("linear_se3", np.array([[y]]), np.array([[*turned, *H3, *b3]]), unit6),
+            Factors("linear_pair_se2", np.array([[x, x + 1]]), np.array([[*here, *here, *H2, *H2, *b2]]), unit3),
+            Factors("linear_pair_se3", np.array([[y, y + 1]]), np.array([[*turned, *turned, *H3, *H3, *b3]]), unit6),
+        )
+    )
 
 
 def _sights() -> Batch:

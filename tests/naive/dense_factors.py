@@ -51,6 +51,10 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """r of a kind of factor at the values of its variables."""
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _sight(kind, *ends, z)
+    if kind.startswith("linear"):
+        return _linear(ends, z)
+    if kind.startswith(("position", "heading", "attitude")):
+        return _absolute(kind, ends[0], z)
     if kind.startswith("prior_point"):
         return ends[0] - z
     if kind.startswith("prior"):
@@ -59,10 +63,41 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
         relative = np.linalg.inv(pose_matrix(ends[0])) @ pose_matrix(ends[1])
         return _pose_error(np.linalg.inv(pose_matrix(z)) @ relative)
     seen = (np.linalg.inv(pose_matrix(ends[0])) @ np.append(ends[1], 1.0))[:-1]
+    if kind.startswith("range"):
+        return np.array([np.linalg.norm(seen)]) - z
+    if kind == "bearing_se2":
+        return np.array([np.angle(np.exp(1j * (np.arctan2(seen[1], seen[0]) - z[0])))])
+    if kind == "bearing_se3":
+        return seen / np.linalg.norm(seen) - z / np.linalg.norm(z)
     if kind == "bearing_range_se2":
         turn = np.angle(np.exp(1j * (np.arctan2(seen[1], seen[0]) - z[0])))
         return np.array([turn, np.hypot(*seen) - z[1]])
     return seen - z
+
+
+def _absolute(kind: str, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Of a pose in the map: where its antenna is, where it looks, how it sees a direction."""
+    T = pose_matrix(x)
+    n = len(T) - 1
+    if kind.startswith("position"):
+        return (T @ np.append(z[n:], 1.0))[:n] - z[:n]
+    if kind == "heading_se2":
+        return np.array([np.angle(np.exp(1j * (x[2] - z[0])))])
+    seen, there = z[:3] / np.linalg.norm(z[:3]), z[3:] / np.linalg.norm(z[3:])
+    return T[:3, :3].T @ there - seen
+
+
+def _linear(ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
+    """Σ H (x ⊟ y) + b."""
+    size, d, count = len(ends[0]), 3 if len(ends[0]) == 3 else 6, len(ends)
+    r = z[-d:].copy()
+    for e, x in enumerate(ends):
+        H = z[count * size + e * d * d :][: d * d].reshape(d, d)
+        error = _pose_error(np.linalg.inv(pose_matrix(z[e * size : (e + 1) * size])) @ pose_matrix(x))
+        if d == 6:
+            error[3:] *= 2.0
+        r += H @ error
+    return r
 
 
 def camera_of(lens: np.ndarray) -> Camera:

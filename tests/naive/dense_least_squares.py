@@ -16,6 +16,18 @@ CONNECTS = {
     "idp_first": ["se3", "idp"],
     "idp_seen": ["se3", "idp"],
     "point_seen": ["se3", "point3"],
+    "position_se2": ["se2"],
+    "position_se3": ["se3"],
+    "heading_se2": ["se2"],
+    "attitude_se3": ["se3"],
+    "range_se2": ["se2", "point2"],
+    "range_se3": ["se3", "point3"],
+    "bearing_se2": ["se2", "point2"],
+    "bearing_se3": ["se3", "point3"],
+    "linear_se2": ["se2"],
+    "linear_se3": ["se3"],
+    "linear_pair_se2": ["se2", "se2"],
+    "linear_pair_se3": ["se3", "se3"],
 }
 
 

@@ -1,10 +1,12 @@
 """False loop closures are found and taken out: a map that they have bent gets straight again."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from factorbus.formats import read
 from factorbus.proto.messages import Batch, Change, Factors
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
@@ -119,3 +121,41 @@ def test_weights_fall_from_one_to_nothing_and_get_sharper() -> None:
         assert (np.diff(weights) <= 0).all()
         assert ((weights > 0) & (weights <= 1)).all()
     np.testing.assert_array_equal(weigh(s, bound, 1e9) > 0.5, s < bound)
+
+
+def with_false_closures(path: Path, share: float, seed: int) -> tuple[Solver, set[int]]:
+    """A replay of a data set with closures that nobody has seen among its own; and their ids."""
+    rng, solver, false = np.random.default_rng(seed), Solver(Options()), set()
+    poses: list[int] = []
+    for batch in read(path).steps():
+        poses += [int(key) for group in batch.variables for key in group.keys]
+        groups = list(batch.factors)
+        loops = sum(int((np.abs(group.keys[:, 1] - group.keys[:, 0]) != 1).sum()) for group in groups)
+        wrong = int(rng.binomial(loops, share / (1 - share))) if loops and len(poses) > 50 else 0
+        if wrong:
+            ends = np.column_stack([rng.choice(poses[:-20], wrong), np.full(wrong, poses[-1])])
+            z = np.column_stack([rng.normal(0, 1, (wrong, 2)), rng.uniform(-np.pi, np.pi, wrong)])
+            groups.append(Factors("between_se2", ends, z, np.repeat(groups[-1].information[:1], wrong, 0)))
+        first = solver.stage(Batch(batch.variables, tuple(groups)))
+        solver.step()
+        count = sum(len(group.keys) for group in groups)
+        false |= set(range(first + count - wrong, first + count))
+    solver.step(settle=True)
+    return solver, false
+
+
+def test_intel_with_three_of_ten_closures_false_is_intel_again(datasets: Path) -> None:
+    """There is no ground truth: the error is the distance from the optimum without false closures."""
+    clean, _ = with_false_closures(datasets / "intel.g2o", 0.0, 1)
+    solver, false = with_false_closures(datasets / "intel.g2o", 0.3, 1)
+    best = {k: row for g in clean.estimate() for k, row in zip(g.keys.tolist(), g.values, strict=True)}
+    off = error_of(solver, best)
+    found = repair(solver.content())
+    placed = [Change("place", keys=g.keys, kind=g.kind, values=g.values) for g in found.groups]
+    repaired, *_ = solver.with_changes([Change("remove_factors", found.false), *placed], settle=True)
+    taken = set(found.false.tolist())
+    print(f"{len(false)} false of {found.suspects}, {len(false - taken)} missed, {len(taken - false)} right ones taken")
+    print(f"{off:.3g} m off, repaired {error_of(repaired, best):.3g} m off")
+    assert len(false) > 200
+    assert off > 1.0
+    assert error_of(repaired, best) < 0.1

@@ -65,6 +65,14 @@ class Changes:
         """These variables are estimated again."""
         return self._add(Change("free", keys=_keys(keys)))
 
+    def marginalise(self, *keys: Key) -> "Changes":
+        """These variables go; what their factors say of the others is kept, as linear factors.
+
+        Refused (too_connected) where what hangs together shares factors with more than two poses that stay.  Before any
+        loss, weigh or place of the same insert.
+        """
+        return self._add(Change("marginalise", keys=_keys(keys)))
+
     def place(self, groups: Iterable[Variables]) -> "Changes":
         """Variables go to the values in `groups`, as in an estimate; the map goes on from there."""
         for group in groups:

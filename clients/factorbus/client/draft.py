@@ -137,6 +137,68 @@ class Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
 
+    def position_se2(
+        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
+    ) -> "Draft":
+        """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
+        return self.factor(
+            "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
+        )
+
+    def position_se3(
+        self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0, 0.0), **certainty: Unpack[Certainty]
+    ) -> "Draft":
+        """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
+        return self.factor(
+            "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
+        )
+
+    def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a pose in the plane looks, in the map: theta (radians)."""
+        return self.factor("heading_se2", (key,), [theta], **certainty)
+
+    def attitude_se3(
+        self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
+    ) -> "Draft":
+        """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
+        both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
+        return self.factor("attitude_se3", (key,), both, **certainty)
+
+    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+        """How far a point2 is from the pose (metres)."""
+        return self.factor("range_se2", (pose, point), [distance], **certainty)
+
+    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+        """How far a point3 is from the pose (metres)."""
+        return self.factor("range_se3", (pose, point), [distance], **certainty)
+
+    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
+        return self.factor("bearing_se2", (pose, point), [bearing], **certainty)
+
+    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+        """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
+        return self.factor("bearing_se3", (pose, point), _row("direction", direction, 3), **certainty)
+
+    def linear(
+        self,
+        keys: Sequence[Key],
+        values: Sequence[ArrayLike],
+        jacobians: Sequence[ArrayLike],
+        residual: ArrayLike,
+        **certainty: Unpack[Certainty],
+    ) -> "Draft":
+        """What you have linearised yourself, of one pose or two of a kind: r = sum H (x - y) + b.
+
+        x - y is the local increment; values: y of each, as poses are stored; jacobians: H of each, (3, 3) or (6, 6);
+        residual: b, (3,) or (6,).  Rows that you do not need: zeros in H and b, and any certainty.
+        """
+        rows = [np.asarray(value, np.float64).ravel() for value in values]
+        space = "se2" if rows and rows[0].size == VARIABLE_KINDS["se2"].size else "se3"
+        numbers = [*rows, *(np.asarray(H, np.float64).ravel() for H in jacobians), np.asarray(residual, np.float64)]
+        kind = f"linear_{space}" if len(keys) == 1 else f"linear_pair_{space}"
+        return self.factor(kind, keys, np.concatenate(numbers), **certainty)
+
     def idp_first(
         self,
         pose: Key,

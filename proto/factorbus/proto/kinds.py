@@ -67,6 +67,20 @@ FACTOR_KINDS = {
         FactorKind("idp_first", ("se3", "idp"), 14, 6, f"{_PIXEL}, rho (1/metre), {_LENS}"),
         FactorKind("idp_seen", ("se3", "idp"), 13, 2, f"{_PIXEL}, {_LENS}"),
         FactorKind("point_seen", ("se3", "point3"), 13, 2, f"{_PIXEL}, {_LENS}"),
+        FactorKind("position_se2", ("se2",), 4, 2, "x y in the map, x y of the antenna on the robot (metres)"),
+        FactorKind("position_se3", ("se3",), 6, 3, "x y z in the map, x y z of the antenna on the robot (metres)"),
+        FactorKind("heading_se2", ("se2",), 1, 1, "theta in the map (radians)"),
+        FactorKind(
+            "attitude_se3", ("se3",), 6, 3, "a direction as the robot sees it, the same in the map (any length)"
+        ),
+        FactorKind("range_se2", ("se2", "point2"), 1, 1, "distance (metres)"),
+        FactorKind("range_se3", ("se3", "point3"), 1, 1, "distance (metres)"),
+        FactorKind("bearing_se2", ("se2", "point2"), 1, 1, "bearing (radians), from the pose"),
+        FactorKind("bearing_se3", ("se3", "point3"), 3, 3, "direction from the pose (any length)"),
+        FactorKind("linear_se2", ("se2",), 15, 3, "y (3), H (3 x 3), b (3)"),
+        FactorKind("linear_se3", ("se3",), 49, 6, "y (7), H (6 x 6), b (6)"),
+        FactorKind("linear_pair_se2", ("se2", "se2"), 27, 3, "y of both (6), H of both (2 x 3 x 3), b (3)"),
+        FactorKind("linear_pair_se3", ("se3", "se3"), 92, 6, "y of both (14), H of both (2 x 6 x 6), b (6)"),
     )
 }
 
@@ -90,5 +104,6 @@ CHANGES = {
         ChangeKind("fix", "keys"),
         ChangeKind("free", "keys"),
         ChangeKind("place", "keys", "values"),
+        ChangeKind("marginalise", "keys"),
     )
 }

@@ -53,6 +53,7 @@ class Change(NamedTuple):
     loss              factors, loss, scale (n,)  their loss from now on; "": none
     weigh             factors, weight (n,)       their information is multiplied by it
     fix, free         keys                       held where they are; estimated again
+    marginalise       keys                       they go; what their factors say of others is kept
     place             kind, keys, values         variables of one kind go to these values (n, size)
     """
 

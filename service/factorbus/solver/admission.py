@@ -179,9 +179,11 @@ def _bad_factor(
     if wrong == at.SELF_LOOP:
         return errors.SelfLoop(keys[0], where)
     if wrong == at.BAD_QUATERNION:
-        return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:])))
+        return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:7])))
     if wrong == at.BAD_RANGE:
-        return errors.BadRange(where, float(measured[1]))
+        return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
+    if wrong == at.BAD_DIRECTION:
+        return errors.BadDirection(where)
     if wrong == at.NOT_POSITIVE_DEFINITE:
         matrix = np.zeros((kind.dim, kind.dim))
         matrix[np.triu_indices(kind.dim)] = information

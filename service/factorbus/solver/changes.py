@@ -6,8 +6,11 @@
     loss               factors (n,), loss, scale (n,)   these factors have this loss from now on; "": none
     weigh              factors (n,), weight (n,)        Ω becomes w Ω
     fix, free          keys (n,)                        variables are held where they are; or estimated again
-    place              kind, keys (n,), values          variables of one kind go to these values (n, size), also those
-                                                        that are fixed; the estimate goes on from there
+    place              kind, keys (n,), values          variables of one kind, also fixed ones, go to these values; the
+                                                        estimate goes on from there
+
+    marginalise        keys (n,)                        these variables go; what their factors say of others is kept as
+                                                        linear factors (`marginal`)
 
 Changes are made one after the other: what the first has removed the second cannot name.
 """
@@ -21,11 +24,13 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph import Graph
+from factorbus.solver.groups import FactorGroup
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.marginal import marginals
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
-CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place")
+CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalise")
 _NONE = np.empty(0, np.int64)
 _QUATERNION_TOLERANCE = 1e-3
 
@@ -59,6 +64,7 @@ class Edits:
 
     stays, kept: whether it is there afterwards   free: whether a variable is estimated
     loss, scale: code of the loss and its scale   weight: what Ω is multiplied by   values: as in the graph
+    placed: how many variables were given a value   added: factors that take the place of some
     counted: what is to be told of it
     """
 
@@ -69,6 +75,8 @@ class Edits:
     scale: F64
     weight: F64
     values: F64
+    placed: int = 0
+    added: list[FactorGroup] = field(default_factory=list)
     counted: dict[str, int] = field(default_factory=dict)
 
 
@@ -92,9 +100,8 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         "edited_factors": int(np.count_nonzero(touched & edits.kept)),
         "fixed_variables": int(np.count_nonzero(edits.stays & before & ~edits.free)),
         "freed_variables": int(np.count_nonzero(edits.stays & ~before & edits.free)),
-        "placed_variables": sum(
-            change.keys.size for change in changes if change.change == "place" and change.keys is not None
-        ),
+        "placed_variables": edits.placed,
+        "added_factors": sum(len(group.keys) for group in edits.added),
     }
     return edits
 
@@ -180,7 +187,7 @@ def _place(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> Non
     if values is None or values.shape != (picked.size, kind.size):
         seen = "none" if values is None else " × ".join(map(str, values.shape))
         raise errors.BadShape("change place values", seen, f"{picked.size} × {kind.size}")
-    edits.values = edits.values.copy()
+    edits.values, edits.placed = edits.values.copy(), edits.placed + picked.size
     edits.values[graph.var[picked, at.V_AT, None] + np.arange(kind.size)] = _checked(kind.name, picked, values, graph)
 
 
@@ -200,6 +207,17 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
     return values
 
 
+def _marginalise(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+    gone = np.unique(_variables(graph, edits, change))
+    held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
+    if edits.added or edits.placed or touched.any() or held:
+        raise errors.BadOrder("marginalise", "before any loss, weigh, fix, free, place or marginalise")
+    edits.added += marginals(graph, gone, edits.kept)
+    edits.stays[gone] = False
+    ends = graph.fac[: edits.kept.size, at.F_I : at.F_J + 1]
+    edits.kept &= ~np.isin(ends, gone).any(axis=1)
+
+
 _MAKE = {
     "remove_factors": _remove_factors,
     "remove_variables": _remove_variables,
@@ -208,6 +226,7 @@ _MAKE = {
     "fix": _fix,
     "free": _free,
     "place": _place,
+    "marginalise": _marginalise,
 }
 
 

@@ -91,7 +91,8 @@ def constraint(graph: Graph, recent_poses: int = 1) -> I64:
     poses = np.flatnonzero((var[:, at.V_KIND] <= at.SE3) & (var[:, at.V_COLUMN] >= 0))
     if poses.size:
         fac = graph.fac[: graph.counts[at.FACTORS]]
-        seen = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & np.isin(fac[:, at.F_I], poses[-recent_poses:]), at.F_J]
+        fac = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & (fac[:, at.F_J] >= 0)]
+        seen = fac[np.isin(fac[:, at.F_I], poses[-recent_poses:]), at.F_J]
         columns = var[seen, at.V_COLUMN]
         group[columns[columns >= 0]] = _RECENT_LANDMARK
         group[var[poses[-1], at.V_COLUMN]] = _LAST_POSE

@@ -13,6 +13,7 @@
     ├── NotFinite              not_finite              a NaN or an infinity, given or arising
     ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
     ├── BadRange               bad_range               a range that is not positive
+    ├── BadDirection           bad_direction           a direction that is no vector of some length
     ├── BadLens                bad_lens                a lens that cannot be
     ├── BadSight               bad_sight               a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
@@ -20,6 +21,8 @@
     ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
     ├── NotInMap               unknown_variable        a change of a variable that the map does not have
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
+    ├── TooConnected           too_connected           variables to be marginalised with too large a border
+    ├── BadOrder               bad_order               changes in an order that has no meaning
     ├── BadWeight              bad_weight              a weight that is not positive
     ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
     └── Underconstrained       underconstrained        a variable that the factors leave free to move
@@ -146,9 +149,14 @@ class BadRange(SolverError):
     code = "bad_range"
 
     def __init__(self, where: str, seen: float) -> None:
-        super().__init__(
-            f"{where}: the range is {seen:g}, wanted more than 0; measured is (bearing, range)", where=where
-        )
+        super().__init__(f"{where}: the range is {seen:g}, wanted more than 0, metres", where=where)
+
+
+class BadDirection(SolverError):
+    code = "bad_direction"
+
+    def __init__(self, where: str) -> None:
+        super().__init__(f"{where}: a direction has length 0, wanted a vector of any other length", where=where)
 
 
 class BadLens(SolverError):
@@ -218,6 +226,27 @@ class InUse(SolverError):
             factor=factor,
             count=count,
         )
+
+
+class TooConnected(SolverError):
+    code = "too_connected"
+
+    def __init__(self, key: int, count: int, border: Sequence[int]) -> None:
+        listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
+        super().__init__(
+            f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
+            f"factors with {listed}; wanted at most two poses of a kind, or a point that it determines: marginalise some of "
+            "these as well, or remove some of its factors first",
+            key=key,
+            border=list(border),
+        )
+
+
+class BadOrder(SolverError):
+    code = "bad_order"
+
+    def __init__(self, change: str, wanted: str) -> None:
+        super().__init__(f"{change}: wanted it {wanted}; send it as an insert of its own", change=change)
 
 
 class BadWeight(SolverError):

@@ -50,6 +50,18 @@ FACTOR_KINDS = {
         FactorKind("idp_first", layout.IDP_FIRST, (SE3, IDP), 14, 6, "pixel, ρ₀, lens", "MATH (3.15)"),
         FactorKind("idp_seen", layout.IDP_SEEN, (SE3, IDP), 13, 2, "pixel, lens", "MATH (3.16)"),
         FactorKind("point_seen", layout.POINT_SEEN, (SE3, POINT3), 13, 2, "pixel, lens", "MATH (3.17)"),
+        FactorKind("position_se2", layout.POSITION_SE2, (SE2,), 4, 2, "position in the map, lever", "MATH (3.20)"),
+        FactorKind("position_se3", layout.POSITION_SE3, (SE3,), 6, 3, "position in the map, lever", "MATH (3.20)"),
+        FactorKind("heading_se2", layout.HEADING_SE2, (SE2,), 1, 1, "heading in the map", "MATH (3.21)"),
+        FactorKind("attitude_se3", layout.ATTITUDE_SE3, (SE3,), 6, 3, "direction, seen and in the map", "MATH (3.22)"),
+        FactorKind("range_se2", layout.RANGE_SE2, (SE2, POINT2), 1, 1, "distance", "MATH (3.23)"),
+        FactorKind("range_se3", layout.RANGE_SE3, (SE3, POINT3), 1, 1, "distance", "MATH (3.23)"),
+        FactorKind("bearing_se2", layout.BEARING_SE2, (SE2, POINT2), 1, 1, "radians", "MATH (3.24)"),
+        FactorKind("bearing_se3", layout.BEARING_SE3, (SE3, POINT3), 3, 3, "direction", "MATH (3.25)"),
+        FactorKind("linear_se2", layout.LINEAR_SE2, (SE2,), 15, 3, "y, H, b", "MATH (3.26)"),
+        FactorKind("linear_se3", layout.LINEAR_SE3, (SE3,), 49, 6, "y, H, b", "MATH (3.26)"),
+        FactorKind("linear_pair_se2", layout.LINEAR_PAIR_SE2, (SE2, SE2), 27, 3, "y₁ y₂, H₁ H₂, b", "MATH (3.26)"),
+        FactorKind("linear_pair_se3", layout.LINEAR_PAIR_SE3, (SE3, SE3), 92, 6, "y₁ y₂, H₁ H₂, b", "MATH (3.26)"),
     )
 }
 LENS_AT = {"idp_first": 3, "idp_seen": 2, "point_seen": 2}  # where in a measurement the code of its lens is

@@ -46,7 +46,8 @@ class Graph:
     @property
     def sights(self) -> bool:
         """Whether any camera has seen anything."""
-        return bool((self.fac[: self.counts[at.FACTORS], at.F_KIND] >= at.IDP_FIRST).any())
+        kinds = self.fac[: self.counts[at.FACTORS], at.F_KIND]
+        return bool(((kinds >= at.IDP_FIRST) & (kinds < at.POSITION_SE2)).any())
 
     def mark(self) -> Mark:
         """How much is in use now."""

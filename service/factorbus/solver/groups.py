@@ -73,3 +73,11 @@ class FactorGroup:
     loss: str = ""
     scale: F64 | None = None
     ids: I64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Addition:
+    """A `BatchLike` of the solver's own."""
+
+    variables: Sequence[VariablesLike]
+    factors: Sequence[FactorsLike]

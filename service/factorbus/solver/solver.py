@@ -18,7 +18,7 @@ from factorbus.solver.edited import edited
 from factorbus.solver.elimination import Elimination
 from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
-from factorbus.solver.groups import BatchLike, FactorGroup, Group
+from factorbus.solver.groups import Addition, BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
@@ -195,6 +195,7 @@ class Solver:
         edits = collect(self._graph, changes)
         made = Solver(self._options)
         made._graph.take(edited(self._graph, edits))
+        made._add(edits.added)
         variables, factors = made.variable_count, made.factor_count
         first = made._graph.next_id if batch is None else made.stage(batch)
         new = made.variable_count - variables, made.factor_count - factors
@@ -264,6 +265,10 @@ class Solver:
         None: as for `try_view`.
         """
         return self._live.joint(variables) if self._live else None
+
+    def _add(self, factors: Sequence[FactorGroup]) -> None:
+        if factors:
+            admit(self._graph, Addition((), factors))
 
     def _place_new(self) -> None:
         """Good first values for the few variables that a step of a robot brings."""

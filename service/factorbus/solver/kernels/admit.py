@@ -10,9 +10,9 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.se2 import wrap
-from factorbus.solver.kernels.sizes import dim_of, residual_dim
+from factorbus.solver.kernels.sizes import dim_of, kinds_of_ends, residual_dim
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -180,9 +180,43 @@ def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scr
         return at.BAD_QUATERNION
     if kind == at.BEARING_RANGE_SE2 and not payload[p + 1] > 0.0:
         return at.BAD_RANGE
+    if kind >= at.POSITION_SE2:
+        wrong = check_other(kind, p, payload)
+        if wrong != at.GOOD:
+            return wrong
     if not is_positive_definite(residual_dim(kind), payload, p + size, scratch):
         return at.NOT_POSITIVE_DEFINITE
     return at.GOOD
+
+
+@part
+def check_other(kind: int, p: int, payload: F64) -> int:
+    """What is wrong with a measurement of the kinds from POSITION_SE2 on; directions and quaternions become unit."""
+    if (kind == at.RANGE_SE2 or kind == at.RANGE_SE3) and not payload[p] > 0.0:
+        return at.BAD_RANGE
+    attitude, pair = kind == at.ATTITUDE_SE3, kind == at.LINEAR_PAIR_SE3
+    if (attitude or kind == at.BEARING_SE3) and not make_direction(payload, p):
+        return at.BAD_DIRECTION
+    if attitude and not make_direction(payload, p + 3):
+        return at.BAD_DIRECTION
+    if (pair or kind == at.LINEAR_SE3) and not make_unit(payload, p + 3):
+        return at.BAD_QUATERNION
+    if pair and not make_unit(payload, p + 10):
+        return at.BAD_QUATERNION
+    return at.GOOD
+
+
+@inline_kernel
+def make_direction(v: F64, k: int) -> bool:
+    """Bring the vector at k to unit length, unless it is there to the last bit; False: it has none."""
+    n2 = v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2]
+    if not n2 > 1e-100:
+        return False
+    if abs(n2 - 1.0) > 4e-16:
+        scale = 1.0 / math.sqrt(n2)
+        for c in range(3):
+            v[k + c] *= scale
+    return True
 
 
 @inline_kernel
@@ -195,22 +229,6 @@ def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, var: I64, 
     fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_FLAGS] = -1, -1, -1, loss << at.LOSS_SHIFT
     counts[at.PAYLOAD] += numbers
     counts[at.FACTORS] += 1
-
-
-@inline_kernel
-def kinds_of_ends(kind: int) -> tuple:
-    """The kinds of variables that a kind of factor connects; −1: no second one."""
-    if kind <= at.PRIOR_POINT3:
-        return kind, -1
-    if kind == at.BETWEEN_SE2:
-        return at.SE2, at.SE2
-    if kind == at.BETWEEN_SE3:
-        return at.SE3, at.SE3
-    if kind == at.LANDMARK_SE3 or kind == at.POINT_SEEN:
-        return at.SE3, at.POINT3
-    if kind == at.IDP_FIRST or kind == at.IDP_SEEN:
-        return at.SE3, at.IDP
-    return at.SE2, at.POINT2
 
 
 @inline_kernel

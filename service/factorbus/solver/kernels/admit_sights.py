@@ -22,7 +22,7 @@ def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payl
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         kind = fac[f, at.F_KIND]
-        if kind >= at.IDP_FIRST:
+        if at.IDP_FIRST <= kind < at.POSITION_SE2:
             x, y, p = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
             status = status_of_pixel(kind, payload, p) if new else GOOD
             if status == GOOD:

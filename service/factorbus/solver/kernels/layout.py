@@ -57,9 +57,21 @@ BETWEEN_SE3 = 5
 LANDMARK_SE2 = 6
 LANDMARK_SE3 = 7
 BEARING_RANGE_SE2 = 8
-IDP_FIRST = 9  # from here on: what a camera sees
+IDP_FIRST = 9  # from here on: how far it is bent is computed, (9.11); and these three are what a camera sees
 IDP_SEEN = 10
 POINT_SEEN = 11
+POSITION_SE2 = 12  # from here on: kinds that nobody is placed by
+POSITION_SE3 = 13
+HEADING_SE2 = 14
+ATTITUDE_SE3 = 15
+RANGE_SE2 = 16
+RANGE_SE3 = 17
+BEARING_SE2 = 18
+BEARING_SE3 = 19
+LINEAR_SE2 = 20
+LINEAR_SE3 = 21
+LINEAR_PAIR_SE2 = 22
+LINEAR_PAIR_SE3 = 23
 
 # Codes of losses.
 NO_LOSS = 0
@@ -86,6 +98,7 @@ SELF_LOOP = 8
 BAD_RANGE = 9
 NOT_POSITIVE_DEFINITE = 10
 BAD_SCALE = 11
+BAD_DIRECTION = 12
 
 # Columns of `groups`: groups of variables and factors whose numbers lie in the bytes of a message, little-endian, one
 # row each in any order, and after the last one a row of kind END.  An offset is that of the first byte.

@@ -12,12 +12,16 @@ import numpy as np
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.absolute import attitude_se3, heading_se2, position_se2, position_se3
+from factorbus.solver.kernels.directions import bearing_se2, bearing_se3, range_se2, range_se3
+from factorbus.solver.kernels.linear import linear_se2, linear_se3
 from factorbus.solver.kernels.losses import soften
 from factorbus.solver.kernels.points import prior_point2, prior_point3
 from factorbus.solver.kernels.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.se3 import between_se3, landmark_se3, prior_se3
 from factorbus.solver.kernels.sights import sight
-from factorbus.solver.kernels.sizes import information_at, residual_dim
+from factorbus.solver.kernels.sizes import end_dims, information_at, residual_dim
+from factorbus.solver.lenses.layout import GOOD
 
 
 @kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
@@ -43,7 +47,7 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
         elif kind == at.PRIOR_POINT2:
             chi2 += add_factor(2, 2, 2, f, var, fac, payload[p + 2 :], r, H, W, data, eta)
         else:
-            chi2 += add_sight(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
+            chi2 += add_other(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
     return chi2
 
 
@@ -86,8 +90,10 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
         prior_point2(x, i, j, payload, p, r, A, B)
     elif kind == at.PRIOR_POINT3:
         prior_point3(x, i, j, payload, p, r, A, B)
-    else:
+    elif kind < at.POSITION_SE2:
         more = sight(kind, x, i, j, payload, p, r, A, B)
+    else:
+        evaluate_other(kind, x, i, j, payload, p, r, A, B)
     loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
     if loss != at.NO_LOSS:
         more = soften(kind, loss, p, payload, more, r, A, B)
@@ -95,10 +101,36 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
 
 
 @part
-def add_sight(kind: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64) -> float:
-    """`add_factor` of what a camera sees."""
-    dim = residual_dim(kind)
-    return add_factor(dim, 6, 3 if kind == at.POINT_SEEN else 6, f, var, fac, info, r, H, W, data, eta)
+def evaluate_other(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
+    """The kinds from POSITION_SE2 on."""
+    r[at.R_STATUS] = GOOD
+    if kind == at.POSITION_SE2:
+        position_se2(x, i, p, k, r, A)
+    elif kind == at.POSITION_SE3:
+        position_se3(x, i, p, k, r, A)
+    elif kind == at.HEADING_SE2:
+        heading_se2(x, i, p, k, r, A)
+    elif kind == at.ATTITUDE_SE3:
+        attitude_se3(x, i, p, k, r, A)
+    elif kind == at.RANGE_SE2:
+        range_se2(x, i, j, p, k, r, A, B)
+    elif kind == at.RANGE_SE3:
+        range_se3(x, i, j, p, k, r, A, B)
+    elif kind == at.BEARING_SE2:
+        bearing_se2(x, i, j, p, k, r, A, B)
+    elif kind == at.BEARING_SE3:
+        bearing_se3(x, i, j, p, k, r, A, B)
+    elif kind == at.LINEAR_SE2 or kind == at.LINEAR_PAIR_SE2:
+        linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
+    else:
+        linear_se3(x, i, j, 1 if kind == at.LINEAR_SE3 else 2, p, k, r, A, B)
+
+
+@part
+def add_other(kind: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64) -> float:
+    """`add_factor` of the kinds that are not worth straight code."""
+    di, dj = end_dims(kind)
+    return add_factor(residual_dim(kind), di, dj, f, var, fac, info, r, H, W, data, eta)
 
 
 @inline_kernel

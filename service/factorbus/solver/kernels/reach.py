@@ -68,7 +68,7 @@ def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: 
 def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
     """The variable that factor `f` reaches now, or _NOTHING, or _WAITS: both ends are still out of reach."""
     kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
-    if kind == at.IDP_SEEN or kind == at.POINT_SEEN:  # a pixel alone places nothing
+    if kind == at.IDP_SEEN or kind >= at.POINT_SEEN:  # a pixel alone places nothing, nor what is behind it in the list
         return _NOTHING
     has_i = i < v0 or reached[i - v0] != 0
     if j < 0:

@@ -65,7 +65,7 @@ def lever_of(kind: int, p: F64, k: int) -> float:
         return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1] + p[k + 2] * p[k + 2])
     if kind == at.BEARING_RANGE_SE2:
         return p[k + 1]
-    if kind >= at.IDP_FIRST:  # of a pixel: how many a radian has
+    if at.IDP_FIRST <= kind < at.POSITION_SE2:  # of a pixel: how many a radian has
         return p[k + (4 if kind == at.IDP_FIRST else 3) + FU]
     return 0.0
 
@@ -79,7 +79,7 @@ def root_weight(kind: int, w: F64, d: float) -> float:
         return math.sqrt(max(w[0, 0], w[1, 1]))
     if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
         return math.sqrt(max(w[0, 0], w[1, 1], w[2, 2]))
-    if kind >= at.IDP_FIRST:
+    if at.IDP_FIRST <= kind < at.POSITION_SE2:
         a = 3 if kind == at.IDP_FIRST else 0
         return math.sqrt(max(w[a, a], w[a + 1, a + 1]))
     return 0.0

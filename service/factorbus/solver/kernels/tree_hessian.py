@@ -5,7 +5,7 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.linearise import evaluate_apart, multiply
 from factorbus.solver.kernels.simd import put
-from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim
+from factorbus.solver.kernels.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.kernels.tree_bend import lever_of, root_weight
 from factorbus.solver.lenses.layout import GOOD
 
@@ -49,12 +49,9 @@ def note_sleep(f: int, asleep: bool, link: I64, state: I64) -> None:
 
 @part
 def _write_other(kind: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
-    """Priors, and what cameras see."""
-    dim = residual_dim(kind)
-    if kind >= at.IDP_FIRST:
-        _write(dim, 6, 3 if kind == at.POINT_SEEN else 6, p, more, payload, r, H, W, h, out)
-    else:
-        _write(dim, dim, 0, p, more, payload, r, H, W, h, out)
+    """Of the kinds that are not worth straight code."""
+    di, dj = end_dims(kind)
+    _write(residual_dim(kind), di, dj, p, more, payload, r, H, W, h, out)
 
 
 @inline_kernel

@@ -1,0 +1,97 @@
+"""Single random factors of the kinds that place nobody, and graphs that grow with them."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from naive.dense_factors import boxplus, pose_matrix
+from naive.dense_least_squares import CONNECTS
+from naive.random_graphs import factor, random_information, random_value
+
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.symbols import symbol
+
+_BEGINNINGS = ("position", "heading", "attitude", "range_se", "bearing_se", "linear")
+OTHERS = tuple(name for name in FACTOR_KINDS if name.startswith(_BEGINNINGS))
+
+
+def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
+    """What a factor of such a kind would measure at these values, with noise."""
+    T = pose_matrix(ends[0])
+    n = len(T) - 1
+    if kind.startswith("position"):
+        lever = rng.normal(0, 0.5, n)
+        return np.concatenate([(T @ np.append(lever, 1.0))[:n] + noise * rng.normal(size=n), lever])
+    if kind == "heading_se2":
+        return ends[0][2:] + noise * rng.normal(size=1)
+    if kind == "attitude_se3":
+        there = rng.normal(size=3)
+        seen = T[:3, :3].T @ there / np.linalg.norm(there) + noise * rng.normal(size=3)
+        return np.concatenate([2.0 * seen, there])
+    if kind.startswith("linear"):
+        at = [boxplus(CONNECTS[kind][0], end, 0.1 * rng.normal(size=n * (n + 1) // 2)) for end in ends]
+        d = FACTOR_KINDS[kind].dim
+        blocks = [np.eye(d) * (1 if e else -1) + 0.2 * rng.normal(size=(d, d)) for e in range(len(ends))]
+        off = [np.append(*_apart(T, y, end)) for y, end in zip(at, ends, strict=True)]
+        rest = -sum(H @ e for H, e in zip(blocks, off, strict=True)) + noise * rng.normal(size=d)
+        return np.concatenate([*at, *(H.ravel() for H in blocks), rest])
+    seen = (np.linalg.inv(T) @ np.append(ends[1], 1.0))[:-1]
+    if kind.startswith("range"):
+        return np.array([abs(np.linalg.norm(seen) + noise * rng.normal())])
+    if kind == "bearing_se2":
+        return np.array([np.arctan2(seen[1], seen[0]) + noise * rng.normal()])
+    return 3.0 * (seen / np.linalg.norm(seen) + noise * rng.normal(size=3))
+
+
+def _apart(_: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x ⊟ y as (translation, rotation)."""
+    E = np.linalg.inv(pose_matrix(y)) @ pose_matrix(x)
+    if len(E) == 3:
+        return E[:2, 2], np.array([np.arctan2(E[1, 0], E[0, 0])])
+    w = 0.5 * np.sqrt(max(1.0 + np.trace(E[:3, :3]), 0.0))
+    skew = E[:3, :3] - E[:3, :3].T
+    return E[:3, 3], np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (2.0 * w)
+
+
+def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") -> Iterator[Batch]:
+    """A robot in the plane and one in space; all of these kinds occur, and what they alone leave free is held."""
+    rng = np.random.default_rng(seed)
+    truth: dict[int, np.ndarray] = {}
+
+    def new(kind: str, letter: str, index: int, value: np.ndarray, given: bool = False) -> Variables:
+        truth[symbol(letter, index)] = value
+        return Variables(kind, np.array([symbol(letter, index)]), value[None] if given else None)
+
+    def made(kind: str, *keys: int) -> Factors:
+        z = random_other(kind, [truth[key] for key in keys], noise, rng)
+        information = random_information(FACTOR_KINDS[kind].dim, rng)
+        group = Factors(kind, np.array([keys]), z[None], information[None])
+        return group._replace(loss=loss, scale=np.array([1.5])) if loss else group
+
+    for n in range(steps):
+        x, y, l, p = (symbol(letter, n) for letter in "xylp")
+        plane, space = random_value("se2", rng), random_value("se3", rng)
+        if n:
+            plane = boxplus("se2", truth[x - 1], np.array([1.0, 0.1, rng.normal(0, 0.6)]))
+            space = boxplus("se3", truth[y - 1], np.array([1, 0, 0.1, *rng.normal(0, 0.4, 3)]))
+        variables = [new("se2", "x", n, plane), new("se3", "y", n, space)]
+        variables += [new("point2", "l", n, plane[:2] + rng.uniform(1, 3, 2), given=True)]
+        variables += [new("point3", "p", n, space[:3] + rng.uniform(1, 3, 3), given=True)]
+        if n == 0:
+            factors = [factor("prior_se2", [x], truth, noise, rng), factor("prior_se3", [y], truth, noise, rng)]
+        else:
+            factors = [factor("between_se2", [x - 1, x], truth, noise, rng)]
+            factors += [factor("between_se3", [y - 1, y], truth, noise, rng)]
+            factors += [made("linear_pair_se2", x - 1, x), made("linear_pair_se3", y, y - 1)]
+            factors += [made("range_se2", x, l - 1), made("bearing_se3", y, p - 1)]
+        factors += [
+            made("range_se2", x, l),
+            made("bearing_se2", x, l),
+            made("range_se3", y, p),
+            made("bearing_se3", y, p),
+        ]
+        factors += [factor("prior_point2", [l], truth, noise, rng), factor("prior_point3", [p], truth, noise, rng)]
+        if n % 2:
+            factors += [made(kind, x) for kind in ("position_se2", "heading_se2", "linear_se2")]
+            factors += [made(kind, y) for kind in ("position_se3", "attitude_se3", "linear_se3")]
+        yield Batch(tuple(variables), tuple(factors))

@@ -1,0 +1,148 @@
+"""Old variables marginalised: what is left has the estimate and the covariances that it had; memory does not grow."""
+
+import numpy as np
+import pytest
+from naive.dense_least_squares import distance
+
+from factorbus.proto.messages import Batch, Change, Factors, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.covariance.blocks import Blocks
+
+SPACES = {"se2": (3, 3), "se3": (7, 6)}
+
+
+def info(*sigmas: float) -> np.ndarray:
+    return np.diag(1.0 / np.array(sigmas) ** 2)[np.triu_indices(len(sigmas))][None]
+
+
+def start(kind: str) -> Batch:
+    value = np.zeros((1, SPACES[kind][0]))
+    if kind == "se3":
+        value[0, 6] = 1.0
+    return Batch((Variables(kind, np.array([symbol("x", 0)]), value, fixed=True),))
+
+
+def step(kind: str, n: int, rng: np.random.Generator, closure: int = 2) -> Batch:
+    """The next pose: odometry, a closure to the pose `closure` before, and now and then a position."""
+    size, dim = SPACES[kind]
+    key = symbol("x", n)
+
+    def edge(back: int) -> Factors:
+        z = np.zeros((1, size))
+        if kind == "se3":
+            z[0, 3:6] = 0.02 * rng.normal(size=3)
+            z[0, 6] = np.sqrt(1.0 - z[0, 3:6] @ z[0, 3:6])
+        else:
+            z[0, 2] = 0.1 * back + 0.02 * rng.normal()
+        z[0, 0] = back + 0.05 * rng.normal()
+        return Factors(f"between_{kind}", np.array([[key - back, key]]), z, info(*([0.1] * dim)))
+
+    factors = [edge(1)]
+    if n > closure and closure > 1:
+        factors.append(edge(closure))
+    if n % 5 == 0:
+        where = np.zeros((1, 4 if kind == "se2" else 6))
+        where[0, :2] = 5.0 * np.cos(0.1 * n), 5.0 * np.sin(0.1 * n)
+        factors.append(
+            Factors(f"position_{kind}", np.array([[key]]), where, info(*([3.0] * (2 if kind == "se2" else 3))))
+        )
+    return Batch((Variables(kind, np.array([key])),), tuple(factors))
+
+
+def driven(kind: str, poses: int, mode: str = "tree", closure: int = 2) -> tuple[Solver, np.random.Generator]:
+    rng, solver = np.random.default_rng(3), Solver(Options(mode=mode))
+    solver.stage(start(kind))
+    for n in range(1, poses):
+        solver.stage(step(kind, n, rng, closure))
+        solver.step()
+    solver.step(settle=True)
+    return solver, rng
+
+
+def oldest(first: int, last: int) -> list[Change]:
+    return [Change("marginalise", keys=np.array([symbol("x", n) for n in range(first, last)]))]
+
+
+def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
+    return {k: (g.kind, row) for g in solver.estimate() for k, row in zip(g.keys.tolist(), g.values, strict=True)}
+
+
+def covariance(solver: Solver, *names: int) -> np.ndarray:
+    """The joint covariance of some poses."""
+    blocks = Blocks(solver.factored())
+    return blocks.joint(np.array([solver._graph.find(symbol("x", n)) for n in names]))
+
+
+@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("closure", [1, 2])
+@pytest.mark.parametrize("kind", SPACES)
+def test_what_is_left_stays_where_it_is_and_as_certain_as_it_was(kind: str, closure: int, mode: str) -> None:
+    solver, _ = driven(kind, 24, mode, closure)
+    before, sure = values(solver), covariance(solver, 20, 21, 23)
+    after, _, _, counted = solver.with_changes(oldest(0, 20), settle=True)
+    assert counted["removed_variables"] == 20
+    assert counted["added_factors"] == closure
+    assert len(values(after)) == 4
+    for key, (of, row) in values(after).items():
+        assert distance(of, row, before[key][1]) < 1e-7
+    np.testing.assert_allclose(covariance(after, 20, 21, 23), sure, rtol=1e-5, atol=1e-8 * sure.max())
+
+
+def test_a_relative_marginal_leaves_its_poses_free_together() -> None:
+    """Of poses that only odometry joins, nothing is known but where they are from each other."""
+    solver, _ = driven("se2", 12, closure=1)
+    middle, _, _, counted = solver.with_changes(oldest(3, 8), settle=True)
+    assert counted["added_factors"] >= 1
+    for key, (of, row) in values(middle).items():
+        assert distance(of, row, values(solver)[key][1]) < 1e-7
+    np.testing.assert_allclose(covariance(middle, 2, 9), covariance(solver, 2, 9), rtol=1e-5, atol=1e-10)
+
+
+def test_a_border_of_three_is_refused_and_named() -> None:
+    solver, _ = driven("se2", 20, closure=2)
+    solver.stage(Batch(factors=(step("se2", 17, np.random.default_rng(1), 10).factors[1],)))
+    solver.step()
+    with pytest.raises(errors.TooConnected) as refused:
+        solver.with_changes(oldest(0, 9))
+    assert refused.value.detail["border"] == [symbol("x", n) for n in (9, 10, 17)]
+    with pytest.raises(errors.BadOrder):
+        solver.with_changes([Change("weigh", np.array([0]), weight=np.array([2.0])), *oldest(0, 5)])
+
+
+def test_landmarks_seen_from_one_pose_that_stays_become_what_it_knows() -> None:
+    solver, rng = driven("se2", 8)
+    l = np.array([symbol("l", 1)])
+    keys = [np.array([[symbol("x", n), l[0]]]) for n in (3, 4, 6)]
+    seen = [
+        Factors("landmark_se2", k, np.array([[2.0 - n, 1.0]]) + 0.02 * rng.normal(size=2), info(0.1, 0.1))
+        for n, k in enumerate(keys)
+    ]
+    solver.stage(Batch((Variables("point2", l),), tuple(seen)))
+    solver.step(settle=True)
+    before = values(solver)
+    after, *_ = solver.with_changes([oldest(0, 6)[0]._replace(keys=np.append(oldest(0, 6)[0].keys, l))], settle=True)
+    assert sorted(values(after)) == [symbol("x", 6), symbol("x", 7)]
+    for key, (of, row) in values(after).items():
+        assert distance(of, row, before[key][1]) < 1e-7
+    kept, *_ = solver.with_changes(oldest(0, 4)[:0] + [Change("marginalise", keys=l[:0])])
+    assert len(values(kept)) == len(before)
+
+
+@pytest.mark.parametrize("poses", [1500, pytest.param(100_000, marks=pytest.mark.data)])
+def test_a_window_over_a_long_drive_takes_constant_memory(poses: int) -> None:
+    rng, solver = np.random.default_rng(3), Solver(Options())
+    solver.stage(start("se2"))
+    first, sizes, window = 0, [], 100
+    for n in range(1, poses):
+        solver.stage(step("se2", n, rng))
+        solver.step()
+        if n - first == 2 * window:
+            solver, *_ = solver.with_changes(oldest(first, first + window))
+            first += window
+            sizes.append(solver.memory_bytes())
+    assert solver.variable_count <= 2 * window + 1
+    assert solver._graph.next_id > poses
+    assert max(sizes[1:]) <= 1.2 * sizes[1], "it does not grow with the length of the drive"
+    where = values(solver)[symbol("x", poses - 1)][1]
+    assert np.hypot(*where[:2]) < 30.0, "the positions hold it, however long ago the first were"
