@@ -235,8 +235,8 @@ class TooConnected(SolverError):
         listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
         super().__init__(
             f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
-            f"factors with {listed}; wanted at most two poses of a kind, or a point that it determines: marginalise some of "
-            "these as well, or remove some of its factors first",
+            f"factors with {listed}; wanted at most two poses of a kind, or a point that they determine: marginalise "
+            "some of these as well, or remove some of its factors first",
             key=key,
             border=list(border),
         )

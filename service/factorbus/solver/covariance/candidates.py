@@ -112,8 +112,9 @@ def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
 def linearised(graph: Graph, first: int, last: int) -> Linear:
     """The factors first .. last−1 at the estimate."""
     n = last - first
-    r, A, B, W = np.zeros((n, LARGEST)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
+    r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
     evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    r = np.ascontiguousarray(r[:, :LARGEST])  # without what became of a sight
     fac = graph.fac[first:last]
     ends = np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1])
     return Linear(ends, _SIZES[fac[:, at.F_KIND]], r, A, B, W)
