@@ -129,6 +129,7 @@ def test_landmarks_seen_from_one_pose_that_stays_become_what_it_knows() -> None:
     assert len(values(kept)) == len(before)
 
 
+@pytest.mark.timeout(3000)
 @pytest.mark.parametrize("poses", [1500, pytest.param(100_000, marks=pytest.mark.data)])
 def test_a_window_over_a_long_drive_takes_constant_memory(poses: int) -> None:
     rng, solver = np.random.default_rng(3), Solver(Options())

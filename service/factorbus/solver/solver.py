@@ -99,7 +99,7 @@ class Solver:
         if packed:
             first = try_admit(self._graph, *packed)
             if first is not None:
-                return first
+                return first + self._graph.id_shift
         mark = self._graph.mark()
         try:
             admit(self._graph, batch)

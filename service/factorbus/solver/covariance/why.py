@@ -150,15 +150,15 @@ def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccoun
         without = float(weighted @ np.linalg.solve(np.eye(d) - L.T @ T @ L, weighted))
     return FactorAccount(
         factor, kind.name, keys, r, weighted, float(weighted @ weighted), d, float(np.trace(W @ T)), without,
-        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), _weight(graph, factor, linear),
-        sights.why_asleep(graph, factor),
+        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), _weight(graph, place, linear),
+        sights.why_asleep(graph, place),
     )  # fmt: skip
 
 
-def _weight(graph: Graph, factor: int, linear: Linear) -> float:
+def _weight(graph: Graph, row: int, linear: Linear) -> float:
     """w, from r with and without the loss."""
     plain = copy.copy(graph)
-    plain.fac = graph.fac[: factor + 1].copy()
-    plain.fac[factor, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
-    r = linearised(plain, factor, factor + 1).r[0]
+    plain.fac = graph.fac[: row + 1].copy()
+    plain.fac[row, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
+    r = linearised(plain, row, row + 1).r[0]
     return float(linear.r[0] @ linear.r[0]) / float(r @ r) if r.any() else 1.0
