@@ -14,7 +14,7 @@ from factorbus.client import connect
 
 TAKEOVERS = 6
 EACH = 150
-BOUND_S = 10.0  # a try that nobody answers is repeated after 5 s
+BOUND_S = 4.0
 ROUTER = str(Path(__file__).parent / "router.py")
 
 

@@ -74,10 +74,15 @@ class Courier:
         return errand
 
     def hurry(self, prefix: str) -> None:
-        """Try everything that waits and whose key begins with `prefix` now: somebody is there again."""
+        """Try everything now whose key begins with `prefix`: somebody is there again.
+
+        Also what is on its way: what reached them before they were ready may well be answered by nobody.
+        """
         with self._changed:
             now = time.monotonic()
-            self._due = [(now if e.key.startswith(prefix) else at, n, e) for at, n, e in self._due]
+            self._due = [each for each in self._due if not each[2].key.startswith(prefix)]
+            again = sorted((e for e in self._open if e.key.startswith(prefix)), key=lambda e: e.sent_at)
+            self._due += [(now, next(self._order), errand) for errand in again]
             heapq.heapify(self._due)
             self._changed.notify()
 
@@ -96,22 +101,23 @@ class Courier:
             self._finish(errand, Unavailable(errand.what, self._waited(errand), "the connection was closed first"))
 
     def _try(self, errand: Errand) -> None:
-        errand.attempt += 1
+        errand.attempt = attempt = errand.attempt + 1
         timeout_s = TRY_S
         if errand.deadline is not None:
             timeout_s = min(TRY_S, max(errand.deadline - time.monotonic(), 0.001))
-        self._link.ask(errand.key, errand.payload, timeout_s, lambda reply: self._take(errand, reply))
+        self._link.ask(errand.key, errand.payload, timeout_s, lambda reply: self._take(errand, attempt, reply))
 
-    def _take(self, errand: Errand, reply: Reply) -> None:
+    def _take(self, errand: Errand, attempt: int, reply: Reply) -> None:
         """On zenoh's thread: only decode, hand over, or put back."""
-        verdict = judge(reply, errand.attempt, errand.passing)
+        verdict = judge(reply, attempt, errand.passing)
         if isinstance(verdict, bytes):
             try:
                 self._finish(errand, errand.decode(verdict))
             except Problem as unreadable:
                 self._finish(errand, unreadable)
         elif isinstance(verdict, Again):
-            self._put_back(errand, verdict)
+            if attempt == errand.attempt:  # else a later try is on its way
+                self._put_back(errand, verdict)
         else:
             self._finish(errand, verdict)
 
