@@ -20,5 +20,5 @@ def command() -> None:
     from factorbus.service.warm import warm
     from factorbus.solver import compiled_seconds
 
-    seconds = warm(lambda group: note(f"  {group}"))
+    seconds = warm(lambda kernel: note(f"  compiling {kernel}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")

@@ -11,9 +11,8 @@ def get_ready_to_compute(warm: bool) -> None:
     """Have every kernel at hand, if `warm`; afterwards the interpreter pauses as rarely and as shortly as can be."""
     if warm:
         from factorbus.service.warm import warm as warm_all
-        from factorbus.solver import compiled_seconds
 
-        seconds = warm_all(lambda name: _announce(name, compiled_seconds()))
+        seconds = warm_all(lambda name: log.info("compiling kernels: %s", name))
         log.info("kernels ready after %.1f s", seconds)
     # The compiler leaves some hundred thousand objects that live on: not walking them again saves pauses of 0.1 s.
     gc.collect()
@@ -22,9 +21,3 @@ def get_ready_to_compute(warm: bool) -> None:
     gc.set_threshold(20_000, 50, 100)
     # Callbacks and the solver's Python share one interpreter lock; the default of 5 ms is longer than most steps.
     sys.setswitchinterval(0.0005)
-
-
-def _announce(kernels: str, compiled_s: float) -> None:
-    """On a cold start, say what is being compiled; loading what was compiled before takes no time worth a line."""
-    if compiled_s:
-        log.info("compiling kernels: %s", kernels)

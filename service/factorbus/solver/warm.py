@@ -8,7 +8,7 @@ from typing import Any
 
 from factorbus.solver import kernels
 from factorbus.solver.covariance import kernels as covariance_kernels
-from factorbus.solver.kernels._jit import compiled_seconds, iter_compile
+from factorbus.solver.kernels._jit import compiled_seconds, is_on_disk, iter_compile
 
 
 def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -> float:
@@ -25,6 +25,21 @@ def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -
             for _ in iter_compile(*found):
                 pass
     return compiled_seconds() - before
+
+
+def list_missing(*packages: ModuleType) -> list[Any]:
+    """The kernels in `packages`, the solver's own by default, that are not on disk: compiling one puts it there.
+
+    Those that take longest come first, near enough: they have the most arguments.
+    """
+    found = [
+        one
+        for package in packages or (kernels, covariance_kernels)
+        for _, group in _iter_groups(package)
+        for one in group
+        if not is_on_disk(one)
+    ]
+    return sorted(found, key=lambda one: -one.factorbus_signatures[0].count(","))
 
 
 def _iter_groups(package: ModuleType = kernels) -> Iterator[tuple[str, list[Any]]]:

@@ -34,6 +34,8 @@ import numba.extending
 import numpy as np
 from llvmlite import ir
 from numba.core import caching, cgutils, config, event, types
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
@@ -49,6 +51,7 @@ __all__ = [
     "inline_kernel",
     "intrinsic",
     "ir",
+    "is_on_disk",
     "iter_compile",
     "kernel",
     "part",
@@ -71,6 +74,21 @@ _EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _KEPT_FOLDERS = 6
+
+
+class _PartLibrary(JITCodeLibrary):
+    """The code of a part: optimised where it is linked, in every kernel that calls it, and only there.
+
+    Numba's own libraries are optimised at every level of calls, which makes compiling a third longer.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+
+class _PartCompiler(Compiler):
+    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
+        super().__init__(typingctx, targetctx, library or _PartLibrary(targetctx.codegen(), "part"), *rest)
 
 
 class KernelFolder:
@@ -100,13 +118,13 @@ class KernelFolder:
         """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
         if DISABLED:
             return function
-        return _ours(numba.njit(forceinline=True, **self._flags)(function))
+        return _ours(numba.njit(forceinline=True, pipeline_class=_PartCompiler, **self._flags)(function))
 
     def part(self, function: Callable[..., Any]) -> Any:
         """A step of a kernel, kept on disk with the kernel that calls it."""
         if DISABLED:
             return function
-        return _ours(numba.njit(**self._flags)(function))
+        return _ours(numba.njit(pipeline_class=_PartCompiler, **self._flags)(function))
 
     def path(self) -> Path:
         """The cache folder, made when it is first asked for."""
@@ -148,6 +166,11 @@ def iter_compile(*kernels: Any) -> Iterator[str]:
         yield function.__name__
         if not DISABLED:
             _compile_declared(function)
+
+
+def is_on_disk(function: Any) -> bool:
+    """Whether a kernel with signatures has been compiled before, as these sources have it."""
+    return DISABLED or Path(function._cache._cache_file._index_path).is_file()
 
 
 def vector_lanes() -> int:
