@@ -68,7 +68,9 @@ def row_of(lines: list[str], name: str) -> list[str]:
     return next((line.split() for line in lines if line.strip().startswith(name)), [])
 
 
-def test_the_screen_follows_the_service(endpoint: str, spawn: Callable[..., Process]) -> None:
+def test_the_screen_follows_the_service(spawn: Callable[..., Process]) -> None:
+    # Of its own: what others have on the folder's service would not leave room on the screen.
+    (endpoint,) = spawn("-m", "factorbus.cli", "serve", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()
     worker = spawn("-m", "factorbus.cli", "work", "--connect", endpoint, "--name", "worker7", "--no-warm")
     worker.ready()
     with connect(endpoint, client="robot") as bus, bus.map("topped") as joined:
