@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from naive.dense_factors import residual
 from naive.random_graphs import random_steps
+from naive.random_others import other_steps
 
 from factorbus.cli.columns import merged
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
@@ -11,10 +12,12 @@ from factorbus.proto.messages import Factors, Variables
 from factorbus.solver import Options, Solver
 from factorbus.viz.residuals import Values, factor_chi2
 
+WORLDS = [(random_steps, 1), (random_steps, 2), (random_steps, 3), (other_steps, 1), (other_steps, 2)]
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(seed: int) -> None:
-    graph = merged(random_steps(seed))
+
+@pytest.mark.parametrize(("steps", "seed"), WORLDS)
+def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(steps, seed: int) -> None:
+    graph = merged(steps(seed))
     solver = Solver(Options())
     solver.stage(graph)
     report = solver.step(settle=True)
@@ -38,7 +41,7 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(seed:
 
 
 def test_the_graphs_above_have_every_kind_but_sights() -> None:
-    kinds = {group.kind for seed in (1, 2, 3) for step in random_steps(seed) for group in step.factors}
+    kinds = {group.kind for steps, seed in WORLDS for step in steps(seed) for group in step.factors}
     assert kinds == set(FACTOR_KINDS) - {"idp_first", "idp_seen", "point_seen"}  # a lens is more than colours need
 
 

@@ -97,6 +97,42 @@ def _bearing_range(pose: F64, point: F64, z: F64) -> F64:
     return np.column_stack([_wrap(np.arctan2(u[:, 1], u[:, 0]) - z[:, 0]), np.hypot(*u.T) - z[:, 1]])
 
 
+def _position(pose: F64, z: F64, turned: Callable[[F64, F64], F64]) -> F64:
+    """Of an antenna in the map: t + R l − z."""
+    n = z.shape[1] // 2
+    return pose[:, :n] + turned(pose, z[:, n:]) - z[:, :n]
+
+
+def _turned_in_plane(pose: F64, v: F64) -> F64:
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])
+
+
+def _turned_in_space(pose: F64, v: F64) -> F64:
+    return _turned_back(pose[:, 3:7] * (-1.0, -1.0, -1.0, 1.0), v)
+
+
+def _unit(v: F64) -> F64:
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def _distance(pose: F64, point: F64, z: F64, n: int) -> F64:
+    return np.linalg.norm(point[:, :n] - pose[:, :n], axis=1, keepdims=True) - z
+
+
+def _linear(*ends_and_z: F64) -> F64:
+    """Σ H (x ⊟ y) + b."""
+    *ends, z = ends_and_z
+    size, d = (3, 3) if z.shape[1] in (15, 27) else (7, 6)
+    r = z[:, -d:].copy()
+    for e, x in enumerate(ends):
+        y = z[:, e * size : (e + 1) * size]
+        step = _less_se2(y, x) if d == 3 else _less_se3(y, x)[:, :6] * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
+        first = len(ends) * size + e * d * d
+        r += np.einsum("mij,mj->mi", z[:, first : first + d * d].reshape(-1, d, d), step)
+    return r
+
+
 _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "prior_se2": lambda x, z: _less_se2(z, x),
     "prior_se3": lambda x, z: _less_se3(z, x)[:, :6],
@@ -107,4 +143,16 @@ _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "landmark_se2": lambda a, p, z: _into_plane(a, p) - z,
     "landmark_se3": lambda a, p, z: _into_space(a, p) - z,
     "bearing_range_se2": _bearing_range,
+    "position_se2": lambda x, z: _position(x, z, _turned_in_plane),
+    "position_se3": lambda x, z: _position(x, z, _turned_in_space),
+    "heading_se2": lambda x, z: _wrap(x[:, 2:3] - z),
+    "attitude_se3": lambda x, z: _turned_back(x[:, 3:7], _unit(z[:, 3:])) - _unit(z[:, :3]),
+    "range_se2": lambda a, p, z: _distance(a, p, z, 2),
+    "range_se3": lambda a, p, z: _distance(a, p, z, 3),
+    "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
+    "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
+    "linear_se2": _linear,
+    "linear_se3": _linear,
+    "linear_pair_se2": _linear,
+    "linear_pair_se3": _linear,
 }
