@@ -14,8 +14,8 @@ from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-UNWRITABLE = ("bearing_range_se2", "prior_point2", "idp_first", "idp_seen", "point_seen")
-WRITABLE = [name for name in FACTOR_KINDS if name not in UNWRITABLE]
+WRITABLE = ("prior_se2", "prior_se3", "between_se2", "between_se3", "landmark_se2", "landmark_se3", "prior_point3")
+UNWRITABLE = [name for name in FACTOR_KINDS if name not in WRITABLE]
 WRITABLE_VARIABLES = {name: kind for name, kind in VARIABLE_KINDS.items() if name != "idp"}
 NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
 

@@ -23,7 +23,8 @@ def write_g2o(path_or_file: str | os.PathLike[str] | TextIO, batch: Batch) -> No
 
     An id is the index of the variable's key (x12 → 12) when no two keys share one; otherwise variables are numbered
     in order.  Variables without a value get no vertex line.  Raises FormatError for what g2o has no record for
-    (bearing and range, priors on 2D points, sights, features of inverse depth, losses), before anything is written.
+    (bearings, ranges, positions, headings, attitudes, linear factors, priors on 2D points, sights, features of inverse
+    depth, losses), before anything is written.
     """
     text = g2o_text(batch)
     if isinstance(path_or_file, str | os.PathLike):
