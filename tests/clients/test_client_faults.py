@@ -1,5 +1,6 @@
 """The client against a service that fails in every way the bus allows, over real zenoh on a local socket."""
 
+import queue
 import subprocess
 import sys
 import threading
@@ -337,6 +338,25 @@ def test_names_are_checked(start: Callable[..., Service], endpoint: str) -> None
     start()
     with connect(endpoint) as bus, pytest.raises(BadName, match="map"):
         bus.map("a b")
+
+
+def test_closing_ends_the_wait_of_another_thread(start: Callable[..., Service], endpoint: str) -> None:
+    start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        kitchen.insert(point("l1", 1))
+        ended: queue.Queue[str] = queue.Queue()
+
+        def wait() -> None:
+            try:
+                kitchen.estimate.wait_for(9, timeout_s=50)
+            except Unavailable as gone:
+                ended.put(gone.message)
+
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        bus.close()
+        assert "closed here" in ended.get(timeout=20)
+        waiting.join()
 
 
 def test_two_threads_insert_through_one_handle(start: Callable[..., Service], endpoint: str) -> None:

@@ -42,6 +42,7 @@ class Child:
             threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True),
             threading.Thread(target=self._listen, args=(self._process.stderr,), daemon=True),
         ]
+        self._watchers: list[threading.Thread] = []
         for reader in self._readers:
             reader.start()
 
@@ -82,13 +83,15 @@ class Child:
         return self._process.poll() is not None
 
     def when_ended(self, act: Callable[[], None]) -> None:
-        """Call `act`, on a thread of its own, when it ends."""
+        """Call `act`, on a thread of its own, when it ends; `stop` waits until that is done."""
 
         def watch() -> None:
             self._process.wait()
             act()
 
-        threading.Thread(target=watch, daemon=True).start()
+        watcher = threading.Thread(target=watch, daemon=True)
+        self._watchers.append(watcher)
+        watcher.start()
 
     def died(self) -> Stopped:
         """How it ended, and the last that it said."""
@@ -108,8 +111,9 @@ class Child:
                 break
             except subprocess.TimeoutExpired:
                 continue
-        for reader in self._readers:
-            reader.join(_STOP_S)
+        # A thread still inside zenoh when the interpreter goes takes the process down with it.
+        for thread in (*self._readers, *self._watchers):
+            thread.join(_STOP_S)
         for stream in (self._process.stdout, self._process.stderr):
             if stream is not None:
                 stream.close()

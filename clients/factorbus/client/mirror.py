@@ -123,10 +123,13 @@ class Mirror:
             return Snapshot(self.epoch, self.revision, self._following.columns())
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
-        """Until the values are of `revision` or later and not stale.  Raises Unavailable."""
+        """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        if self._try_wait(lambda: self._there(revision), timeout_s):
+        self._try_wait(lambda: self._there(revision), timeout_s)
+        if self._there(revision):
             return
+        if self._closing:
+            raise Unavailable(f"map {self._map!r}", 0.0, "it was closed here; open it again")
         state = "stale" if self.stale else "up to date"
         hint = (
             f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
@@ -172,13 +175,13 @@ class Mirror:
             self._inbox.put((word, data))
         # Otherwise it is lost, and the next one that fits shows the gap.
 
-    def _try_wait(self, reached: Callable[[], bool], timeout_s: float) -> bool:
+    def _try_wait(self, reached: Callable[[], bool], timeout_s: float) -> None:
+        """Until `reached`, the mirror's end, or the end of time."""
         end = time.monotonic() + timeout_s
         with self._changed:
-            if self._changed.wait_for(reached, min(_IMPATIENT_S, timeout_s)):
-                return True
-            self._inbox.put(("probe", None))
-            return self._changed.wait_for(reached, max(end - time.monotonic(), 0.0))
+            if not self._changed.wait_for(lambda: self._closing or reached(), min(_IMPATIENT_S, timeout_s)):
+                self._inbox.put(("probe", None))
+                self._changed.wait_for(lambda: self._closing or reached(), max(end - time.monotonic(), 0.0))
 
     def _there(self, revision: int) -> bool:
         return self._following.live and self._following.revision >= revision
@@ -229,7 +232,9 @@ class Mirror:
             case "probe" if self._following.live:
                 self._probe()
             case "stop":
-                self._closing = True
+                with self._changed:
+                    self._closing = True
+                    self._changed.notify_all()
 
     def _apply_delta(self, delta: Delta) -> None:
         with self._changed:
