@@ -5,11 +5,11 @@
 Clients are processes of their own.  Each streams one pose and its odometry an insert, with a window; after hundreds or
 thousands it leaves the bus and joins again, and every few seconds one is killed (SIGKILL) and another starts in its
 place.  What was sent and what was answered each client writes into memory that outlives it.  Maps take turns: after
-`--rotate` inserts all clients go to the next, and of the one before everything is counted, and it is dropped: so the
-memory of the service is that of a service, not that of a growing map.
+`--rotate` inserts all clients leave and rest, everything is counted, the map is dropped, and the memory is read: so it
+is that of a service, not that of a map, whatever size the maps came to.
 
 Lost: answered, and not in the map.  Duplicated: more factors than the poses there would have, or more inserts in the
-journal than poses.  Memory: resident, when a map has been dropped, fitted over the second half of the maps: what the
+journal than poses.  Memory: resident, with no map, fitted over the second half of the maps: what the
 allocator keeps takes a while to settle; the fit from the third map on is given beside.
 Goal: nothing lost, nothing duplicated, and the memory grows by less than 32 bytes an insert.
 """
@@ -46,6 +46,7 @@ SIGMAS = (0.1, 0.1, 0.05)
 SENT, ANSWERED, BEGINS = 1, 2, 4
 LETTERS = "abcdefghijklmnop"
 _PATIENCE_S = 120.0
+REST = "-"  # in place of a map: stay away from the bus
 
 
 class Notes:
@@ -67,12 +68,12 @@ class Notes:
 
 
 def drive(endpoint: str, letter: str, folder: Path, size: int, seed: int) -> None:
-    """Reads `map NAME`, streams until the next line; prints `left NAME`."""
+    """Reads the name of a map, streams into it until the next line; prints `left NAME`."""
     chance, ordered = random.Random(seed), _Orders()
     print("ready", flush=True)
     for name in iter(ordered.take, ""):
-        notes = Notes(folder / f"{name}-{letter}", size)
-        while not ordered.waiting() and notes.next() < size:
+        notes = Notes(folder / f"{name}-{letter}", size) if name != REST else None
+        while notes and not ordered.waiting() and notes.next() < size:
             with connect(endpoint, client=letter, timeout_s=_PATIENCE_S) as bus:
                 _live(bus, name, letter, notes, min(chance.randint(*LIVES), size - notes.next()), ordered)
         print("left", name, flush=True)
@@ -144,7 +145,7 @@ class Fleet:
         self._running = {letter: self._bear(letter) for letter in letters}
 
     def go_to(self, name: str) -> None:
-        """All stream into map `name` from now on (empty: they end), and have left the one before."""
+        """All stream into map `name` from now on (REST: none; empty: they end), and have left the one before."""
         before, self._map = self._map, name
         for each in self._running.values():
             each.tell(name)
@@ -219,11 +220,10 @@ def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
             name, number = f"soak-{number}", number + 1
             bus.create(name, timeout_s=_PATIENCE_S)
             fleet.go_to(name)
-            if number > 1:
-                _close(bus, f"soak-{number - 2}", letters, folder, account, pid)
             _churn(bus, name, fleet, options.rotate, began + 60 * options.minutes)
+            fleet.go_to(REST)
+            _close(bus, name, letters, folder, account, pid)
         fleet.go_to("")
-        _close(bus, f"soak-{number - 1}", letters, folder, account, pid)
     took = np.concatenate(account.took_us) / 1e3
     seconds = time.monotonic() - began
     return {
