@@ -9,6 +9,7 @@ from typing import TypeAlias, TypedDict, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factorbus.client.mounted import moved_se2, moved_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -92,9 +93,20 @@ class Draft:
         first: Key,
         second: Key,
         measured: ArrayLike,
+        *,
+        mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> "Draft":
-        """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures."""
+        """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
+
+        mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
+        off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
+        carried over to first order in the error (`factorbus.client.mounted`, MATH §3.7).
+        """
+        if mount is not None:
+            where = self._between(first, second, "between_se2")
+            measured, A = moved_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
+            certainty = _carried(where, FACTOR_KINDS["between_se2"], certainty, A)
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -102,9 +114,18 @@ class Draft:
         first: Key,
         second: Key,
         measured: ArrayLike,
+        *,
+        mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> "Draft":
-        """The second pose in the first one's frame: x y z (metres), qx qy qz qw; residual x y z, then half-angles."""
+        """The second pose in the first one's frame: x y z (metres), qx qy qz qw; residual x y z, then half-angles.
+
+        mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
+        """
+        if mount is not None:
+            where = self._between(first, second, "between_se3")
+            measured, A = moved_se3(where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7))
+            certainty = _carried(where, FACTOR_KINDS["between_se3"], certainty, A)
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -266,6 +287,10 @@ class Draft:
         all_triangles.append(triangle)
         return self
 
+    def _between(self, first: Key, second: Key, kind: str) -> str:
+        """What an error says it is about."""
+        return " ".join([kind, *(format_symbol(_number(key)) for key in (first, second))])
+
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
         return Batch(
@@ -314,6 +339,15 @@ def _loss(where: str, loss: tuple[str, float] | None) -> tuple[str, float]:
     if not (np.isfinite(scale) and scale > 0.0):
         raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
     return name, float(scale)
+
+
+def _carried(where: str, kind: FactorKind, certainty: Certainty, A: _Row) -> Certainty:
+    """The certainty of r' where this is that of r = A r'."""
+    upper = np.triu_indices(kind.dim)
+    W = np.zeros((kind.dim, kind.dim))
+    W[upper] = _triangle(where, kind, certainty.get("sigmas"), certainty.get("information"))
+    W += np.triu(W, 1).T
+    return {"information": (A.T @ W @ A)[upper], "loss": certainty.get("loss")}
 
 
 def _triangle(
