@@ -91,6 +91,7 @@ def vectors() -> dict[str, bytes]:
         "ask_export": codec.encode_map({"format": "g2o"}),
         "ask_export_kitti": codec.encode_map({"format": "kitti"}),
         "admin_create": codec.encode_map({"map": "kitchen", "mode": "auto"}),
+        "admin_fork": codec.encode_map({"map": "kitchen", "as": "what-if", "request": 4711}),
         "event": codec.encode_map({"event": "created", "epoch": 7, "revision": 0}),
         **_about_uncertainty(),
     }

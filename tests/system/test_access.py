@@ -154,6 +154,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     "read the service's account": (lambda me: me.answered("admin/stats"), ("ops",)),
     "create a map": (lambda me: me.answered("admin/create", CREATE), ("ops",)),
     "drop a map": (lambda me: me.answered("admin/drop", codec.encode_map({"map": "none"})), ("ops",)),
+    "fork a map": (lambda me: me.answered("admin/fork", codec.encode_map({"map": "none", "as": "n"})), ("ops",)),
     "any operation": (lambda me: me.answered("admin/**"), ()),
     "have features made": (lambda me: me.answered("features/s1/ask"), ("robot1", "robot2")),
     "give a worker a job": (lambda me: me.answered("worker/w1-a/job"), ()),

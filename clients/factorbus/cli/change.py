@@ -1,6 +1,7 @@
-"""`factorbus change`: take something out of a map on the bus, count it differently, hold it."""
+"""`factorbus change`: take something out of a map on the bus, count it differently, hold it, try it on a fork."""
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any, TypeVar
 
 import click
@@ -23,15 +24,20 @@ def command() -> None:
     factorbus change remove warehouse 17 18 x12
     factorbus change loss warehouse dcs 1.0 21
     factorbus change fix warehouse x0
+    factorbus change fork warehouse what-if
     """
 
 
 def _changing(command: F) -> F:
     """NAME, --connect, --timeout, --settle and --json."""
+    return _asking(click.option("--settle", is_flag=True, help="Iterate until converged afterwards.")(command))
+
+
+def _asking(command: F) -> F:
+    """NAME, --connect, --timeout and --json."""
     for option in (
         json_option,
         zenoh_option,
-        click.option("--settle", is_flag=True, help="Iterate until converged afterwards."),
         click.option("--timeout", "timeout_s", type=float, default=30.0, show_default=True, help="Seconds to wait."),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
@@ -120,6 +126,31 @@ def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
     from factorbus.client import Changes
 
     return _make(name, Changes().free(*keys), **how)
+
+
+@command.command("fork")
+@_asking
+@click.argument("new")
+def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """Make a map NEW that begins as NAME is now, on the same service: to try something out, and to drop it.
+
+    Where the service keeps a journal, the new map is kept as well. Where access control is on, ask as an operator.
+
+    \b
+    factorbus change fork warehouse what-if
+    factorbus change remove what-if 17 --settle
+    factorbus drop what-if
+    """
+    from factorbus.client import connect as open_bus
+
+    with open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus:
+        row = bus.fork(name, new)
+    if as_json:
+        document(asdict(row))
+    else:
+        shown = [("mode", row.mode), ("variables", f"{row.variables}"), ("factors", f"{row.factors}")]
+        table(shown, title=f"{row.name} begins at revision {row.revision} of {name}")
+    return OK
 
 
 def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:

@@ -92,6 +92,10 @@ class Bus:
         """Create map `name`, or find it as it is.  Raises Refused, Unavailable, BadName."""
         return await asyncio.to_thread(self._bus.create, name, mode)
 
+    async def fork(self, name: str, target: str) -> MapRow:
+        """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""
+        return await asyncio.to_thread(self._bus.fork, name, target)
+
     async def drop(self, name: str) -> None:
         """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
         await asyncio.to_thread(self._bus.drop, name)

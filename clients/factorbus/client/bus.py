@@ -1,5 +1,6 @@
 """A connection to the bus, and the maps on it."""
 
+import secrets
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
@@ -114,6 +115,19 @@ class Bus:
     def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
         """Create map `name`, or find it as it is if its mode is the same.  Raises Refused, Unavailable, BadName."""
         return self._admin("create", {"map": keys.checked_name("map", name), "mode": mode}, _row, timeout_s)
+
+    def fork(self, name: str, target: str, timeout_s: float | None = None) -> MapRow:
+        """A new map `target` that begins as map `name` is now: a what-if, which may be tried out and dropped.
+
+        Variables, values, factors, their ids, losses and what is fixed are the same, to the bit; the epoch is another,
+        and neither map knows of the other afterwards.  Raises Refused (map_exists, ...), Unavailable, BadName,
+        UnknownMap.
+        """
+        asked = {"map": keys.checked_name("map", name), "as": keys.checked_name("map", target)}
+        try:
+            return self._admin("fork", asked | {"request": secrets.randbits(62) | 1}, _row, timeout_s)
+        except Refused as refused:
+            raise (UnknownMap(name) if refused.code == UnknownMap.code else refused) from None
 
     def drop(self, name: str, timeout_s: float | None = None, *, revision: int | None = None) -> None:
         """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName.

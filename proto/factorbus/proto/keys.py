@@ -8,7 +8,7 @@
     factorbus/v1/worker/<id>/live/<slots>               liveliness token
     factorbus/v1/features/<service>/ask                 query
     factorbus/v1/features/<service>/live                liveliness token
-    factorbus/v1/admin/{maps,create,drop}               query
+    factorbus/v1/admin/{maps,stats,create,fork,drop}    query
 
 Maps sit below `map/`, so that no map name can collide with `worker` or `admin`.
 """

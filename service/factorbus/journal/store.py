@@ -164,16 +164,28 @@ class Store:
         """Somebody is at work with it from now on, in a new epoch if there is one.  Raises JournalFailed."""
         with self._writing():
             if epoch is not None:
-                self._db.execute(
-                    "INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)",
-                    (epoch.epoch, epoch.fold, epoch.because),
-                )
+                self._add_epoch(epoch)
             self._set({"clean": "0", "durability": durability})
 
     def end(self) -> None:
         """It is left in order: nothing that was answered is missing.  Raises JournalFailed."""
         with self._writing():
             self._set({"clean": "1"})
+
+    def become(self, name: str, fold: int, epoch: Epoch, saved: Saved | None) -> None:
+        """A copy of another map's is the journal of map `name`: with nothing after `fold`, in an epoch of its own.
+
+        saved: the one snapshot that it has.  Raises JournalFailed.
+        """
+        with self._writing():
+            self._db.execute("DELETE FROM entry WHERE fold > ?", (fold,))
+            self._db.execute("DELETE FROM fold WHERE number > ?", (fold,))
+            self._db.execute("DELETE FROM epoch WHERE fold > ?", (epoch.fold,))
+            self._add_epoch(epoch)
+            self._db.execute("DELETE FROM snapshot")
+            if saved is not None:
+                self._db.execute("INSERT INTO snapshot VALUES (?, ?, ?)", saved)
+            self._set({"map": name, "clean": "1"})
 
     def probe(self) -> None:
         """Can something be written again, and some room be had?  Raises JournalFailed."""
@@ -237,6 +249,11 @@ class Store:
 
     def _set(self, values: dict[str, str]) -> None:
         self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
+
+    def _add_epoch(self, epoch: Epoch) -> None:
+        self._db.execute(
+            "INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.fold, epoch.because)
+        )
 
     def _checked(self, entry: Entry) -> Entry:
         if digest_of(entry) != entry.digest:

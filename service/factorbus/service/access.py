@@ -4,7 +4,7 @@
     front end    insert under its own name into its maps, ask and follow them, be seen; have features made
     viewer       ask and follow its maps
     worker       take jobs under its own name
-    operator     all that a viewer may, the set of maps (list, create, drop, stats), and insert under its own name
+    operator     all that a viewer may, the set of maps (list, create, fork, drop, stats), and insert under its own name
     service      keep its maps: needed where services meet clients at a router
     router       everything: another router of the same fabric
 

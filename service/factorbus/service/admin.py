@@ -1,5 +1,7 @@
 """Questions about the set of maps, read and judged: which name, which mode, is it ours."""
 
+from typing import NamedTuple
+
 from factorbus.proto import codec
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -32,6 +34,28 @@ class MovedOn(Problem):
         )
 
 
+class MapExists(Problem):
+    """What is to be a new map has the name of one that is there."""
+
+    code = "map_exists"
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"there is a map {name!r} already; drop it, or give the new one another name", map=name)
+
+
+class KeptElsewhere(Problem):
+    """A fork would have a name that its service does not keep."""
+
+    code = "kept_elsewhere"
+
+    def __init__(self, name: str, pattern: str) -> None:
+        super().__init__(
+            f"a fork stays on the service of its original, which keeps maps named {pattern}; {name!r} is not one of "
+            "them: give it such a name, or export and import the map",
+            maps=pattern,
+        )
+
+
 class NotHere(Problem):
     """This service does not keep maps of that name."""
 
@@ -39,6 +63,14 @@ class NotHere(Problem):
 
     def __init__(self, name: str, pattern: str) -> None:
         super().__init__(f"this service keeps maps named {pattern}; {name!r} is not one of them", maps=pattern)
+
+
+class Fork(NamedTuple):
+    """Map `target` is to begin as map `source` is.  request: who asks again with the same one means the same fork."""
+
+    source: str
+    target: str
+    request: int = 0
 
 
 def read_create(payload: bytes) -> tuple[str, str]:
@@ -61,6 +93,15 @@ def read_drop(payload: bytes) -> tuple[str, int | None]:
     return _map_name(content, "drop"), revision
 
 
+def read_fork(payload: bytes) -> Fork:
+    """What an admin/fork asks for.  Raises BadMessage, BadName, TooLarge."""
+    content = codec.decode_map(payload, REQUEST_LIMITS, what="fork")
+    request = content.get("request", 0)
+    if type(request) is not int or request < 0:
+        raise BadMessage("fork.request", f"is {request!r:.40}", "an int, from 0")
+    return Fork(_map_name(content, "fork"), _map_name(content, "fork", "as"), request)
+
+
 def settled_mode(mode: str) -> str:
     """What a map asked for in `mode` runs as."""
     return mode_named(mode).name
@@ -71,8 +112,8 @@ def ours(pattern: str, name: str) -> bool:
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
 
 
-def _map_name(content: dict, where: str) -> str:
-    name = content.get("map")
+def _map_name(content: dict, where: str, field: str = "map") -> str:
+    name = content.get(field)
     if type(name) is not str:
-        raise BadMessage(f"{where}.map", "missing" if name is None else f"is {name!r:.40}", "the name of a map")
+        raise BadMessage(f"{where}.{field}", "missing" if name is None else f"is {name!r:.40}", "the name of a map")
     return checked_name("map", name)

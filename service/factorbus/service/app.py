@@ -22,7 +22,7 @@ from typing import Any
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Busy, Internal, Problem
 from factorbus.proto.version import __version__
-from factorbus.service.admin import NotHere, read_create, read_drop
+from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.arrival import read_insert
 from factorbus.service.bus import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
 from factorbus.service.config import BadConfig, Config, checked
@@ -114,7 +114,7 @@ class Shell:
         self._decoding = config.limits.message()
         self._senders: dict[str, tuple[str, str]] = {}  # keys of inserts taken apart before
         self._desk = Lane("desk")
-        self._delivery = Delivery(self._about, self._find_optimum)
+        self._delivery = Delivery(self._about, self._find_optimum, self._fork)
         lanes = {"outbox": self._delivery.outbox, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
@@ -244,6 +244,9 @@ class Shell:
     def _find_optimum(self, asker: Asker, question: Question, taken: Snapshot) -> None:
         self._desk.hand(self._optima.batch, asker, question, taken)
 
+    def _fork(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+        self._desk.hand(self.maps.forked, asker, question, taken)
+
     def _no_map(self, query: Asker, name: str) -> None:
         if problem := self.maps.missing(name):
             refuse(query, problem)
@@ -264,6 +267,8 @@ class Shell:
                 self._delivery.answer(query, codec.encode_map(self.vitals.account()))
             elif operation == "create":
                 self._delivery.answer(query, codec.encode_map(self.maps.create(*read_create(payload))))
+            elif operation == "fork":
+                self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
                 self.maps.drop(query, *read_drop(payload))
             else:

@@ -111,17 +111,23 @@ class MapCore:
 
     def ask(self, asked: Asked, now: float) -> list[Effect]:
         """A question came in."""
-        if self._closing is not None:
-            return [Refuse(asked.asker, self._closing)]
         try:
+            if self._closing is not None:
+                raise self._closing
             question = parse(asked.question, asked.payload)
         except Problem as problem:
             return [Refuse(asked.asker, problem)]
         if question.name == "stats":
             return [Tell(asked.asker, self.stats(now))]
+        return self.read(Read(question, asked.asker), now)
+
+    def read(self, read: Read, now: float) -> list[Effect]:
+        """A question that needs the solver's state."""
+        if self._closing is not None:
+            return [Refuse(read.asker, self._closing)]
         if len(self._reads) >= self._limits.questions:
-            return [Refuse(asked.asker, Busy(len(self._reads), 0.1))]
-        self._reads.append(Read(question, asked.asker))
+            return [Refuse(read.asker, Busy(len(self._reads), 0.1))]
+        self._reads.append(read)
         return self._go_on([], now)
 
     def judged(self, judged: Judged) -> list[Effect]:

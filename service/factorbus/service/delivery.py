@@ -29,11 +29,17 @@ class Delivery:
     """The outbox, the answering lanes, and what goes on which.
 
     about: what this service adds to the stats of a map.  batch: finds batch optima; (asker, question, snapshot).
+    copied: the same with a copy of a map, which is to be another one.
     """
 
-    def __init__(self, about: Callable[[], dict[str, Any]], batch: Callable[[Asker, Question, Snapshot], None]) -> None:
+    def __init__(
+        self,
+        about: Callable[[], dict[str, Any]],
+        batch: Callable[[Asker, Question, Snapshot], None],
+        copied: Callable[[Asker, Question, Snapshot], None],
+    ) -> None:
         self.outbox, self._answers = Lane("outbox"), Lanes("answers", _ANSWERERS)
-        self._about, self._batch = about, batch
+        self._about, self._batch, self._copied = about, batch, copied
 
     def of_map(self, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
         """For a map at `place`; `tell` adds to its stats, `drained` hears that nothing waits any more."""
@@ -71,6 +77,8 @@ class Delivery:
             if read.question.name == "keyframe":
                 # Behind the delta of the same revision: a mirror that had the keyframe first would skip the delta.
                 self.outbox.hand(place.publish, "keyframe", answer(read.question, taken))
+            elif read.question.name == "copy":
+                self._copied(read.asker, read.question, taken)
             elif read.question.batch:
                 self._batch(read.asker, read.question, taken)
             else:

@@ -30,12 +30,14 @@ from factorbus.service.config import Limits
 from factorbus.service.events import Alone, Folded, Judged, Located, Outcome, Stepped, Waiting
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
-from factorbus.service.questions import Question, Snapshot, snapshot
+from factorbus.service.questions import Copied, Question, Snapshot, snapshot
 from factorbus.service.uncertain import Uncertain
 from factorbus.solver.errors import SolverError
 
 # The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
 _ALONE_BYTES = 48 << 10
+# Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself.
+_COPIES = 3
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +91,8 @@ class Folder:
             raise Broken(self._broken)
         taken = snapshot(self._solver, self._epoch, self._revision, questions, self._account, self._uncertain)
         self._uncertain = taken.uncertain
-        return taken
+        rooms = [question.ask.room for question in questions if question.name == "copy"]
+        return replace(taken, copied=self._copied(min(rooms))) if rooms else taken
 
     def options(self) -> dict[str, Any]:
         """The settings of its solver."""
@@ -118,6 +121,11 @@ class Folder:
         if self._broken:
             raise Broken(self._broken)
         return {"solver": self._solver.dump(), "revision": self._revision, "held": list(self._held)}
+
+    def _copied(self, room: int) -> Copied:
+        """All of it, if another folder and what lies between them fit into so many bytes."""
+        size = _COPIES * self._solver.memory_bytes()
+        return Copied(self.dump() if size <= room else None, size)
 
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the folder was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""

@@ -16,6 +16,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 from factorbus.journal.problems import JournalFailed
@@ -103,6 +104,12 @@ class Host:
         """A question came in."""
         with self._lock:
             effects = self.core.ask(asked, time.monotonic())
+        self._perform(effects)
+
+    def read(self, read: Read) -> None:
+        """A question of the service itself came in."""
+        with self._lock:
+            effects = self.core.read(read, time.monotonic())
         self._perform(effects)
 
     def tick(self) -> None:
@@ -275,11 +282,14 @@ class Host:
             self._answer_after(reads, taken)
 
     def _answer_after(self, reads: Sequence[Read], taken: Snapshot) -> None:
-        """Nobody sees what a crash could take back."""
-        if self._keeper is None:
+        """Nobody sees what a crash could take back, and a copy goes on from what is in the journal."""
+        keeper = self._keeper
+        if keeper is None:
             self._answer(reads, taken)
-        else:
-            self._keeper.after(lambda: self._answer(reads, taken), lambda problem: self._refuse(reads, problem))
+            return
+        noted = replace(taken, fold=keeper.folds)
+        wait = keeper.after if taken.copied is None else keeper.when_written
+        wait(lambda: self._answer(reads, noted), lambda problem: self._refuse(reads, problem))
 
     def _refuse(self, reads: Sequence[Read], problem: Exception) -> None:
         self._do([Refuse(read.asker, problem) for read in reads if read.asker is not None])

@@ -108,7 +108,7 @@ class Keeping(Protocol):
 
 
 class Keeper:
-    """One map's journal.  `hand`, `after`, `reloaded`, `wants_snapshot` and `snapshot`: on the solver's thread only."""
+    """One map's journal.  `hand` to `snapshot`: on the solver's thread only."""
 
     def __init__(
         self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot_s: float,
@@ -153,6 +153,15 @@ class Keeper:
             self._items.put(_After(call, dropped))
         else:
             call()
+
+    def when_written(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
+        """Do `call` when all that was handed in so far is in the journal; `dropped` if it never will be."""
+        self._items.put(_After(call, dropped))
+
+    @property
+    def folds(self) -> int:
+        """How many were handed in, with those that the journal began with."""
+        return self._number
 
     def reloaded(self, last: Last) -> None:
         """The solver is where the journal ends."""

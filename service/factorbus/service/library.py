@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from factorbus.journal.folders import GONE, left_behind, maps_in, sync_folder
+from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalFailed
 from factorbus.journal.records import Epoch, Header
@@ -32,6 +33,11 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
     chosen = {name: value for name, value in options.items() if name in known}
     settings = Options(**{**chosen, "mode": mode, "clock": time.perf_counter})
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
+
+
+def restored(folder: Folder) -> Restored:
+    """How the map in `folder` is."""
+    return Restored(folder.revision, *folder.size, folder.chi2() if folder.revision else 0.0)
 
 
 def log_owner(owner: str) -> None:
@@ -79,6 +85,24 @@ class Library:
             store.close()
             raise
 
+    def fork(self, source: str, target: str, fold: int, state: Mapping[str, Any], limits: Limits) -> "Kept":
+        """A new map `target` with a journal, which is in `state` as `source` was after `fold`.  Raises Problem."""
+        from factorbus.solver import fingerprint
+
+        where, config, because = self._owned.folder, self._config, f"forked from {source} after fold {fold}"
+        epoch = Epoch(secrets.randbits(62) | 1, fold + 1, because)
+        fork_journal(where / source, where / target, fold, epoch, state, fingerprint())
+        store = open_store(where / target, config.durability)
+        try:
+            header = store.header()
+            folder = make_folder(header.mode, header.options, header.epoch, limits)
+            folder.load(state)
+            return Kept(store, header, folder, Recovered(store.last(), True, fold, 0), config)
+        except BaseException:
+            store.close()
+            self.remove(target)
+            raise
+
     def remove(self, name: str) -> None:
         """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises JournalFailed."""
         path = self._owned.folder / name
@@ -118,7 +142,7 @@ class Kept:
         senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
         core.restore(
             [(sender.client, sender.next, answers(sender, epoch.epoch)) for sender in senders],
-            Restored(self.folder.revision, *self.folder.size, self.folder.chi2() if self.folder.revision else 0.0),
+            restored(self.folder),
         )
 
     def keeper(self, listener: Listener) -> Keeper:

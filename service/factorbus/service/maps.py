@@ -8,31 +8,42 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from factorbus.journal.problems import JournalFailed
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, ShuttingDown, TooLarge, UnknownMap
-from factorbus.service.admin import NotHere, OtherMode, ours, settled_mode
+from factorbus.service.admin import Fork, KeptElsewhere, MapExists, NotHere, OtherMode, ours, settled_mode
 from factorbus.service.bus import Bus, Place
 from factorbus.service.config import Config
 from factorbus.service.core import MapCore
 from factorbus.service.delivery import Delivery
-from factorbus.service.events import Asker
+from factorbus.service.events import Asker, Read
 from factorbus.service.fold import Folder
 from factorbus.service.host import Host
 from factorbus.service.lane import Lane
-from factorbus.service.library import Kept, Library, make_folder
-from factorbus.service.memory import Memory, give_back
+from factorbus.service.library import Kept, Library, make_folder, restored
+from factorbus.service.memory import Memory, OutOfMemory, give_back
+from factorbus.service.questions import Copied, Question, Snapshot
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Forking:
+    """A fork on its way.  epoch: of the original, which must still be there; room: bytes that it may take."""
+
+    fork: Fork
+    epoch: int
+    room: int
 
 
 class Owned:
     """A map, its place on the bus, and the end of it."""
 
-    def __init__(self, host: Host, place: Place) -> None:
-        self.host, self.place = host, place
+    def __init__(self, host: Host, place: Place, options: dict[str, Any]) -> None:
+        self.host, self.place, self.options = host, place, options
         self.drained = threading.Event()
         self.on_drained: Callable[[], None] = self.drained.set
 
@@ -49,6 +60,7 @@ class Maps:
         self._maps: dict[str, Owned] = {}
         self._leaving: list[Owned] = []
         self._unopened: dict[str, Problem] = {}  # that are on disk and cannot be trusted
+        self._forks: dict[str, Fork] = {}  # what maps were forked from, since this service began
         self._stopping = False
         self._seat = threading.Lock()  # of the one callback that may solve
 
@@ -90,21 +102,36 @@ class Maps:
             return found.host.core.row()
         if not ours(self._config.maps, keys.checked_name("map", name)):
             raise NotHere(name, self._config.maps)
-        if self._stopping:
-            raise ShuttingDown
-        if len(self._maps) >= self._config.limits.maps:
-            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
-        if (full := self._memory.no_room(0)) is not None:
-            raise full
-        made = self._make(name, settled_mode(mode or "auto"))
-        self._maps[name] = made
-        made.place.announce()
-        made.host.created()
-        core = made.host.core
-        log.info(
-            "map %s, mode %s, epoch %d, revision %d", name, core.mode, core.epoch, core.revision, extra={"map": name}
-        )
-        return core.row()
+        self._check_room()
+        return self._open(name, self._make(name, settled_mode(mode or "auto")))
+
+    def fork(self, asker: Asker, fork: Fork) -> None:
+        """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
+        found = self._maps.get(fork.source)
+        if found is None and not ours(self._config.maps, fork.source):
+            raise NotHere(fork.source, self._config.maps)
+        if found is None:
+            raise self._unopened.get(fork.source) or UnknownMap(fork.source)
+        if self._answered_again(asker, fork):
+            return
+        self._check_new(fork.target)
+        asked = _Forking(fork, found.host.core.epoch, self._memory.room())
+        found.host.read(Read(Question("copy", ask=asked), asker))
+
+    def forked(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+        """The original is copied: make the other map of it."""
+        asked: _Forking = question.ask
+        try:
+            if self._answered_again(asker, asked.fork):
+                return
+            self._check_new(asked.fork.target)
+            row = self._open(asked.fork.target, self._split(asked, taken))
+        except Problem as problem:
+            self._delivery.refuse(asker, problem)
+            return
+        self._forks[asked.fork.target] = asked.fork
+        self._delivery.answer(asker, codec.encode_map(row))
+        self._desk.hand(give_back)
 
     def drop(self, asker: Asker, name: str, revision: int | None) -> None:
         """Drop map `name`, if it is at `revision`, and answer when it is gone.  Raises MovedOn; what is `missing`."""
@@ -123,6 +150,7 @@ class Maps:
             found.on_drained = before
             raise
         del self._maps[name]
+        self._forks.pop(name, None)
         self._leaving.append(found)
         found.place.withdraw()
 
@@ -153,7 +181,10 @@ class Maps:
 
     def _make(self, name: str, mode: str | None) -> Owned:
         """mode: None for that of the map which is there.  Raises Problem."""
-        core, folder, kept = self._begin(name, mode)
+        return self._at_work(*self._begin(name, mode))
+
+    def _at_work(self, core: MapCore, folder: Folder, kept: Kept | None) -> Owned:
+        name = core.name
         place, options = self._bus.place(name, self._service), folder.options()
 
         def more() -> dict[str, Any]:
@@ -161,7 +192,7 @@ class Maps:
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
         host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept)
-        made = Owned(host, place)
+        made = Owned(host, place, options)
         return made
 
     def _begin(self, name: str, mode: str | None) -> tuple[MapCore, Folder, Kept | None]:
@@ -181,6 +212,63 @@ class Maps:
         core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now)
         kept.restore(core)
         return core, kept.folder, kept
+
+    def _open(self, name: str, made: Owned) -> dict[str, Any]:
+        """A map is made: let others see it.  Its row."""
+        self._maps[name] = made
+        made.place.announce()
+        made.host.created()
+        core = made.host.core
+        log.info(
+            "map %s, mode %s, epoch %d, revision %d", name, core.mode, core.epoch, core.revision, extra={"map": name}
+        )
+        return core.row()
+
+    def _check_room(self) -> None:
+        """Raises ShuttingDown, TooLarge, OutOfMemory where no map can be added."""
+        if self._stopping:
+            raise ShuttingDown
+        if len(self._maps) >= self._config.limits.maps:
+            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
+        if (full := self._memory.no_room(0)) is not None:
+            raise full
+
+    def _check_new(self, name: str) -> None:
+        """The same, and KeptElsewhere, MapExists where none of this name can."""
+        if not ours(self._config.maps, name):
+            raise KeptElsewhere(name, self._config.maps)
+        if name in self._maps or name in self._unopened or any(name == gone.host.core.name for gone in self._leaving):
+            raise MapExists(name)
+        if self._library is not None and self._library.has(name):
+            raise MapExists(name)
+        self._check_room()
+
+    def _answered_again(self, asker: Asker, fork: Fork) -> bool:
+        """Whether this very fork has been made: whoever asks again is answered again."""
+        done = bool(fork.request) and self._forks.get(fork.target) == fork
+        if done:
+            self._delivery.answer(asker, codec.encode_map(self._maps[fork.target].host.core.row()))
+        return done
+
+    def _split(self, asked: _Forking, taken: Snapshot) -> Owned:
+        """A map of its own from the copy `taken`.  Raises Problem."""
+        fork, copied, found = asked.fork, taken.copied or Copied(None, 0), self._maps.get(asked.fork.source)
+        if copied.state is None:
+            raise OutOfMemory(self._memory.resident, self._memory.limit, copied.bytes)
+        if found is None or found.host.core.epoch != asked.epoch:
+            raise UnknownMap(fork.source)
+        limits, was, now = self._config.limits, found.host.core, time.monotonic()
+        kept = None
+        if self._library is not None:
+            kept = self._library.fork(fork.source, fork.target, taken.fold, copied.state, limits)
+            epoch, folder = kept.header.epoch, kept.folder
+        else:
+            epoch = secrets.randbits(62) | 1
+            folder = make_folder(was.mode, found.options, epoch, limits)
+            folder.load(copied.state)
+        core = MapCore(fork.target, was.mode, epoch, limits, now)
+        core.restore((), restored(folder))
+        return self._at_work(core, folder, kept)
 
     def _dropped(self, asker: Asker, found: Owned) -> None:
         name = found.host.core.name

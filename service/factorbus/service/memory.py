@@ -24,11 +24,13 @@ class OutOfMemory(Problem):
 
     code = "out_of_memory"
 
-    def __init__(self, resident: int, limit: int) -> None:
+    def __init__(self, resident: int, limit: int, more: int = 0) -> None:
+        """more: what is known to be needed."""
+        needed = f", {more >> 20} MiB more are needed" if more else ""
         super().__init__(
-            f"the service has {resident >> 20} MiB of memory and its limit is {limit >> 20} MiB, so maps cannot grow; "
-            "drop or move a map, or give it more with limits.memory_bytes",
-            size=resident,
+            f"the service has {resident >> 20} MiB of memory{needed} and its limit is {limit >> 20} MiB, "
+            "so maps cannot grow; drop or move a map, or give it more with limits.memory_bytes",
+            size=resident + more,
             limit=limit,
         )
 
@@ -56,6 +58,11 @@ class Memory:
         if self.resident + _GROWTH * size <= self.limit:
             return None
         return OutOfMemory(self.resident, self.limit)
+
+    def room(self) -> int:
+        """Bytes that there are before the limit."""
+        self.look()
+        return max(self.limit - self.resident, 0)
 
     def close(self) -> None:
         """No more measuring."""

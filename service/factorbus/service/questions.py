@@ -30,7 +30,7 @@ _FORMATS = ("g2o", "tum", "kitti")
 @dataclass(frozen=True, slots=True)
 class Question:
     """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export.
-    ask: of one about uncertainty, all of it.
+    ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
     """
 
     name: str
@@ -42,11 +42,19 @@ class Question:
 
 
 @dataclass(frozen=True, slots=True)
+class Copied:
+    """A folder's whole state, from which another one can go on.  state: None if it did not fit into the room."""
+
+    state: Mapping[str, Any] | None
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Snapshot:
     """Copies of what some questions need, all of one revision.
 
     uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
-    solver's copy of everything.
+    solver's copy of everything.  copied: the folder's, and after which fold of the journal that was.
     """
 
     epoch: int
@@ -57,6 +65,8 @@ class Snapshot:
     uncertain: Uncertain | None = None
     ready: Mapping[int, bytes | Exception] = field(default_factory=dict)
     content: Any = None
+    copied: Copied | None = None
+    fold: int = 0
 
     @property
     def graph(self) -> Graph:

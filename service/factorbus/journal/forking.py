@@ -1,0 +1,67 @@
+"""The journal of a map that begins as another one was: all that led there, the state there, and an epoch of its own."""
+
+import logging
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from factorbus.journal.folders import UNFINISHED, sync_folder
+from factorbus.journal.problems import JournalFailed
+from factorbus.journal.records import Epoch
+from factorbus.journal.snapshots import file_of, write_snapshot
+from factorbus.journal.store import NAME, Saved, open_store
+
+log = logging.getLogger(__name__)
+
+
+def fork_journal(
+    source: Path, target: Path, fold: int, epoch: Epoch, state: Mapping[str, Any], fingerprint: str
+) -> None:
+    """The journal in `source`, which may be at work, up to `fold` into `target`, which must not be there yet.
+
+    state: of the solver with this fingerprint after that fold, so that a restart is quick; the inserts are there too,
+    as a snapshot counts only for the solver that wrote it.  All of it or nothing.
+    Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, JournalFailed.
+    """
+    beside = target.with_name(f"{UNFINISHED}{target.name}")
+    shutil.rmtree(beside, ignore_errors=True)
+    try:
+        beside.mkdir(parents=True)
+        _copy(source, beside)
+        _begin(beside, target.name, fold, epoch, _saved(beside, fold, state, fingerprint))
+        sync_folder(beside)
+        beside.rename(target)
+        sync_folder(target.parent)
+    except OSError as error:
+        raise JournalFailed(target / NAME, str(error)) from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def _copy(source: Path, beside: Path) -> None:
+    store = open_store(source, read_only=True)
+    try:
+        store.copy_to(beside / NAME)
+    finally:
+        store.close()
+
+
+def _saved(beside: Path, fold: int, state: Mapping[str, Any], fingerprint: str) -> Saved | None:
+    """The snapshot, if there is room for it: without one a restart takes longer."""
+    if not fold:
+        return None
+    path = file_of(beside, fold)
+    try:
+        return Saved(fold, fingerprint, write_snapshot(path, state))
+    except OSError as error:
+        log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
+        return None
+
+
+def _begin(beside: Path, name: str, fold: int, epoch: Epoch, saved: Saved | None) -> None:
+    store = open_store(beside)
+    try:
+        store.become(name, fold, epoch, saved)
+    finally:
+        store.close()
