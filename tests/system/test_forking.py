@@ -164,6 +164,12 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
             with bus.map("what-if-2", create=False) as second:
                 assert everything(second) == everything(fork)
                 assert again.revision == before[0] + 1
+        (journal / "taken").mkdir()
+        (journal / "taken" / "something").touch()
+        with pytest.raises(Refused) as refused:
+            bus.fork("hall", "taken")
+        assert refused.value.code == "journal_failed"
+        assert not list(journal.glob(".making-*"))
         bus.drop("what-if")
         with bus.map("hall", create=False) as hall:
             assert len(rows(hall.ask_estimate().variables)) <= len(batches)
