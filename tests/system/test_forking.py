@@ -168,7 +168,7 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
         (journal / "taken" / "something").touch()
         with pytest.raises(Refused) as refused:
             bus.fork("hall", "taken")
-        assert refused.value.code == "journal_failed"
+        assert refused.value.code == "map_exists"
         assert not list(journal.glob(".making-*"))
         bus.drop("what-if")
         with bus.map("hall", create=False) as hall:

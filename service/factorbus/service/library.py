@@ -61,6 +61,10 @@ class Library:
         """Whether there is a map of this name."""
         return (self._owned.folder / name / NAME).is_file()
 
+    def is_taken(self, name: str) -> bool:
+        """Whether a new map cannot have this name: there is one, or a folder that is something else."""
+        return (self._owned.folder / name).exists()
+
     def mode(self, name: str) -> str:
         """The mode that map `name` was made in.  Raises JournalDamaged, JournalVersion."""
         store = open_store(self._owned.folder / name, read_only=True)

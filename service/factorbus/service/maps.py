@@ -239,7 +239,7 @@ class Maps:
             raise KeptElsewhere(name, self._config.maps)
         if name in self._maps or name in self._unopened or any(name == gone.host.core.name for gone in self._leaving):
             raise MapExists(name)
-        if self._library is not None and self._library.has(name):
+        if self._library is not None and self._library.is_taken(name):
             raise MapExists(name)
         self._check_room()
 
