@@ -1,4 +1,4 @@
-"""`factorbus change`: take something out of a map on the bus, count it differently, hold it, try it on a fork."""
+"""`factorbus change`: take something out of a map on the bus, count it differently, hold it; fork and merge maps."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import OK
+from factorbus.cli.merging import merge_command
 from factorbus.cli.options import DEFAULT_ENDPOINT, json_option, zenoh_option
 from factorbus.cli.screen import document, table
 
@@ -25,6 +26,7 @@ def command() -> None:
     factorbus change loss warehouse dcs 1.0 21
     factorbus change fix warehouse x0
     factorbus change fork warehouse what-if
+    factorbus change merge warehouse robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05
     """
 
 
@@ -151,6 +153,9 @@ def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float
         shown = [("mode", row.mode), ("variables", f"{row.variables}"), ("factors", f"{row.factors}")]
         table(shown, title=f"{row.name} begins at revision {row.revision} of {name}")
     return OK
+
+
+command.command("merge")(_changing(merge_command))
 
 
 def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:

@@ -22,7 +22,7 @@ COMMANDS = {
     "top": ("top", "Maps, clients and workers of a service, in the terminal."),
     "record": ("record", "Record a map into an MCAP file, which Foxglove opens."),
     "ask": ("ask", "How certain a map is, what it thinks of a measurement, and why."),
-    "change": ("change", "Take something out of a map, count it differently, hold it, fork it."),
+    "change": ("change", "Take something out of a map, count it differently, hold it; fork, merge."),
     "plot": ("plot", "Pictures: a map, a drive, the sparsity of its system, where things may be."),
     "convert": ("convert", "Turn one file format into another."),
     "datasets": ("datasets", "The public data sets: what there is, where it is, and fetching it."),

@@ -13,24 +13,30 @@ from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
 from factorbus.client.grown import Factored, Grown
 from factorbus.client.map import Map, MapRow
+from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror, Snapshot
 from factorbus.client.ticket import NoAnswerYet, Ticket
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import Problem, Refused, Unavailable
 
 __all__ = [
+    "AbsoluteFactors",
     "BadCamera",
     "Bus",
     "Camera",
+    "CannotMerge",
     "Changes",
     "Draft",
     "Factored",
     "Features",
     "Growing",
     "Grown",
+    "KeyCollision",
     "Map",
     "MapRow",
+    "Merged",
     "Mirror",
+    "NoAnchor",
     "NoAnswerYet",
     "Problem",
     "Refused",

@@ -25,6 +25,7 @@ from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
+from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.stream import DeltaStream
 from factorbus.client.ticket import NoAnswerYet, Ticket
@@ -161,6 +162,26 @@ class Map:
     async def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
         """Change what the map has: remove, weigh, fix, ...  Raises Refused, NoAnswerYet."""
         return await self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+
+    async def merge(
+        self,
+        other: "Graph | Map",
+        *,
+        anchors: Batch | Draft | None = None,
+        frame: ArrayLike | None = None,
+        sigmas: ArrayLike | None = None,
+        letters: Mapping[str, str] | None = None,
+        absolute: str = "refuse",
+        settle: bool = False,
+        timeout_s: float | None = None,
+    ) -> Merged:
+        """Take all of the map `other` into this one, as `factorbus.client.Map.merge`."""
+        graph = other if isinstance(other, Graph) else await other.graph(timeout_s)
+        fitted = fit_into(
+            await self.ask_estimate(timeout_s=timeout_s), graph,
+            anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute,
+        )  # fmt: skip
+        return Merged(await self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
 
     async def send(
         self,

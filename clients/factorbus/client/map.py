@@ -3,15 +3,18 @@
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
+
+from numpy.typing import ArrayLike
 
 from factorbus.client.changes import Changes
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft, Key
 from factorbus.client.link import Link
+from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions
 from factorbus.client.ticket import Ticket
@@ -118,6 +121,38 @@ class Map:
     def change(self, changes: Changes, *, settle: bool = False, timeout_s: float | None = None) -> Accepted:
         """Change what the map has: remove, weigh, fix, ...  Raises Refused (the map is as it was), Unavailable."""
         return self.insert(Batch(), changes=changes, settle=settle, timeout_s=timeout_s)
+
+    def merge(
+        self,
+        other: "Graph | Map",
+        *,
+        anchors: Batch | Draft | None = None,
+        frame: ArrayLike | None = None,
+        sigmas: ArrayLike | None = None,
+        letters: Mapping[str, str] | None = None,
+        absolute: str = "refuse",
+        settle: bool = False,
+        timeout_s: float | None = None,
+    ) -> Merged:
+        """Take all of the map `other` into this one, as one insert: all of it or nothing.
+
+        other: a whole graph (`graph()` of a map on any service), or a map.  letters: of its keys, old to new.
+        anchors: factors between variables of both, the other's under their new keys; among them a relative pose between
+        a pose of each, by which values are brought into this map's frame (of several, the one that the others agree
+        with best).  frame: where the other map's origin is in this one, x y θ or x y z qx qy qz qw, instead; where
+        there are no anchors, a relative pose that says it is added between the poses that hold the maps, with `sigmas`.
+
+        absolute: what the other knows of its own frame beyond one fixed pose or one prior of a pose, which are left
+        out.  "refuse" if there is more (AbsoluteFactors); "leave_out" all of it, fixed variables are estimated; "keep"
+        it, if both maps have one frame: nothing is transformed then, and anchors are not needed.
+
+        Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, TooLarge: nothing was sent.  Raises
+        Refused (the map is as it was), Unavailable.
+        """
+        graph = other if isinstance(other, Graph) else other.graph(timeout_s)
+        here = self.ask_estimate(timeout_s=timeout_s)
+        fitted = fit_into(here, graph, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
+        return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
 
     def send(
         self,

@@ -1,0 +1,226 @@
+"""Merging maps, short of the bus: what is moved measures the same in another frame, what would be wrong is refused."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive.dense_factors import pose_matrix, pose_vector, residual
+from naive.dense_least_squares import full
+from naive.random_graphs import random_information, random_value
+from naive.random_others import random_other
+from naive.random_sights import random_sight
+
+from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
+from factorbus.client.frames import compose, difference, inverse, is_relative, moved_factors, moved_values, says_nothing
+from factorbus.client.merging import fit_into
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Estimate, Factors, Graph, Variables
+from factorbus.proto.problems import BadSymbol
+from factorbus.proto.symbols import parse_symbol
+from factorbus.solver import Options, Solver
+
+seeds = st.integers(0, 2**32 - 1)
+ABSOLUTE = ("prior", "position", "heading", "attitude")
+RELATIVE = [n for n in FACTOR_KINDS if not n.startswith(ABSOLUTE) and n not in ("linear_se2", "linear_se3")]
+SIGMAS = (0.1, 0.1, 0.05)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("kind", ["se2", "se3"])
+def test_composition_is_that_of_matrices(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_value(kind, rng), random_value(kind, rng)
+    A, B = pose_matrix(a), pose_matrix(b)
+    np.testing.assert_allclose(pose_matrix(compose(a, b[None])[0]), A @ B, atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(inverse(a)), np.linalg.inv(A), atol=1e-12)
+    np.testing.assert_allclose(difference(a, b), residual(f"prior_{kind}", [b], a), atol=1e-12)
+
+
+def random_relative(kind: str, rng: np.random.Generator) -> Any:
+    """Values of what a factor of this kind is on, and what is measured."""
+    if kind in ("idp_first", "idp_seen", "point_seen"):
+        return random_sight(kind, rng)[1:]
+    ends = [random_value(of, rng) for of in FACTOR_KINDS[kind].connects]
+    if kind.startswith("between"):
+        return ends, random_value(FACTOR_KINDS[kind].connects[0], rng)
+    if kind.startswith("landmark"):
+        return ends, rng.normal(0, 2, ends[1].size)
+    if kind == "bearing_range_se2":
+        return ends, np.array([rng.uniform(-3, 3), rng.uniform(1, 5)])
+    return ends, random_other(kind, ends, 0.1, rng)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("kind", RELATIVE)
+def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ends, z = random_relative(kind, rng)
+    connects = FACTOR_KINDS[kind].connects
+    T = random_value("se2" if connects[0].endswith("2") else "se3", rng)
+    omega = random_information(FACTOR_KINDS[kind].dim, rng)
+    group = Factors(kind, np.arange(len(ends))[None], z[None], omega[None])
+    moved = moved_factors(group, T)
+    there = [moved_values(of, end[None], T)[0] for of, end in zip(connects, ends, strict=True)]
+    before, after = residual(kind, ends, z), residual(kind, there, moved.measured[0])
+    expected = before @ full(omega) @ before
+    np.testing.assert_allclose(after @ full(moved.information[0]) @ after, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() -> None:
+    for kind, step in (("se2", (1, 0.2, 0.7)), ("se3", (1, 0.2, 0.1, 0.1, 0.2, 0.3, 0.9))):
+        step = (
+            np.array(step) if kind == "se2" else np.array([*step[:3], *np.array(step[3:]) / np.linalg.norm(step[3:])])
+        )
+        sigmas = [0.1, 0.2, 0.3] if kind == "se2" else [0.1, 0.2, 0.3, 0.05, 0.06, 0.07]
+        for prior in (False, True):
+            draft = Draft().variable(kind, "x0", [0] * 3 if kind == "se2" else [0] * 6 + [1], fixed=True)
+            for i in range(1, 5):
+                draft.variable(kind, f"x{i}").factor(f"between_{kind}", (f"x{i - 1}", f"x{i}"), step, sigmas=sigmas)
+            if prior:
+                draft.factor(f"prior_{kind}", ("x2",), draft_pose(kind, step), sigmas=sigmas)
+            solver = Solver(Options())
+            solver.stage(draft.batch())
+            solver.step(settle=True)
+            changes = Changes().marginalise("x2").listed()
+            marginal, *_ = solver.with_changes(changes, Batch(), True)
+            pairs = [f for f in marginal.graph()[1] if f.kind == f"linear_pair_{kind}"]
+            assert len(pairs) == 1
+            pair = Factors(pairs[0].kind, pairs[0].keys, pairs[0].measured, pairs[0].information)
+            assert is_relative(pair).tolist() == [not prior]
+            rest = [
+                Factors(f.kind, f.keys, f.measured, f.information)
+                for f in marginal.graph()[1]
+                if f.kind == f"linear_{kind}"
+            ]
+            assert all(says_nothing(group, [pair]).all() for group in rest) == (not prior)
+
+
+def draft_pose(kind: str, step: np.ndarray) -> np.ndarray:
+    return pose_vector(pose_matrix(step) @ pose_matrix(step))
+
+
+def here(*names: str) -> Estimate:
+    keys = np.array([parse_symbol(name) for name in names], np.int64)
+    rows = np.array([[float(i), 0, 0] for i in range(len(names))])
+    return Estimate(7, 1, (Variables("se2", keys, rows),))
+
+
+def there(*more: Callable[[Draft], Any]) -> Graph:
+    """x0 and x1, one metre apart along x, and something more."""
+    draft = Draft().se2("x0", (0, 0, 0)).se2("x1", (1, 0, 0)).between_se2("x0", "x1", (1, 0, 0), sigmas=SIGMAS)
+    for add in more:
+        add(draft)
+    return Graph(9, 4, draft.batch())
+
+
+LETTERS = {"x": "y"}
+
+
+def link(z: Any = (0, 2, np.pi / 2), a: str = "x1", b: str = "y0") -> Draft:
+    return Draft().between_se2(a, b, z, sigmas=SIGMAS)
+
+
+def test_values_are_in_the_other_frame_and_keys_have_other_letters() -> None:
+    fitted = fit_into(here("x0", "x1"), there(), anchors=link(), letters=LETTERS)
+    np.testing.assert_allclose(fitted.frame, (1, 2, np.pi / 2), atol=1e-12)
+    (group,) = fitted.batch.variables
+    assert group.keys.tolist() == [parse_symbol("y0"), parse_symbol("y1")]
+    np.testing.assert_allclose(group.values, [(1, 2, np.pi / 2), (1, 3, np.pi / 2)], atol=1e-12)
+    assert [f.keys.tolist() for f in fitted.batch.factors] == [
+        [[parse_symbol("y0"), parse_symbol("y1")]],
+        [[parse_symbol("x1"), parse_symbol("y0")]],
+    ]
+    back = fit_into(
+        here("x0", "x1"), there(), anchors=link(inverse(np.array([0, 2, np.pi / 2])), "y0", "x1"), letters=LETTERS
+    )
+    np.testing.assert_allclose(back.frame, fitted.frame, atol=1e-12)
+
+
+def test_of_several_anchors_a_false_one_does_not_say_where_the_map_begins() -> None:
+    anchors = Draft()
+    for a, b, z in (("x0", "y1", (9, 9, 2)), ("x0", "y0", (1, 2, 0.5)), ("x1", "y1", (0.87, 2.5, 0.5))):
+        anchors.between_se2(a, b, z, sigmas=SIGMAS)
+    fitted = fit_into(here("x0", "x1"), there(), anchors=anchors, letters=LETTERS)
+    np.testing.assert_allclose(fitted.frame, (1, 2, 0.5), atol=0.1)
+    assert fitted.anchors == 3
+
+
+def test_a_frame_alone_becomes_a_relative_pose_between_what_holds_the_maps() -> None:
+    other = there()
+    fixed = Variables("se2", np.array([parse_symbol("x5")]), np.array([[3.0, 0, 0]]), True)
+    other = Graph(9, 4, other.batch._replace(variables=(*other.batch.variables, fixed)))
+    fitted = fit_into(here("x0", "x1"), other, frame=(1, 2, np.pi / 2), sigmas=SIGMAS, letters=LETTERS)
+    tie = fitted.batch.factors[-1]
+    assert tie.keys.tolist() == [[parse_symbol("x0"), parse_symbol("y5")]]
+    np.testing.assert_allclose(tie.measured, [(1, 5, np.pi / 2)], atol=1e-12)
+    assert fitted.left_out == {"fixed": 1}
+    assert not any(group.fixed for group in fitted.batch.variables)
+
+
+def prior(key: str) -> Callable[[Draft], Any]:
+    return lambda draft: draft.prior_se2(key, (0, 0, 0), sigmas=SIGMAS)
+
+
+def fixed_point(draft: Draft) -> None:
+    draft.point2("l1", (0, 0), fixed=True)
+
+
+@pytest.mark.parametrize(
+    ("more", "count"),
+    [
+        ((), None),
+        ((prior("x0"),), None),
+        ((prior("x0"), prior("x1")), {"prior_se2": 2}),
+        ((lambda d: d.position_se2("x0", (0, 0), sigmas=(1, 1)),), {"position_se2": 1}),
+        ((lambda d: d.heading_se2("x0", 0.1, sigmas=(1,)),), {"heading_se2": 1}),
+        ((lambda d: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), sigmas=SIGMAS),), {"linear_se2": 1}),
+        ((fixed_point, prior("x0")), {"fixed": 1, "prior_se2": 1}),
+        ((fixed_point,), {"fixed": 1}),
+    ],
+)
+def test_what_a_map_knows_of_its_own_frame_is_refused_unless_it_is_only_where_it_begins(
+    more: tuple[Callable[[Draft], Any], ...], count: dict[str, int] | None
+) -> None:
+    other = there(*more)
+    if count is None:
+        fitted = fit_into(here("x0", "x1"), other, anchors=link(), letters=LETTERS)
+        assert not any(group.kind.startswith(ABSOLUTE) for group in fitted.batch.factors)
+        return
+    with pytest.raises(AbsoluteFactors) as refused:
+        fit_into(here("x0", "x1"), other, anchors=link(), letters=LETTERS)
+    assert refused.value.detail == count
+    letters = {**LETTERS, "l": "m"}
+    without = fit_into(here("x0", "x1"), other, anchors=link(), letters=letters, absolute="leave_out")
+    assert without.left_out == count
+    assert without.batch.factor_count == 2
+    kept = fit_into(here("x0", "x1"), other, letters=letters, absolute="keep")
+    assert kept.batch.factor_count == other.batch.factor_count
+    np.testing.assert_array_equal(kept.batch.variables[0].values, other.batch.variables[0].values)
+    assert [group.fixed for group in kept.batch.variables] == [group.fixed for group in other.batch.variables]
+
+
+def test_what_cannot_be_merged_says_why() -> None:
+    ours, other = here("x0", "x1"), there()
+    for problem, wrong, how in (
+        (KeyCollision, other, {"anchors": link()}),
+        (KeyCollision, collided(), {"anchors": link(), "letters": LETTERS}),
+        (NoAnchor, other, {"letters": LETTERS}),
+        (NoAnchor, other, {"letters": LETTERS, "anchors": link(a="x0", b="x1")}),
+        (NoAnchor, other, {"letters": LETTERS, "frame": (0, 0, 0)}),
+        (CannotMerge, other, {"letters": LETTERS, "frame": (0, 0)}),
+        (CannotMerge, other, {"letters": LETTERS, "frame": (0, np.nan, 0)}),
+        (CannotMerge, other, {"letters": LETTERS, "absolute": "perhaps"}),
+        (CannotMerge, Graph(1, 0, Batch()), {"anchors": link()}),
+        (CannotMerge, there(lambda d: d.se3("z1", (0, 0, 0, 0, 0, 0, 1))), {"letters": LETTERS, "anchors": link()}),
+        (BadSymbol, other, {"letters": {"x": "yy"}, "anchors": link()}),
+    ):
+        with pytest.raises(problem):
+            fit_into(ours, wrong, **how)
+
+
+def collided() -> Graph:
+    """Has y0 already."""
+    return there(lambda d: d.se2("y0", (5, 0, 0)).between_se2("x1", "y0", (4, 0, 0), sigmas=SIGMAS))
