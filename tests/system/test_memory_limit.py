@@ -57,6 +57,9 @@ def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path
         taken, refused = fill(first)
         assert (refused.code, refused.detail["limit"]) == ("out_of_memory", limit)
         assert "memory_bytes" in refused.message
+        with pytest.raises(Refused) as no_copy:
+            bus.fork("first", "copy")
+        assert no_copy.value.code == "out_of_memory"
         account = bus.stats()[0]
         assert resident(account["pid"]) < limit / 0.8, "by default the limit leaves a fifth for a step under way"
         assert resident(account["pid"]) > limit - ROOM // 2, "not long before, either"
