@@ -99,13 +99,16 @@ def test_a_relative_marginal_leaves_its_poses_free_together() -> None:
     np.testing.assert_allclose(covariance(middle, 2, 9), covariance(solver, 2, 9), rtol=1e-5, atol=1e-10)
 
 
-def test_a_border_of_three_is_refused_and_named() -> None:
+def test_a_border_of_three_is_a_factor_in_pieces_and_marginalising_comes_first() -> None:
     solver, _ = driven("se2", 20, closure=2)
     solver.stage(Batch(factors=(step("se2", 17, np.random.default_rng(1), 10).factors[1],)))
-    solver.step()
-    with pytest.raises(errors.TooConnected) as refused:
-        solver.with_changes(oldest(0, 9))
-    assert refused.value.detail["border"] == [symbol("x", n) for n in (9, 10, 17)]
+    solver.step(settle=True)
+    before, sure = values(solver), covariance(solver, 9, 10, 17)
+    after, _, _, counted = solver.with_changes(oldest(0, 9), settle=True)
+    assert counted["added_factors"] == 3 + 3 + 1 + 3  # x9, x10, x17: one of each sign, a number, and the pairs
+    for key, (of, row) in values(after).items():
+        assert distance(of, row, before[key][1]) < 1e-9
+    np.testing.assert_allclose(covariance(after, 9, 10, 17), sure, rtol=0, atol=1e-8 * sure.max())
     with pytest.raises(errors.BadOrder):
         solver.with_changes([Change("weigh", np.array([0]), weight=np.array([2.0])), *oldest(0, 5)])
 

@@ -136,6 +136,46 @@ def test_a_restart_after_a_kill_has_the_changes(spawn: Callable[..., Process], t
         assert joined.insert(Draft().between_se2("x0", "x9", (0, 0, 0), sigmas=SIGMAS)).first_factor == 17
 
 
+def test_a_marginal_of_many_poses_is_there_again_after_a_kill(spawn: Callable[..., Process], tmp_path: Path) -> None:
+    serve = ("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--journal", str(tmp_path / "journal"))
+    service = spawn(*serve)
+    with connect(service.ready()[0], client="robot", timeout_s=60) as bus, bus.map("window") as joined:
+        drive(joined, 0, 12)
+        joined.settle()
+        settled = {name: joined.estimate[name] for name in ("x5", "x8", "x11")}
+        done = joined.change(Changes().marginalise("x1", "x2", "x3", "x4"), settle=True)
+        assert done.report["added_factors"] > 3 * 4, "pieces on four poses"
+        for name, value in settled.items():
+            np.testing.assert_allclose(joined.estimate[name], value, rtol=0, atol=1e-9)
+        pieces = [g for g in joined.graph().batch.factors if g.kind.startswith("linear")]
+        assert any((g.information[:, 0] < 0).any() for g in pieces)
+        with pytest.raises(Refused) as refused:
+            joined.change(Changes().remove_factors([int(pieces[0].ids[0])]))
+        assert refused.value.code == "not_positive_definite"
+        drive(joined, 12, 14)
+        before, graph = joined.ask_estimate(), joined.graph()
+    service.signal(signal.SIGKILL)
+    service.wait()
+    again = spawn(*serve)
+    with connect(again.ready()[0], client="robot", timeout_s=60) as bus, bus.map("window", create=False) as joined:
+        after, new = joined.ask_estimate(), joined.graph()
+        assert (after.epoch, after.revision) == (before.epoch, before.revision)
+        for old, now in zip(before.variables, after.variables, strict=True):
+            assert (old.keys.tobytes(), old.values.tobytes()) == (now.keys.tobytes(), now.values.tobytes())
+        for old, now in zip(graph.batch.factors, new.batch.factors, strict=True):
+            assert (old.measured.tobytes(), old.information.tobytes()) == (
+                now.measured.tobytes(),
+                now.information.tobytes(),
+            )
+        # What ask/graph gives makes the same map elsewhere.
+        bus.map("copy").insert(new.batch)
+        copied = bus.map("copy", create=False)
+        copied.settle()
+        joined.settle()
+        for old, now in zip(joined.ask_estimate().variables, copied.ask_estimate().variables, strict=True):
+            np.testing.assert_allclose(now.values, old.values, rtol=0, atol=1e-9)
+
+
 def ran(*arguments: str, code: int = 0) -> str:
     done = subprocess.run(
         [sys.executable, "-m", "factorbus.cli", *arguments], capture_output=True, text=True, timeout=120

@@ -10,6 +10,7 @@ from factorbus.solver import errors, sights
 from factorbus.solver.factors import FACTOR_KINDS, LENS_AT, LOSSES, FactorKind
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import BatchLike, FactorsLike, VariablesLike
+from factorbus.solver.joints import SINGLE, check_joints
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
@@ -20,15 +21,19 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 _I64 = np.dtype(np.int64)
 _F64 = np.dtype(np.float64)
 _NO_SCALE = np.empty(0)
+_NONE = np.empty(0, np.int64)
 _NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIABLE_KINDS.values()}}
 
 
-def admit(graph: Graph, batch: BatchLike) -> None:
+def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
     """Append `batch` to `graph` and give values to the variables that come without.
 
+    whole: a linear factor of one pose may have a negative definite Ω where those that came together make a form that is
+    positive semidefinite (`joints`); else it may not.
+
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
-    BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Uninitialised; `graph` then holds a part of the batch and
-    must go back to its mark.
+    BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialised; `graph` then
+    holds a part of the batch and must go back to its mark.
     """
     counts = graph.counts.tolist()
     first, first_factor = counts[at.VARIABLES], counts[at.FACTORS]
@@ -38,8 +43,7 @@ def admit(graph: Graph, batch: BatchLike) -> None:
         if has_values:
             given.append((new, new + count))
         new += count
-    for group in batch.factors:
-        _admit_factors(graph, group)
+    negative = [_admit_factors(graph, group, whole) for group in batch.factors]
     if len(given) < len(batch.variables):
         reached = np.zeros(new, np.int64)
         for begin, behind in given:
@@ -47,6 +51,8 @@ def admit(graph: Graph, batch: BatchLike) -> None:
         _compose(graph, first, first_factor, reached)
     if any(group.kind in LENS_AT for group in batch.factors):
         sights.check(graph, first_factor)
+    if any(negative):
+        check_joints(graph, first_factor)
 
 
 def try_admit(graph: Graph, raw: bytes, groups: I64, reached: I64 | None = None) -> int | None:
@@ -98,7 +104,8 @@ def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
     return keys.size, group.values is not None
 
 
-def _admit_factors(graph: Graph, group: FactorsLike) -> None:
+def _admit_factors(graph: Graph, group: FactorsLike, whole: bool) -> bool:
+    """Gives whether there are any of negative weight."""
     kind = FACTOR_KINDS.get(group.kind)
     if kind is None:
         raise errors.UnknownKind("factor", group.kind, tuple(FACTOR_KINDS))
@@ -110,7 +117,14 @@ def _admit_factors(graph: Graph, group: FactorsLike) -> None:
     loss, scale = at.NO_LOSS, _NO_SCALE
     if group.loss:
         loss, scale = _loss(group, len(ends))
+    negative = _NONE
+    if whole and kind.name in SINGLE and loss == at.NO_LOSS:
+        negative = np.flatnonzero(information[:, 0] < 0.0)
+        if negative.size:
+            information = information.copy()
+            information[negative] *= -1.0
     graph.reserve_factors(len(ends), kind.size + kind.triangle + 1)
+    first = int(graph.counts[at.FACTORS])
     row, wrong = admit_factors(
         kind.code, loss, ends, measured, information, scale, graph.table, graph.keys, graph.var, graph.fac,
         graph.payload, graph.counts,
@@ -119,6 +133,9 @@ def _admit_factors(graph: Graph, group: FactorsLike) -> None:
         raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", "more than 0, standard deviations")
     if wrong != at.GOOD:
         raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
+    for begin in (graph.fac[first + negative, at.F_AT] + kind.size).tolist():
+        graph.payload[begin : begin + kind.triangle] *= -1.0
+    return negative.size > 0
 
 
 def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:

@@ -25,6 +25,7 @@ from factorbus.solver import errors
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import FactorGroup
+from factorbus.solver.joints import check_kept
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.marginal import marginals
@@ -84,7 +85,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
     Raises UnknownKind, UnknownFactor, NotInMap, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
-    NotFinite, BadQuaternion.
+    NotFinite, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
     """
     edits = unchanged(graph)
     before = edits.free.copy()
@@ -94,6 +95,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         if make is None:
             raise errors.UnknownKind("change", change.change, CHANGES)
         make(graph, edits, change, touched)
+    check_kept(graph, edits.kept)
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
         "removed_factors": int(np.count_nonzero(~edits.kept)),
@@ -212,10 +214,13 @@ def _marginalise(graph: Graph, edits: Edits, change: ChangeLike, touched: np.nda
     held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
     if edits.added or edits.placed or touched.any() or held:
         raise errors.BadOrder("marginalise", "before any loss, weigh, fix, free, place or marginalise")
-    edits.added += marginals(graph, gone, edits.kept)
+    check_kept(graph, edits.kept, all_or_none=True)
+    made, replaced = marginals(graph, gone, edits.kept)
+    edits.added += made
     edits.stays[gone] = False
     ends = graph.fac[: edits.kept.size, at.F_I : at.F_J + 1]
     edits.kept &= ~np.isin(ends, gone).any(axis=1)
+    edits.kept[replaced] = False
 
 
 _MAKE = {

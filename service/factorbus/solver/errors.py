@@ -18,6 +18,7 @@
     ├── BadSight               bad_sight               a pixel of what the camera cannot see
     ├── BadLoss                bad_loss                a loss that does not exist, or a scale that is not positive
     ├── NotPositiveDefinite    not_positive_definite   an information matrix that is not positive definite
+    ├── Apart                  not_positive_definite   a factor in pieces that are not together
     ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
     ├── NotInMap               unknown_variable        a change of a variable that the map does not have
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
@@ -195,6 +196,20 @@ class NotPositiveDefinite(SolverError):
         )
 
 
+class Apart(SolverError):
+    code = "not_positive_definite"
+
+    def __init__(self, keys: Sequence[int], factors: Sequence[int], seen: str) -> None:
+        listed = ", ".join(map(printed, keys[:8])) + (", ..." if len(keys) > 8 else "")
+        super().__init__(
+            f"the linear factors of {listed} are one factor in pieces, some of negative weight: {seen}; "
+            "wanted a sum without negative eigenvalues: leave all of them, or remove or weigh all alike",
+            where=f"linear factors of {listed}",
+            keys=list(keys),
+            factors=list(factors),
+        )
+
+
 class UnknownFactor(SolverError):
     code = "unknown_factor"
 
@@ -235,8 +250,8 @@ class TooConnected(SolverError):
         listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
         super().__init__(
             f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
-            f"factors with {listed}; wanted at most two poses of a kind, or a point that they determine: marginalise "
-            "some of these as well, or remove some of its factors first",
+            f"factors with {len(border)} others, {listed}; wanted at most 32 poses of a kind, or a point that they "
+            "determine: marginalise some of these as well, or remove some of its factors first",
             key=key,
             border=list(border),
         )

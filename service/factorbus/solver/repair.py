@@ -25,6 +25,7 @@ from factorbus.solver.gauss_newton import Rule, minimise
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import Group
 from factorbus.solver.incremental import Incremental
+from factorbus.solver.joints import find_joints
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
@@ -83,7 +84,11 @@ def repair(graph: Graph, factors: I64 | None = None, probability: float = 0.99) 
 
 
 def find_loops(graph: Graph) -> I64:
-    """Rows of the factors between variables that factors before them, or being fixed, join already."""
+    """Rows of the factors between variables that factors before them, or being fixed, join already.
+
+    Pieces of what is known of many poses together join, and are no suspects.
+    """
+    trusted = {f for joint in find_joints(graph) for f in joint.rows}
     count = int(graph.counts[at.VARIABLES])
     above = list(range(count + 1))
     for v in np.flatnonzero(graph.var[:count, at.V_COLUMN] < 0).tolist():
@@ -94,7 +99,8 @@ def find_loops(graph: Graph) -> I64:
             continue
         first, second = _root(above, i), _root(above, j)
         if first == second:
-            loops.append(f)
+            if f not in trusted:
+                loops.append(f)
         else:
             above[min(first, second)] = max(first, second)
     return np.array(loops, np.int64)
@@ -112,6 +118,10 @@ def _rows(graph: Graph, ids: I64) -> I64:
     rows = graph.rows_of(ids)
     if (missing := np.flatnonzero(rows < 0)).size:
         raise errors.UnknownFactor(int(ids[missing[0]]), graph.next_id)
+    pieces = {f for joint in find_joints(graph) for f in joint.rows}
+    if bad := [f for f in rows.tolist() if f in pieces]:
+        named = int(graph.ids_of(np.array(bad[:1]))[0])
+        raise errors.BadOption("factors", f"{named}, a piece of what is known of many poses together", "other factors")
     return rows
 
 

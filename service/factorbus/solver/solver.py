@@ -20,6 +20,7 @@ from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import Addition, BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
+from factorbus.solver.joints import check_joints
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.settle_new import settle_new
@@ -196,6 +197,7 @@ class Solver:
         made = Solver(self._options)
         made._graph.take(edited(self._graph, edits))
         made._add(edits.added)
+        check_joints(made._graph)
         variables, factors = made.variable_count, made.factor_count
         first = made._graph.next_id if batch is None else made.stage(batch)
         new = made.variable_count - variables, made.factor_count - factors

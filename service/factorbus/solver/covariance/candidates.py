@@ -67,7 +67,7 @@ def admitted(graph: Graph, groups: Sequence[FactorsLike]) -> Iterator[None]:
     """`groups` are the last factors of `graph` for a while.  Raises as `judge_candidates`."""
     mark = graph.mark()
     try:
-        admit(graph, _Batch((), tuple(groups)))
+        admit(graph, _Batch((), tuple(groups)), whole=False)
         yield
     finally:
         graph.forget(mark)

@@ -13,6 +13,7 @@ from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_cliques
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph import Graph
+from factorbus.solver.joints import negative_rows
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
@@ -81,7 +82,12 @@ class Upkeep:
         return order[: list_cliques(tree.node[: self._dims.size], tree.clique, order)]
 
     def _loops(self, old: int, first: int) -> I64 | None:
-        """The new factors but one for each new variable, which places it; None: not all are placed so."""
+        """The new factors but one for each new variable, which places it; None: not all are placed so.
+
+        Nor can those of negative weight be worked in one by one.
+        """
+        if negative_rows(self._graph, first).size:
+            return None
         free = {v for v in range(old, self._dims.size) if self._scalar[v] >= 0}
         if len(free) > _MOST_NEW:
             return None

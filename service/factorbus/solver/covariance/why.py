@@ -27,6 +27,7 @@ class FactorAccount:
     loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one; residual and all that follows are times √w
     asleep: why a sight has no pixel, and so no weight; else ""
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: rᵀ Ω r
+    of a piece of negative weight (`joints`) Ω = −L Lᵀ: χ² and influence are not above 0, and there is no `without`
     influence: tr(Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: rᵀ (Ω⁻¹ − H Σ Hᵀ)⁻¹ r, by how much χ² would fall without it; None: nothing else measures what it does
     """
@@ -112,6 +113,11 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
 
 
 def _why_row(blocks: Blocks, row: int) -> FactorAccount:
+    linear = linearised(blocks.factored.graph, row, row + 1)
+    if linear.W[0, 0, 0] < 0.0:
+        d = int(blocks.factored.dims[linear.ends[0, 0]])
+        H = linear.A[0, :d, :d]  # of one pose, with a residual as large
+        return _account(blocks, row, linear, H @ blocks.of(linear.ends[0, :1])[0, :d, :d] @ H.T)
     T = judge_rows(blocks, row, row + 1).predicted[0]
     return _account(blocks, row, linearised(blocks.factored.graph, row, row + 1), T)
 
@@ -141,15 +147,16 @@ def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccoun
     d = kind.dim
     r, W, T = linear.r[0, :d].copy(), linear.W[0, :d, :d], T[:d, :d]
     keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
-    L = np.linalg.cholesky(W)
+    sign = -1.0 if W[0, 0] < 0.0 else 1.0
+    L = np.linalg.cholesky(sign * W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
     left = np.linalg.eigvalsh(np.eye(d) - L.T @ T @ L)
     weighted = L.T @ r
     without = None
-    if left[0] > _NOTHING:
+    if sign > 0.0 and left[0] > _NOTHING:
         without = float(weighted @ np.linalg.solve(np.eye(d) - L.T @ T @ L, weighted))
     return FactorAccount(
-        factor, kind.name, keys, r, weighted, float(weighted @ weighted), d, float(np.trace(W @ T)), without,
+        factor, kind.name, keys, r, weighted, sign * float(weighted @ weighted), d, float(np.trace(W @ T)), without,
         LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), _weight(graph, place, linear),
         sights.why_asleep(graph, place),
     )  # fmt: skip

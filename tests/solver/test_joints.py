@@ -1,0 +1,476 @@
+"""What is known of many poses together: marginals with a border of any size, and their pieces."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from naive.dense_factors import TANGENT, _pose_error, boxplus, pose_matrix, residual
+from naive.dense_least_squares import DenseGraph, distance, full
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.simulate import manhattan
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.why import why_variable
+from factorbus.solver.groups import FactorGroup
+from factorbus.solver.joints import MOST, find_joints, negative_rows, split
+from factorbus.solver.repair import find_loops, repair
+
+MODES = ("tree", "inc-l", "all-batch")
+SIZE = {"se2": 3, "se3": 7}
+
+
+def x(*names: int) -> np.ndarray:
+    return np.array([symbol("x", n) for n in names])
+
+
+def random_pose(kind: str, rng: np.random.Generator, step: float = 0.0) -> np.ndarray:
+    small = 0.3 * rng.normal(size=TANGENT[kind])
+    small[0] += step
+    nothing = np.zeros(3) if kind == "se2" else np.array([0.0, 0, 0, 0, 0, 0, 1])
+    return boxplus(kind, nothing, small)
+
+
+def information(rng: np.random.Generator, d: int) -> np.ndarray:
+    """A full Ω, with other units for angles."""
+    A = rng.normal(size=(d, d)) + 3.0 * np.eye(d)
+    units = np.array([10.0] * (d // 2 + d % 2) + [40.0] * (d // 2))
+    return ((A.T @ A) * units * units[:, None])[np.triu_indices(d)][None]
+
+
+def loopy(kind: str, poses: int, seed: int, reach: int = 6) -> Batch:
+    """A drive with an odometry edge and two loops a pose, of which none is further back than `reach`."""
+    rng, d = np.random.default_rng(seed), TANGENT[kind]
+    true = [random_pose(kind, rng)]
+    for _ in range(1, poses):
+        true.append(_composed(kind, true[-1], random_pose(kind, rng, 1.0)))
+    pairs = {(i - 1, i) for i in range(1, poses)}
+    pairs |= {(int(rng.integers(max(0, i - reach), i)), i) for i in range(1, poses) for _ in range(2)}
+    factors = []
+    for i, j in sorted(pairs):
+        z = boxplus(kind, _relative(kind, true[i], true[j]), 0.01 * rng.normal(size=d))
+        factors.append(Factors(f"between_{kind}", x(i, j)[None], z[None], information(rng, d)))
+    factors.append(Factors(f"prior_{kind}", x(0)[None], true[0][None], information(rng, d)))
+    factors.append(
+        Factors(f"prior_{kind}", x(poses - 1)[None], boxplus(kind, true[-1], 0.02 * rng.normal(size=d))[None],
+                0.001 * information(rng, d))
+    )  # fmt: skip
+    return Batch((Variables(kind, x(*range(poses)), np.array(true)),), tuple(factors))
+
+
+def _vector(T: np.ndarray) -> np.ndarray:
+    return np.array([*_pose_error(T)]) if len(T) == 3 else np.array([*_pose_error(T), _last(T)])
+
+
+def _last(T: np.ndarray) -> float:
+    return float(np.sqrt(max(0.0, 1.0 - (_pose_error(T)[3:] ** 2).sum())))
+
+
+def _relative(kind: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return _vector(np.linalg.inv(pose_matrix(a)) @ pose_matrix(b))
+
+
+def _composed(kind: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return _vector(pose_matrix(a) @ pose_matrix(b))
+
+
+def solved(batch: Batch, mode: str = "tree") -> Solver:
+    solver = Solver(Options(mode=mode))
+    solver.stage(batch)
+    solver.step(settle=True)
+    return solver
+
+
+def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
+    return {k: (g.kind, row) for g in solver.estimate() for k, row in zip(g.keys.tolist(), g.values, strict=True)}
+
+
+def covariance(solver: Solver, *names: int) -> np.ndarray:
+    return Blocks(solver.factored()).joint(np.array([solver._graph.find(key) for key in x(*names).tolist()]))
+
+
+def marginalise(*names: int) -> list[Change]:
+    return [Change("marginalise", keys=x(*names))]
+
+
+def apart(a: Solver, b: Solver) -> float:
+    of, there = values(a), values(b)
+    return max(distance(kind, row, there[key][1]) for key, (kind, row) in of.items())
+
+
+@dataclass
+class Twin:
+    """A dense graph that keeps |R (x ⊟ y) − d|² of some poses, made by a dense Schur complement."""
+
+    graph: DenseGraph
+    keys: list[int]
+    y: list[np.ndarray]
+    R: np.ndarray
+    d: np.ndarray
+
+    def error(self) -> np.ndarray:
+        e = []
+        for key, y in zip(self.keys, self.y, strict=True):
+            part = _pose_error(np.linalg.inv(pose_matrix(y)) @ pose_matrix(self.graph.values[key]))
+            e.append(part if len(part) == 3 else part * np.array([1, 1, 1, 2, 2, 2]))
+        return np.concatenate(e)
+
+    def settle(self) -> None:
+        for _ in range(20):
+            Lambda, eta = self.graph.system()
+            starts, H, column, here = self.graph.starts(), np.zeros((len(self.R), len(eta))), 0, self.error()
+            for key in self.keys:
+                kind = self.graph.kinds[key]
+                n, at = TANGENT[kind], self.graph.values[key]
+                J = np.zeros((len(here), n))
+                for c in range(n):
+                    e = []
+                    for h in (-1e-5, 1e-5):
+                        self.graph.values[key] = boxplus(kind, at, h * np.eye(n)[c])
+                        e.append(self.error())
+                    J[:, c] = (e[1] - e[0]) / 2e-5
+                self.graph.values[key] = at
+                H[:, starts[key] : starts[key] + n] = self.R @ J
+                column += n
+            r = self.R @ here - self.d
+            delta = np.linalg.solve(Lambda + H.T @ H, eta - H.T @ r)
+            for key, start in starts.items():
+                kind = self.graph.kinds[key]
+                step = delta[start : start + TANGENT[kind]]
+                self.graph.values[key] = boxplus(kind, self.graph.values[key], step)
+            if np.abs(delta).max() < 1e-10:
+                break
+
+
+def twin_of(batch: Batch, estimate: dict[int, tuple[str, np.ndarray]], gone: np.ndarray) -> Twin:
+    whole, left = DenseGraph(), DenseGraph()
+    whole.add(batch)
+    whole.values = {key: row for key, (_, row) in estimate.items()}
+    leaving = set(gone.tolist())
+    left.kinds = {key: kind for key, kind in whole.kinds.items() if key not in leaving}
+    left.values = {key: whole.values[key] for key in left.kinds}
+    taken = [not leaving.isdisjoint(keys) for _, keys, _, _ in whole.factors]
+    for factor, loss, is_taken in zip(whole.factors, whole.losses, taken, strict=True):
+        if not is_taken:
+            left.factors.append(factor)
+            left.losses.append(loss)
+    touched = {key for (_, keys, _, _), of in zip(whole.factors, taken, strict=True) if of for key in keys}
+    whole.factors = [factor for factor, of in zip(whole.factors, taken, strict=True) if of]
+    whole.losses = [loss for loss, of in zip(whole.losses, taken, strict=True) if of]
+    border = sorted(touched - leaving)
+    whole.kinds = {key: whole.kinds[key] for key in [*sorted(leaving), *border]}
+    Lambda, eta = whole.system()
+    cut = sum(TANGENT[whole.kinds[key]] for key in leaving)
+    gain = np.linalg.solve(Lambda[:cut, :cut], np.column_stack([Lambda[:cut, cut:], eta[:cut]]))
+    S, right = Lambda[cut:, cut:] - Lambda[cut:, :cut] @ gain[:, :-1], eta[cut:] - Lambda[cut:, :cut] @ gain[:, -1]
+    lam, V = np.linalg.eigh(S)
+    known = lam > 1e-12 * lam[-1]
+    R = np.sqrt(lam[known])[:, None] * V[:, known].T
+    return Twin(left, border, [left.values[key] for key in border], R, (V[:, known].T @ right) / np.sqrt(lam[known]))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("kind", SIZE)
+def test_the_pieces_sum_to_the_form_wherever_the_poses_are(kind: str, seed: int) -> None:
+    rng, d = np.random.default_rng(seed), TANGENT[kind]
+    n = int(rng.integers(3, 9))
+    A = rng.normal(size=(int(rng.integers(1, n * d + 1)), n * d)) * np.tile(10.0 ** rng.uniform(-2, 3, d), n)
+    A[:, rng.integers(n * d)] = 0.0  # something of which nothing is known
+    Lambda, eta = A.T @ A, A.T @ rng.normal(size=len(A))
+    y = [random_pose(kind, rng, 5.0) for _ in range(n)]
+    groups = split(kind, x(*range(n)), y, Lambda, eta)
+    assert sum(int((g.information[:, 0] < 0).sum()) for g in groups) == n
+    least = eta @ np.linalg.pinv(Lambda, rcond=1e-12) @ eta
+    for far in (0.0, 1e-3, 1.0):
+        e = far * rng.normal(size=(n, d)) * 0.3
+        at = [boxplus(kind, row, step) for row, step in zip(y, e, strict=True)]
+        e = np.concatenate(
+            [_pose_error(np.linalg.inv(pose_matrix(a)) @ pose_matrix(b)) for a, b in zip(y, at, strict=True)]
+        )
+        if kind == "se3":
+            e *= np.tile([1, 1, 1, 2, 2, 2], n)
+        total = size = 0.0
+        for group in groups:
+            for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True):
+                r = residual(group.kind, [at[symbol_number(key)] for key in keys], z)
+                chi2 = r @ full(upper) @ r
+                total, size = total + chi2, size + abs(chi2)
+        assert abs(total - (e @ Lambda @ e - 2 * eta @ e + least)) < 1e-11 * size + 1e-9 * least
+
+
+def symbol_number(key: int) -> int:
+    return key - symbol("x", 0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "mode"), [("se2", seed, mode) for seed in (1, 2) for mode in MODES] + [("se3", 3, "tree")]
+)
+def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_a_dense_twin(
+    kind: str, seed: int, mode: str
+) -> None:
+    batch = loopy(kind, 16, seed)
+    solver = solved(batch, mode)
+    estimate, gone = values(solver), list(range(8))
+    names = list(range(8, 16))
+    sure = covariance(solver, *names)
+    after, _, report, counted = solver.with_changes(marginalise(*gone), settle=True)
+    assert counted["removed_variables"] == 8
+    (joint,) = find_joints(after._graph)
+    assert len(joint.poses) >= 3, "else it shows nothing"
+    assert all(distance(of, row, estimate[key][1]) < 1e-9 for key, (of, row) in values(after).items())
+    np.testing.assert_allclose(covariance(after, *names), sure, rtol=0, atol=1e-8 * np.abs(sure).max())
+    assert report.chi2 >= 0.0
+
+    twin = twin_of(batch, estimate, x(*gone))
+    assert twin.keys == x(*(n for n in names if symbol("x", n) in twin.keys)).tolist()
+    rng, d = np.random.default_rng(seed), TANGENT[kind]
+    now = {n: estimate[symbol("x", min(n, 15))][1] for n in (8, 9, 15, 16)}
+    more = Batch(
+        (Variables(kind, x(16)),),
+        tuple(
+            Factors(
+                f"between_{kind}",
+                x(a, b)[None],
+                boxplus(kind, _relative(kind, now[a], now[b]), 0.05 * rng.normal(size=d))[None],
+                information(rng, d),
+            )
+            for a, b in ((15, 16), (8, 15), (9, 16))
+        ),
+    )  # fmt: skip
+    after.stage(more)
+    after.step(settle=True)
+    twin.graph.add(more)
+    twin.graph.values[symbol("x", 16)] = values(after)[symbol("x", 16)][1]
+    twin.settle()
+    moved = max(distance(of, row, estimate[key][1]) for key, (of, row) in values(after).items() if key in estimate)
+    assert moved > 1e-3
+    for key, (of, row) in values(after).items():
+        assert distance(of, row, twin.graph.values[key]) < 2e-8
+
+
+@pytest.mark.parametrize("kind", SIZE)
+def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
+    """What is known of many poses goes whole into the next marginal, and leaves no pieces behind."""
+    solver = solved(loopy(kind, 18, 5))
+    at_once, *_ = solver.with_changes(marginalise(*range(10)), settle=True)
+    slowly = solver
+    for n in range(10):
+        slowly, *_ = slowly.with_changes(marginalise(n), settle=True)
+    assert apart(at_once, slowly) < 1e-9
+    a, b = covariance(at_once, *range(10, 18)), covariance(slowly, *range(10, 18))
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * np.abs(a).max())
+    assert len(find_joints(slowly._graph)) == 1
+    assert negative_rows(slowly._graph).size == len(find_joints(slowly._graph)[0].poses)
+    assert slowly.chi2() == pytest.approx(at_once.chi2(), rel=1e-6)
+
+
+def window() -> tuple[Solver, list[int]]:
+    """A map with one form in pieces, and the ids of these."""
+    solver, *_ = solved(loopy("se2", 16, 1)).with_changes(marginalise(*range(8)), settle=True)
+    (joint,) = find_joints(solver._graph)
+    return solver, solver._graph.ids_of(np.array(joint.rows)).tolist()
+
+
+def test_pieces_stay_together_or_go_together() -> None:
+    solver, ids = window()
+    before = values(solver)
+    negative = solver._graph.ids_of(negative_rows(solver._graph)).tolist()
+    pair = next(f for f in ids if f not in negative)
+    for changes in (
+        [Change("remove_factors", np.array(ids[:1]))],
+        [Change("remove_variables", keys=solver._graph.keys[[find_joints(solver._graph)[0].poses[0]]])],
+        [Change("weigh", np.array(negative), weight=np.full(len(negative), 2.0))],
+        [Change("loss", np.array(negative[:1]), loss="huber", scale=np.ones(1))],
+        [Change("loss", np.array([pair]), loss="huber", scale=np.ones(1))],
+    ):
+        with pytest.raises(errors.Apart) as refused:
+            solver.with_changes(changes)
+        assert refused.value.code == "not_positive_definite"
+        assert set(refused.value.detail["factors"]) <= set(ids)
+    assert all(np.array_equal(row, before[key][1]) for key, (_, row) in values(solver).items())
+    heavier, *_ = solver.with_changes([Change("weigh", np.array(ids), weight=np.full(len(ids), 2.0))])
+    assert len(find_joints(heavier._graph)) == 1
+    without, *_ = solver.with_changes([Change("remove_factors", np.array(ids))])
+    assert not find_joints(without._graph)
+    held, *_ = solver.with_changes([Change("fix", keys=x(10))], settle=True)
+    freed, *_ = held.with_changes([Change("free", keys=x(10))], settle=True)
+    assert apart(freed, solver) < 1e-9
+
+
+def test_what_asks_about_pieces_gets_an_answer() -> None:
+    solver, ids = window()
+    graph, blocks = solver._graph, Blocks(solver.factored())
+    total = 0.0
+    for v in range(solver.variable_count):
+        account = why_variable(blocks, v, True)
+        assert account.pivot > 0.0
+        assert 0.0 < account.conditioning <= 1.0 + 1e-9
+        total += sum(f.chi2 / len(f.keys) for f in account.factors)
+        for f in account.factors:
+            if f.chi2 < 0.0 or f.influence < 0.0:
+                assert f.without is None
+    assert total == pytest.approx(solver.chi2(), rel=1e-9)
+    assert not set(graph.ids_of(find_loops(graph)).tolist()) & set(ids)
+    assert repair(graph).false.size == 0
+    with pytest.raises(errors.BadOption, match="piece"):
+        repair(graph, np.array(ids[:1]))
+    row = graph.factors()[0]
+    negative = next(g for g in graph.factors() if g.kind == "linear_se2" and (g.information[:, 0] < 0).any())
+    with pytest.raises(errors.NotPositiveDefinite):
+        judge_candidates(blocks, [negative])
+    assert judge_candidates(blocks, [row]).distance.size == len(row.keys)
+
+
+def test_the_kept_up_covariance_is_that_from_scratch() -> None:
+    solver, _ = window()
+    upkeep = solver.try_upkeep()
+    assert upkeep is not None
+    upkeep.update()
+    rng = np.random.default_rng(1)
+    for n in range(16, 22):
+        edge = Factors("between_se2", x(n - 1, n)[None], np.array([[1.0, 0, 0.1]]), information(rng, 3))
+        solver.stage(Batch((Variables("se2", x(n)),), (edge,)))
+        solver.step()
+        upkeep.update()
+        np.testing.assert_allclose(
+            upkeep.diagonal()[:, :3, :3],
+            Blocks(solver.factored()).diagonal(),
+            rtol=0,
+            atol=1e-8 * upkeep.diagonal().max(),
+        )
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", SIZE)
+def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> None:
+    solver, *_ = solved(loopy(kind, 16, 1)).with_changes(marginalise(*range(8)), settle=True)
+    variables, factors = solver.graph()
+    sent = Batch(
+        tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in variables),
+        tuple(_sent(g) for g in factors),
+    )
+    came = codec.decode_insert(codec.encode_insert(Insert(1, sent))).batch
+    other = solved(came, mode)
+    assert apart(solver, other) < 1e-9
+    assert other.chi2() == pytest.approx(solver.chi2(), rel=1e-6)
+    assert len(find_joints(other._graph)) == 1
+    # As an insert into a map that is there: the poses first.
+    late = Solver(Options(mode=mode))
+    late.stage(came._replace(factors=tuple(g for g in came.factors if not g.kind.startswith("linear"))))
+    late.step()
+    late.stage(Batch((), tuple(g for g in came.factors if g.kind.startswith("linear"))))
+    late.step(settle=True)
+    assert apart(solver, late) < 1e-9
+    before = values(late)
+    alone = next(g for g in came.factors if g.kind == f"linear_{kind}")
+    negative = alone.information[:, 0] < 0
+    lonely = alone._replace(**{n: getattr(alone, n)[negative] for n in ("keys", "measured", "information")})
+    for wrong in (lonely, lonely._replace(loss="huber", scale=np.ones(int(negative.sum())))):
+        with pytest.raises(errors.SolverError) as refused:
+            late.stage(Batch((), (wrong,)))
+        assert refused.value.code == "not_positive_definite"
+    late.step()
+    assert all(np.array_equal(row, before[key][1]) for key, (_, row) in values(late).items())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
+    solver, *_ = solved(loopy("se2", 16, 1), mode).with_changes(marginalise(*range(8)))
+    again = Solver(Options(mode=mode))
+    again.load(solver.dump())
+    for n in (16, 17):
+        edge = Factors(
+            "between_se2", x(n - 1, n)[None], np.array([[1.0, 0.1, 0.1]]), information(np.random.default_rng(n), 3)
+        )
+        loop = Factors(
+            "between_se2", x(n - 5, n)[None], np.array([[4.0, 0.1, 0.4]]), information(np.random.default_rng(n), 3)
+        )
+        for each in (solver, again):
+            each.stage(Batch((Variables("se2", x(n)),), (edge, loop)))
+            each.step()
+        assert all(np.array_equal(row, values(again)[key][1]) for key, (_, row) in values(solver).items())
+    ones, others = solver.with_changes(marginalise(8, 9))[0], again.with_changes(marginalise(8, 9))[0]
+    assert all(np.array_equal(row, values(others)[key][1]) for key, (_, row) in values(ones).items())
+
+
+def test_a_crowd_of_pieces_is_refused_before_it_costs_anything() -> None:
+    rng, count = np.random.default_rng(1), 140
+    y = [random_pose("se2", rng) for _ in range(count)]
+    A = rng.normal(size=(3 * count, 3 * count))
+    groups = split("se2", x(*range(count)), y, A.T @ A, np.zeros(3 * count))
+    solver = Solver(Options())
+    with pytest.raises(errors.Apart, match="140 poses"):
+        solver.stage(Batch((Variables("se2", x(*range(count)), np.array(y)),), tuple(_sent(g) for g in groups)))
+    assert solver.variable_count == 0
+
+
+def _sent(group: FactorGroup) -> Factors:
+    return Factors(group.kind, group.keys, group.measured, group.information)
+
+
+def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
+    rng, count = np.random.default_rng(1), MOST + 2
+    star = tuple(
+        Factors("between_se2", x(0, n)[None], np.array([[1.0 * n, 0, 0]]), information(rng, 3)) for n in range(1, count)
+    )
+    solver = solved(Batch((Variables("se2", x(*range(count))),), (*star, loopy("se2", 2, 1).factors[-2])))
+    with pytest.raises(errors.TooConnected) as refused:
+        solver.with_changes(marginalise(0))
+    assert refused.value.detail["border"] == x(*range(1, count)).tolist()
+    after, *_ = solver.with_changes(marginalise(0, 1), settle=True)
+    assert len(find_joints(after._graph)[0].poses) == MOST
+    assert apart(after, solver) < 1e-9
+    l = np.array([symbol("l", 1)])
+    seen = [
+        Factors("landmark_se2", np.array([[k, l[0]]]), np.ones((1, 2)), np.eye(2)[np.triu_indices(2)][None])
+        for k in x(0, 1)
+    ]
+    solver.stage(Batch((Variables("point2", l),), tuple(seen)))
+    solver.step()
+    with pytest.raises(errors.TooConnected):
+        solver.with_changes(marginalise(0))
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("poses", [400, pytest.param(4000, marks=pytest.mark.data)])
+def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int) -> None:
+    """Loops of up to 60 poses are inside the window; those that reach further back are left out."""
+    keep, every = 60, 15
+    solver, rest, first, sizes, widest, loops = Solver(Options()), Solver(Options()), 0, [], 0, 0
+    for n, step in enumerate(_steps(poses, keep)):
+        for each in (solver, rest):
+            each.stage(step)
+            each.step()
+        loops += step.factor_count - 1
+        if n - first == keep + every:
+            solver, *_ = solver.with_changes(marginalise(*range(first, first + every)))
+            first += every
+            sizes.append(solver.memory_bytes())
+            widest = max([widest, *(len(joint.poses) for joint in find_joints(solver._graph))])
+    assert widest >= 4, "loops make it more than a chain"
+    assert loops > poses / 10
+    half = len(sizes) // 2
+    assert max(sizes[half:]) <= 2.0 * max(sizes[:half]), "it does not grow with the length of the drive"
+    solver.step(settle=True)
+    rest.step(settle=True)
+    here, there = values(solver), values(rest)
+    last = here[symbol("x", poses - 1)][1], there[symbol("x", poses - 1)][1]
+    for key in here:
+        seen, wanted = (_relative("se2", of[key][1], end) for of, end in zip((here, there), last, strict=True))
+        assert distance("se2", seen, wanted) < 1e-3, "the window is what it is in the whole map"
+    if poses < 1000:
+        assert np.hypot(*(last[0] - last[1])[:2]) < 0.1, "and where it is there, but for what was linearised once"
+
+
+def _steps(poses: int, keep: int) -> Iterator[Batch]:
+    """A pose a step, with the factors to those at most `keep` before it."""
+    for step in manhattan(poses=poses, seed=3, loop_gap=8, block_m=3, loop_share=0.8, sigma_theta_rad=0.005):
+        near = []
+        for g in step.batch.factors:
+            cut = np.ptp(g.keys, axis=1) <= keep
+            near.append(g._replace(keys=g.keys[cut], measured=g.measured[cut], information=g.information[cut]))
+        yield step.batch._replace(factors=tuple(g for g in near if len(g.keys)))
