@@ -116,8 +116,8 @@ def split(kind: str, keys: I64, y: Sequence[F64], information: F64, eta: F64) ->
     U, s, Vt = np.linalg.svd(blocks[first, second])
     some = s[:, 0] > _NOTHING if len(s) else np.zeros(0, bool)
     first, second, U, root, Vt = first[some], second[some], U[some], np.sqrt(s[some]), Vt[some]
-    A: F64 = root[:, :, None] * U.transpose(0, 2, 1)
-    B: F64 = root[:, :, None] * Vt
+    A = root[:, :, None] * U.transpose(0, 2, 1)
+    B = root[:, :, None] * Vt
     taken = np.zeros((n, d, d))
     np.add.at(taken, first, A.transpose(0, 2, 1) @ A)
     np.add.at(taken, second, B.transpose(0, 2, 1) @ B)
@@ -161,7 +161,7 @@ def _normalised(information: F64, eta: F64, inverse: F64) -> tuple[F64, float, f
     return S, max(float(values[-1]), 0.0), least
 
 
-def _factors(kind: str, keys: I64, columns: Sequence[F64], upper: F64) -> FactorGroup:
+def _factors(kind: str, keys: I64, columns: Sequence[np.ndarray], upper: F64) -> FactorGroup:
     measured = np.concatenate([column.reshape(len(keys), -1) for column in columns], axis=1)
     return FactorGroup(kind, np.ascontiguousarray(keys), measured, np.tile(upper, (len(keys), 1)))
 
