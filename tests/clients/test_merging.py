@@ -21,6 +21,7 @@ from factorbus.proto.messages import Batch, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.symbols import parse_symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.joints import split
 
 seeds = st.integers(0, 2**32 - 1)
 ABSOLUTE = ("prior", "position", "heading", "attitude")
@@ -200,6 +201,30 @@ def test_what_a_map_knows_of_its_own_frame_is_refused_unless_it_is_only_where_it
     assert kept.batch.factor_count == other.batch.factor_count
     np.testing.assert_array_equal(kept.batch.variables[0].values, other.batch.variables[0].values)
     assert [group.fixed for group in kept.batch.variables] == [group.fixed for group in other.batch.variables]
+
+
+def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
+    """Of its pieces those on pairs may look as if they said nothing of the map's own frame."""
+    keys = np.array([parse_symbol(f"x{i}") for i in range(3)])
+    Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
+    pieces = split("se2", keys, [np.zeros(3)] * 3, Lambda, np.zeros(9))
+    sent = tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in pieces)
+    assert is_relative(sent[-1]).all()
+    batch = there().batch
+    other = Graph(
+        9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))
+    )
+    how: Any = {"letters": LETTERS, "anchors": link()}
+    with pytest.raises(AbsoluteFactors):
+        fit_into(here("x0", "x1"), other, **how)
+    without = fit_into(here("x0", "x1"), other, **how, absolute="leave_out")
+    assert [group.kind for group in without.batch.factors] == ["between_se2", "between_se2"]
+    kept = fit_into(here("x0", "x1"), other, **how, absolute="keep")
+    solver = Solver(Options())
+    solver.stage(Batch((Variables("se2", keys[:2], np.zeros((2, 3)), fixed=True),)))
+    solver.stage(kept.batch)
+    solver.step()
+    assert solver.factor_count == kept.batch.factor_count
 
 
 def test_what_cannot_be_merged_says_why() -> None:

@@ -186,11 +186,11 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     fixed = sum(group.keys.size for group in batch.variables if group.fixed)
     if fixed:
         held["fixed"] = fixed
-    factors, pairs = [], [group for group in batch.factors if group.kind in _PAIRS]
+    factors, pairs, joint = [], [group for group in batch.factors if group.kind in _PAIRS], _joint(batch)
     for group in batch.factors:
         if group.kind in _LINEAR:
             group = _rows(group, ~says_nothing(group, pairs))
-        stays = _stays(group)
+        stays = _stays(group, joint)
         if not stays.all():
             held[group.kind] = held.get(group.kind, 0) + int((~stays).sum())
         if stays.any():
@@ -200,9 +200,15 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     return Batch(tuple(group._replace(fixed=False) for group in batch.variables), tuple(factors)), held
 
 
-def _stays(group: Factors) -> np.ndarray:
+def _joint(batch: Batch) -> I64:
+    """Poses with a linear factor of negative weight: of those, only all linear factors together mean anything."""
+    negative = [g.keys[g.information[:, 0] < 0.0, 0] for g in batch.factors if g.kind in _LINEAR]
+    return np.concatenate([np.empty(0, np.int64), *negative])
+
+
+def _stays(group: Factors, joint: I64) -> np.ndarray:
     if group.kind in _PAIRS:
-        return is_relative(group)
+        return is_relative(group) & ~np.isin(group.keys, joint).all(axis=1)
     return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
 
 
