@@ -1,6 +1,7 @@
 """Merging maps, short of the bus: what is moved measures the same in another frame, what would be wrong is refused."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -214,12 +215,12 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     other = Graph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))
     )
-    how: Any = {"letters": LETTERS, "anchors": link()}
+    fit = partial(fit_into, here("x0", "x1"), other, letters=LETTERS, anchors=link())
     with pytest.raises(AbsoluteFactors):
-        fit_into(here("x0", "x1"), other, **how)
-    without = fit_into(here("x0", "x1"), other, **how, absolute="leave_out")
+        fit()
+    without = fit(absolute="leave_out")
     assert [group.kind for group in without.batch.factors] == ["between_se2", "between_se2"]
-    kept = fit_into(here("x0", "x1"), other, **how, absolute="keep")
+    kept = fit(absolute="keep")
     solver = Solver(Options())
     solver.stage(Batch((Variables("se2", keys[:2], np.zeros((2, 3)), fixed=True),)))
     solver.stage(kept.batch)
