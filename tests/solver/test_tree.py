@@ -204,10 +204,14 @@ def by_key(groups: list[Group]) -> dict[int, bytes]:
     return {int(k): v.tobytes() for group in groups for k, v in zip(group.keys, group.values, strict=True)}
 
 
-@pytest.mark.parametrize("world", [manhattan, city_trees])
-def test_the_estimate_along_a_drive_is_the_batch_answer(world) -> None:
+# With rough odometry trees are first put where they then do not stay: MATH (9.12).
+@pytest.mark.parametrize(
+    ("world", "noise", "worst"),
+    [(manhattan, {}, 1.02), (city_trees, {}, 1.002), (city_trees, {"sigma_xy_m": 0.05, "sigma_theta_rad": 0.03}, 1.002)],
+)
+def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, float], worst: float) -> None:
     solver, ratios = Solver(Options(mode="tree")), []
-    for n, step in enumerate(world(400, 3)):
+    for n, step in enumerate(world(400, 3, **noise)):
         solver.stage(step.batch)
         report = solver.step()
         if n % 50 == 49:
@@ -216,8 +220,8 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world) -> None:
             assert report.chi2 == pytest.approx(
                 solver.chi2(), rel=0.15, abs=1e-3
             )  # the linear problem's, between two looks
-    assert np.median(ratios) < 1.001
-    assert max(ratios) < 1.02
+    assert np.median(ratios) < 1.0005
+    assert max(ratios) < worst
 
 
 def test_a_long_drive_does_not_drift() -> None:

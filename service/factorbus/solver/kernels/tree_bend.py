@@ -10,7 +10,12 @@ makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range
 
     bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
 
-and there both ends have to move.  How a sight is bent, or a factor with a loss, which is by its weight as well, is
+and there both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted against
+the pose, the Jacobian of the pose's turn is off by that share of d, and with it the gradient, whatever φ is:
+
+    slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
+
+the second term for r is that of the linearisation point.  Where that is more than the bend, both ends move.  How a sight is bent, or a factor with a loss, which is by its weight as well, is
 computed: what the linear model misses of √w r, in standard deviations,
 
     bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
@@ -54,6 +59,20 @@ def bend_of(kind: int, root: float, d: float, phi: float, shift: float) -> float
     if kind == at.BEARING_RANGE_SE2 and d > 0.0:
         bend += root * shift * shift / d
     return bend
+
+
+@inline_kernel
+def slip_of(kind: int, root: float, d: float, shift: float, hessian: F64, h: int) -> float:
+    """(9.12); √ω |r| from the gradient of the pose's translation, Ω r.  0 of what sees no landmark."""
+    if d > 0.0 and kind == at.LANDMARK_SE2:
+        g = h + 9 + 6 + 4
+        pull = math.sqrt(load(hessian, g) ** 2 + load(hessian, g + 1) ** 2)
+    elif d > 0.0 and kind == at.LANDMARK_SE3:
+        g = h + 36 + 18 + 9
+        pull = math.sqrt(load(hessian, g) ** 2 + load(hessian, g + 1) ** 2 + load(hessian, g + 2) ** 2)
+    else:
+        return 0.0
+    return (pull / root + root * shift) * shift / d
 
 
 @inline_kernel

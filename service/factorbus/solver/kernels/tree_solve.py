@@ -14,7 +14,7 @@ from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
-from factorbus.solver.kernels.tree_bend import bend_of, shift_between, turn_of
+from factorbus.solver.kernels.tree_bend import bend_of, shift_between, slip_of, turn_of
 from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
@@ -138,12 +138,12 @@ def move_frontals(
 
 @part
 def find_bent(
-    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
-    values: F64, pending: I64, moved: I64, state: I64,
+    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
+    scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
 ) -> float:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
-    more than `bent`, (9.4), and both ends of one for which that is computed, (9.11).  Gives the largest bend, and
-    empties `moved`.
+    more than `bent`, (9.4), with the landmark where that is what has moved, (9.5) and (9.12), and both ends of one for
+    which that is computed, (9.11).  Gives the largest bend, and empties `moved`.
     """
     most, delta = 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
@@ -163,11 +163,14 @@ def find_bent(
                     await_ends(f, fac, var, node, pending, state)
             elif slot % 2 == 0 and phi > 0.0 and link[f, tl.L_FAR] >= 0:
                 shift = shift_between(planar, x, link[f, tl.L_FAR], values, lin)
-                bend = bend_of(link[f, tl.L_KIND], stiff[f, 1], stiff[f, 0], phi, shift)
-                most = max(most, bend)
-                if bend > bent:
+                kind = link[f, tl.L_KIND]
+                bend = bend_of(kind, stiff[f, 1], stiff[f, 0], phi, shift)
+                slip = slip_of(kind, stiff[f, 1], stiff[f, 0], shift, hessian, link[f, tl.L_AT])
+                most = max(most, bend + slip)
+                if bend + slip > bent:
                     await_move(v, node, pending, state)
-                    if link[f, tl.L_KIND] == at.BEARING_RANGE_SE2 and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
+                    both = kind == at.BEARING_RANGE_SE2 or slip > bend
+                    if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
                         await_move(link[f, tl.L_SECOND], node, pending, state)
             slot = next_incidence(slot, link)
     state[tl.S_MOVED] = 0

@@ -227,8 +227,9 @@ def eliminate_again(
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
     if due or account[tl.A_TURN] > settings[tl.P_LOOK]:
         bow = find_bent(
-            settings[tl.P_BENT], var, fac, payload, node, link, stiff, lin[0], scalars, values, pending, moved, state
-        )
+            settings[tl.P_BENT], var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, pending,
+            moved, state,
+        )  # fmt: skip
     lap(now, tl.SUBSTITUTE, state)
     return bow, tl.DONE
 
