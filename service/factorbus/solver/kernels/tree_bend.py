@@ -10,13 +10,14 @@ makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range
 
     bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
 
-and there both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted against
-the pose, the Jacobian of the pose's turn is off by that share of d, and with it the gradient, whatever φ is:
+and there both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted
+against the pose, the Jacobian of the pose's turn is off by that share of d, and with it the gradient, whatever φ is:
 
     slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
 
-the second term for r is that of the linearisation point.  Where that is more than the bend, both ends move.  How a sight is bent, or a factor with a loss, which is by its weight as well, is
-computed: what the linear model misses of √w r, in standard deviations,
+r being the residual at the linearisation point.  Where that is more than the bend, both ends move.  How a sight is
+bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
+standard deviations,
 
     bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
 
