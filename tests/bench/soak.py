@@ -253,7 +253,7 @@ def _churn(bus: Bus, name: str, fleet: Fleet, rotate: int, end: float) -> None:
         row = next(each for each in bus.maps() if each.name == name)
         if row.variables >= rotate:
             return
-        time.sleep(0.2)
+        time.sleep(0.2)  # the map has no mirror here that would tell how far it is
         if time.monotonic() - fleet.killed_at > KILL_EVERY_S:
             fleet.kill_one()
 

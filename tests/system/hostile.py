@@ -57,13 +57,13 @@ class Hostile:
         self.hang = True
         self.send(keys.insert_key(self.map, "bad-1"), b"\x81\xa4what\xd9\xc8" + b"x" * 200)
         if n % 500 == 499:
-            time.sleep(0.01)
+            time.sleep(0.01)  # a flood that its own machine can keep up
 
     def questions(self, n: int) -> None:
         self.hang = True
         self.send(keys.ask_key(self.map, ("estimate", "graph", "export", "stats")[n % 4]), b"")
         if n % 50 == 49:
-            time.sleep(0.01)
+            time.sleep(0.01)  # a flood that its own machine can keep up
 
     def large(self, n: int) -> None:
         own = np.arange(20_000) + (ord("h") << 56)

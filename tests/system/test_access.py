@@ -104,7 +104,7 @@ class Identity:
             while not came and time.monotonic() < until:
                 done = done or act()  # the first may go before the declaration has arrived
                 done = act() if not hasattr(done, "undeclare") else done
-                time.sleep(0.02)
+                time.sleep(0.02)  # nothing tells when a declaration has arrived
             if hasattr(done, "undeclare"):
                 done.undeclare()
         return bool(came)

@@ -39,7 +39,7 @@ def times(driven: Map, first: int, count: int = INSERTS) -> list[float]:
         begun = time.perf_counter()
         driven.insert(draft, timeout_s=30)
         seconds.append(time.perf_counter() - begun)
-        time.sleep(0.005)
+        time.sleep(0.005)  # a robot that inserts at a pace, not as fast as it can
     return seconds
 
 

@@ -225,7 +225,7 @@ def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
     begun = time.monotonic()
     for number, step in enumerate(steps):
         if pace_hz is not None:
-            time.sleep(max(0.0, begun + number / pace_hz - time.monotonic()))
+            time.sleep(max(0.0, begun + number / pace_hz - time.monotonic()))  # the pace that was asked for
         yield step
 
 

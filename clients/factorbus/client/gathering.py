@@ -24,6 +24,7 @@ def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
             if isinstance(verdict, Problem):
                 raise verdict
         pauses = [verdict.pause_s for verdict in verdicts if isinstance(verdict, Again)]
+        # Whoever was busy has said for how long, and of nobody there is nothing to wait on.
         time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))
     hint = "nobody replies: is it running, and may this client ask?"
     raise Unavailable(f"the service, asked for admin/{operation},", timeout_s, hint)
