@@ -21,6 +21,7 @@ of a degree and a lever of a metre 0.15 mm.  MATH §3.7.
 
 import numpy as np
 
+from factorbus.client.frames import compose, inverse, rotation
 from factorbus.proto.arrays import F64
 from factorbus.proto.problems import BadShape
 
@@ -30,44 +31,28 @@ _TOLERANCE = 1e-3
 
 def moved_se2(measured: F64, mount: F64) -> tuple[F64, F64]:
     """(z', A) of z and L, both x y (metres) theta (radians); A (3, 3): r = A r'."""
-    Q, R = _turn(mount[2]), _turn(measured[2])
-    l = mount[:2]
-    moved = np.array([*(l + Q @ measured[:2] - R @ l), measured[2]])
-    A = np.eye(3)
-    A[:2, :2], A[:2, 2] = Q.T, Q.T @ (-l[1], l[0])
-    return moved, A
+    Q, A = rotation(mount), np.eye(3)
+    A[:2, :2], A[:2, 2] = Q.T, Q.T @ (-mount[1], mount[0])
+    return _carried(measured, mount), A
 
 
 def moved_se3(where: str, measured: F64, mount: F64) -> tuple[F64, F64]:
     """(z', A) of z and L, both x y z (metres) qx qy qz qw; A (6, 6): r = A r'.  Raises BadShape: no unit quaternion."""
-    q, z = _unit(f"{where}: mount", mount[3:]), _unit(f"{where}: measured", measured[3:])
-    l, Q = mount[:3], _matrix(q)
-    turn = np.array([*(Q @ z[:3]), z[3]])  # q z q^-1
-    moved = np.array([*(l + Q @ measured[:3] - _matrix(turn) @ l), *turn])
-    A = np.zeros((6, 6))
+    _check_unit(f"{where}: mount", mount)
+    _check_unit(f"{where}: measured", measured)
+    x, y, z = mount[:3]
+    Q, A = rotation(mount), np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = Q.T
-    A[:3, 3:] = -2.0 * Q.T @ np.array([[0.0, -l[2], l[1]], [l[2], 0.0, -l[0]], [-l[1], l[0], 0.0]])
-    return moved, A
+    A[:3, 3:] = -2.0 * Q.T @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return _carried(measured, mount), A
 
 
-def _turn(theta: float) -> F64:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
+def _carried(measured: F64, mount: F64) -> F64:
+    """z' = L z L^-1."""
+    return compose(mount, compose(measured, inverse(mount)[None]))[0]
 
 
-def _unit(where: str, quat_xyzw: F64) -> F64:
-    norm = float(np.linalg.norm(quat_xyzw))
+def _check_unit(where: str, pose: F64) -> None:
+    norm = float(np.linalg.norm(pose[3:]))
     if not abs(norm - 1.0) <= _TOLERANCE:
         raise BadShape(f"{where}: quaternion", f"length {norm:g}", "1: qx qy qz qw")
-    return quat_xyzw / norm
-
-
-def _matrix(quat_xyzw: F64) -> F64:
-    x, y, z, w = quat_xyzw
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
