@@ -9,6 +9,7 @@ from factorbus.solver import Solver
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.packing import Packing
 
+APART = np.zeros((2, 6))[:, ::2]
 EYE3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 
 
@@ -56,6 +57,7 @@ def edge(measured: np.ndarray, keys: np.ndarray | None = None, **more: object) -
         edge(np.zeros((1, 3)), np.array([[1, 2]], np.int32)),
         edge(np.zeros((1, 3)), np.array([1, 2])),
         edge([[0.0, 0.0, 0.0]]),  # type: ignore[arg-type]
+        Batch((), (Factors("between_se2", np.zeros((2, 2), np.int64), APART, np.repeat(EYE3, 2, axis=0)),)),
         edge(np.zeros((1, 3)), loss="huber", scale=np.ones(1)),
         Batch((Variables("se4", np.array([3])),)),
         Batch((Variables("se2", np.array([3]), np.zeros((1, 2))),)),

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -286,3 +287,16 @@ def test_a_step_that_would_raise_chi2_is_replaced_by_a_batch() -> None:
     assert solver.chi2() <= first.chi2()
     assert report.strategy in ("tree", "batch")
     assert solver.step(settle=True).chi2 <= solve_batch(*solver.graph()).chi2 + 1e-6
+
+
+def test_a_robot_that_drives_on_touches_the_root_alone() -> None:
+    """The root has the newest pose: it grows by one in most steps, and is ordered anew when it is too large."""
+    solver, eliminated = Solver(), []
+    solver.stage(Batch((Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True),), ()))
+    for k in range(80):
+        ends, ahead = np.array([[k, k + 1]]), np.array([[1.0, 0.1 * np.sin(k), 0.05 * np.cos(k)]])
+        edge = Factors("between_se2", ends, ahead, np.array([[100.0, 0, 0, 100.0, 0, 400.0]]))
+        solver.stage(Batch((Variables("se2", np.array([k + 1])),), (edge,)))
+        eliminated.append(solver.step().eliminated)
+    assert max(eliminated) <= Options().split_pivots // 3 + 1
+    assert sum(b == a + 1 for a, b in pairwise(eliminated)) >= 0.7 * len(eliminated)

@@ -55,33 +55,13 @@ def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
         check_joints(graph, first_factor)
 
 
-def try_admit(graph: Graph, raw: bytes, groups: I64, reached: I64 | None = None) -> int | None:
+def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
     """As `admit` for a small batch whose columns lie in `raw` where `groups` says; gives the id of its first factor.
 
-    reached: 1 for each new variable that has a value, else 0, where the caller knows; it is written to.  None where
-    anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
+    None where anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
     """
-    mark = graph.mark()
-    missing = admit_bytes(
-        raw, groups, graph.table, graph.keys, graph.var, graph.values, graph.dims, graph.fac, graph.payload,
-        graph.counts,
-    )  # fmt: skip
-    if missing < 0:
-        return None
-    if missing:
-        if reached is None:
-            new = [row for row in _rows(groups) if not row[at.G_FACTORS]]
-            reached = np.array([row[at.G_NUMBERS] >= 0 for row in new for _ in range(row[at.G_COUNT])], np.int64)
-        if _find_missing(graph, mark[at.VARIABLES], mark[at.FACTORS], reached) >= 0:
-            graph.forget(mark)
-            return None
-    return mark[at.FACTORS]
-
-
-def _rows(groups: I64) -> list[list[int]]:
-    rows = groups.tolist()
-    kinds = [row[at.G_KIND] for row in rows]
-    return rows[: kinds.index(at.END)]
+    first = admit_bytes(raw, groups, graph.places())
+    return None if first < 0 else first
 
 
 def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:

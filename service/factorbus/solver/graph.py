@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from factorbus.solver.arenas import Arenas
 from factorbus.solver.errors import printed
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.groups import FactorGroup, Group
@@ -19,16 +20,17 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.move import gather
-from factorbus.solver.rows import Rows
+from factorbus.solver.rows import Rows, Span
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 Mark: TypeAlias = tuple[int, ...]
 
 
-class Graph:
+class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
-    NOT_KEPT = ("_rows",)  # of a solver's state: it follows from the rest
+    ARENAS = at.ARENAS
+    NOT_KEPT = ("_rows", "_places")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         self.keys: I64 = np.empty(16, np.int64)
@@ -91,7 +93,7 @@ class Graph:
 
     def take(self, other: "Graph") -> None:
         """Become `other`."""
-        for name, array in vars(other).items():
+        for name, array in other.__getstate__().items():
             setattr(self, name, array)
 
     def memory_bytes(self) -> int:
@@ -132,20 +134,19 @@ class Graph:
     def variables(self, picked: I64 | None = None) -> list[Group]:
         """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness."""
         if picked is None:
-            following = self._rows.follow(self.var, int(self.counts[at.VARIABLES]))
-            return [self._side_by_side(label, rows) or self._gathered(label, rows) for label, rows in following]
+            spans = self._rows.follow(self.var, int(self.counts[at.VARIABLES]))
+            return [
+                self._side_by_side(span) if span.together else self._gathered(span.label, span.rows()) for span in spans
+            ]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
         return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
 
-    def _side_by_side(self, label: int, rows: I64) -> Group | None:
-        """The group of all variables with one label, `rows`, where no others are between them: their values neither."""
-        first, last = int(rows[0]), int(rows[-1]) + 1
-        if last - first != rows.size:
-            return None
-        kind, start = VARIABLE_KIND_OF_CODE[label // 2], int(self.var[first, at.V_AT])
-        values = self.values[start : start + rows.size * kind.size].copy().reshape(-1, kind.size)
-        return Group(kind.name, self.keys[first:last].copy(), values, fixed=bool(label % 2))
+    def _side_by_side(self, span: Span) -> Group:
+        """The group of all variables with one label, where no others are between them: their values neither."""
+        first, behind, size, start = span.first, span.behind, span.size, span.start
+        values = self.values[start : start + (behind - first) * size].copy().reshape(-1, size)
+        return Group(span.kind, self.keys[first:behind].copy(), values, span.fixed)
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]

@@ -5,6 +5,7 @@ This is the memory of `kernels/tree_step.py`, which does the work in one call; h
 
 import numpy as np
 
+from factorbus.solver.arenas import Arenas
 from factorbus.solver.graph import Graph, grown
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
@@ -19,23 +20,24 @@ _LINE = 8  # doubles in a cache line
 _FEW = 8  # new variables for which good first values are looked for
 
 
-class Tree:
+class Tree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
-    NOT_KEPT = ("_graph", "_settings")
+    ARENAS = tl.ARENAS
+    NOT_KEPT = ("_graph", "settings", "marked", "_places")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph = graph
-        self._settings: F64 = np.empty(tl.P_SIZE)
-        self._settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
-        self._settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
-        self._settings[[tl.P_EVERY, tl.P_LOOK, tl.P_RECENT]] = (
+        self.settings: F64 = np.empty(tl.P_SIZE)
+        self.settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
+        self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
+        self.settings[[tl.P_EVERY, tl.P_LOOK, tl.P_RECENT]] = (
             options.look_every,
             options.look_turned,
             options.recent_steps,
         )
-        self._settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
-        self._settings[tl.P_PLACE] = _FEW if options.place_new else -1
+        self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
+        self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.node: I64 = np.empty((16, tl.N_WIDTH), np.int64)
         self.link: I64 = np.empty((16, tl.L_WIDTH), np.int64)
         self.clique: I64 = np.empty((16, tl.C_WIDTH), np.int64)
@@ -49,6 +51,7 @@ class Tree:
         self.pending: I64 = np.empty(16, np.int64)
         self.changed: I64 = np.empty(16, np.int64)
         self.moved: I64 = np.empty(16, np.int64)
+        self.marked: I64 = np.empty(16, np.int64)
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.account: F64 = np.zeros(tl.A_SIZE)
@@ -62,18 +65,11 @@ class Tree:
         the pivot of variable `failed` was not positive.  INFINITE: the χ² of a new factor is beyond numbers.  After
         these nothing has changed, and the graph has to forget what is new where it is to be refused.
         """
-        graph, state = self._graph, self.state
         if sure:
-            state[tl.S_CHECKED] = 1
-        while True:
-            status = tree_step(
-                graph.counts, self._settings, graph.var, graph.fac, graph.values, graph.payload, self.node, self.link,
-                self.clique, self.lists, self.numbers, self.hessian, self.lin, self.scalars, self.stiff, self.lever,
-                self.pending, self.changed, self.moved, self.saved, state, self.account,
-            )  # fmt: skip
-            if status != tl.NO_ROOM:
-                return status
+            self.state[tl.S_CHECKED] = 1
+        while (status := tree_step(self._graph.places(), self.places())) == tl.NO_ROOM:
             self._make_room()
+        return status
 
     @property
     def failed(self) -> int:
@@ -119,6 +115,8 @@ class Tree:
         state = self.state
         if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
             self.clique = grown(self.clique, need)
+        if len(self.clique) > self.marked.size:
+            self.marked = np.empty(len(self.clique), np.int64)
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:

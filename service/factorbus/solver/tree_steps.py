@@ -26,6 +26,7 @@ from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
+_UNTIMED: dict[str, float] = dict.fromkeys(tl.PHASES, 0.0)
 
 
 class TreeSteps:
@@ -47,8 +48,8 @@ class TreeSteps:
 
     def step(self, settle: bool) -> StepReport:
         """As `Solver.step`."""
-        clock = self._options.clock or _no_clock
-        started = clock()
+        clock = self._options.clock
+        started = clock() if clock else 0.0
         tree, because = self._tree, ""
         try:
             status = tree.step()
@@ -62,18 +63,19 @@ class TreeSteps:
         except BaseException:
             self._graph.forget(self._mark)
             raise
-        compiled = clock()
-        course = None
+        compiled = clock() if clock else 0.0
+        course, account = None, tree.account.tolist()
         if settle and self._graph.counts[at.COLUMNS]:
             tree.exchange()
             before = self._graph.values.copy()
             tree.exchange()
             course, because = self._batch(before, settle=True), "asked to settle"
-        elif tree.account[tl.A_BEND] > self._options.trust and self._is_worse():
+        elif account[tl.A_BEND] > self._options.trust and self._is_worse():
             before = self._graph.values.copy()
             course = self._batch(before, settle=False)
             because = "χ² would have risen: a batch from where the estimate stood"
-        return self._account(started, compiled, clock(), course, because)
+        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else account[tl.A_CHI2]
+        return self._account(started, compiled, course, chi2, because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -152,17 +154,15 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, started: float, compiled: float, done: float, course: Course | None, because: str) -> StepReport:
+    def _account(self, started: float, compiled: float, course: Course | None, chi2: float, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
-        now = self._mark
+        now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         state = self._tree.state[: tl.S_FREE].tolist()
         relinearised, changed = state[tl.S_RELINEARISED], self._moved.size if course else state[tl.S_TOLD]
-        chi2 = self.chi2() if course else float(self._tree.account[tl.A_CHI2])
-        cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
-        share = 1e3 * (compiled - started) / max(sum(cycles), 1)
-        # In the order of the fields: naming them takes longer than all the rest.
-        return StepReport(
+        # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
+        # the rest.
+        return StepReport._make((
             "tree",
             "batch" if course else ("tree" if state[tl.S_CHANGED] or relinearised else "extend"),
             because or f"{relinearised} variables bent too far",
@@ -179,11 +179,14 @@ class TreeSteps:
             float(state[tl.S_FLOPS]),
             0.0,  # damping
             course.converged if course else True,
-            dict(zip(tl.PHASES, [share * count for count in cycles], strict=True)),
-            1e3 * (done - started),
+            _phases(state, 1e3 * (compiled - started)) if clock else _UNTIMED.copy(),
+            1e3 * (clock() - started) if clock else 0.0,
             1e3 * (compiled - started),
-        )
+        ))  # fmt: skip
 
 
-def _no_clock() -> float:
-    return 0.0
+def _phases(state: list[int], compiled_ms: float) -> dict[str, float]:
+    """Milliseconds by phase: the compiled call's in proportion to the cycles they took."""
+    cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
+    share = compiled_ms / max(sum(cycles), 1)
+    return dict(zip(tl.PHASES, [share * count for count in cycles], strict=True))

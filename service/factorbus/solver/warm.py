@@ -30,7 +30,7 @@ def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -
 def list_missing(*packages: ModuleType) -> list[Any]:
     """The kernels in `packages`, the solver's own by default, that are not on disk: compiling one puts it there.
 
-    Those that take longest come first, near enough: they have the most arguments.
+    Those that take longest come first, near enough: their files bring the most together.
     """
     found = [
         one
@@ -39,7 +39,7 @@ def list_missing(*packages: ModuleType) -> list[Any]:
         for one in group
         if not is_on_disk(one)
     ]
-    return sorted(found, key=lambda one: -one.factorbus_signatures[0].count(","))
+    return sorted(found, key=lambda one: -len(one.py_func.__globals__))
 
 
 def _iter_groups(package: ModuleType = kernels) -> Iterator[tuple[str, list[Any]]]:

@@ -17,32 +17,28 @@ from factorbus.solver.kernels.admit import (
     remove_keys,
     slot_of,
 )
+from factorbus.solver.kernels.places import floats, int_rows, ints
+from factorbus.solver.kernels.reach import reach
 
 
-@kernel(
-    "int64(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], int64[::1], int64[::1], int64[:,::1], float64[::1],"
-    " int64[::1], int64[:,::1], float64[::1], int64[::1])"
-)
-def admit_bytes(
-    raw: bytes,
-    groups: I64,
-    table: I64,
-    keys: I64,
-    var: I64,
-    values: F64,
-    dims: I64,
-    fac: I64,
-    payload: F64,
-    counts: I64,
-) -> int:
-    """Append the groups of variables and factors in `raw`.
+@kernel("int64(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], int64[::1])")
+def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
+    """Append the groups of variables and factors in `raw`, and give values to the variables that come without.
 
-    Gives how many of the variables still need a value, or −1: nothing changed.
+    graph: the table of its arenas (`places`).  Gives the number of the first factor, or −1: nothing changed.
     """
+    table, keys, var = ints(graph, at.T_TABLE), ints(graph, at.T_KEYS), int_rows(graph, at.T_VAR)
+    values, dims, fac = floats(graph, at.T_VALUES), ints(graph, at.T_DIMS), int_rows(graph, at.T_FAC)
+    payload, counts = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS)
     before = counts.copy()
+    v0, f0 = before[at.VARIABLES], before[at.FACTORS]
     if take_groups(raw, groups, table, keys, var, values, dims, fac, payload, counts):
-        return count_missing(groups)
-    remove_keys(before[at.VARIABLES], counts[at.VARIABLES], table, keys)
+        if count_missing(groups) == 0:
+            return f0
+        reached = list_given(groups, counts[at.VARIABLES] - v0)
+        if reach(True, v0, f0, counts[at.FACTORS], var, fac, values, payload, reached) < 0:
+            return f0
+    remove_keys(v0, counts[at.VARIABLES], table, keys)
     counts[:] = before
     return -1
 
@@ -131,6 +127,19 @@ def count_missing(groups: I64) -> int:
             missing += groups[g, at.G_COUNT]
         g += 1
     return missing
+
+
+@part
+def list_given(groups: I64, count: int) -> I64:
+    """For each new variable whether it came with a value: 1 or 0."""
+    given, g, v = np.zeros(count, np.int64), 0, 0
+    while groups[g, at.G_KIND] != at.END:
+        if groups[g, at.G_FACTORS] == 0:
+            if groups[g, at.G_NUMBERS] >= 0:
+                given[v : v + groups[g, at.G_COUNT]] = 1
+            v += groups[g, at.G_COUNT]
+        g += 1
+    return given
 
 
 @part

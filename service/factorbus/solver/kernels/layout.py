@@ -6,7 +6,14 @@ The arenas are:
     values   float64         the variables' values, packed one after the other
     payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
     counts   (6,)   int64    how much of each arena is in use
+    keys     (n,)   int64    the variables' keys
+    table    int64           where a key is found (`admit`)
+    dims     (c,)   int64    scalars of each block column of Λ
 """
+
+# These in a graph's table (`places`).
+ARENAS = ("var", "fac", "values", "payload", "counts", "keys", "table", "dims")
+T_VAR, T_FAC, T_VALUES, T_PAYLOAD, T_COUNTS, T_KEYS, T_TABLE, T_DIMS = range(len(ARENAS))
 
 # Columns of `var`.
 V_KIND = 0

@@ -7,7 +7,7 @@ few factors cost, and what is left for the whole system to solve is much smaller
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, kernel, part
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.points import move_point2, move_point3
 from factorbus.solver.kernels.se2 import move_se2
@@ -27,13 +27,11 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: 
     """
     M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
     for v in range(v0, v1):
-        if var[v, at.V_COLUMN] < 0:
+        if var[v, at.V_COLUMN] < 0 or not is_seen_twice(v, f0, f1, fac):
             continue
         x, kind = var[v, at.V_AT], var[v, at.V_KIND]
         dim, size = dim_of(kind), size_of(kind)
-        count, chi2 = gather_system(v, f0, f1, var, fac, values, payload, M, z)
-        if count < 2:
-            continue
+        chi2 = gather_system(v, f0, f1, var, fac, values, payload, M, z)
         for _ in range(_ITERATIONS):
             if not chi2 > least or cholesky(dim, M, z) >= 0:
                 break
@@ -45,7 +43,7 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: 
             for c in range(size):
                 before[c] = values[x + c]
             move_one(kind, values, x, step)
-            count, reached = gather_system(v, f0, f1, var, fac, values, payload, M, z)
+            reached = gather_system(v, f0, f1, var, fac, values, payload, M, z)
             if not reached <= chi2:
                 for c in range(size):
                     values[x + c] = before[c]
@@ -55,13 +53,23 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: 
                 break
 
 
+@inline_kernel
+def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
+    """Whether more than one of the factors f0 .. f1−1 is on variable v."""
+    count = 0
+    for f in range(f0, f1):
+        if fac[f, at.F_I] == v or fac[f, at.F_J] == v:
+            count += 1
+            if count > 1:
+                return True
+    return False
+
+
 @part
-def gather_system(
-    v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, M: F64, z: F64
-) -> tuple[int, float]:
-    """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their count and χ²."""
+def gather_system(v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, M: F64, z: F64) -> float:
+    """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ²."""
     r, H, W = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros((6, 6))
-    width, count, chi2 = dim_of(var[v, at.V_KIND]), 0, 0.0
+    width, chi2 = dim_of(var[v, at.V_KIND]), 0.0
     M[:, :], z[:] = 0.0, 0.0
     for f in range(f0, f1):
         end = 0 if fac[f, at.F_I] == v else 1
@@ -80,8 +88,7 @@ def gather_system(
                     z[i] -= H[end, a, i] * W[a, b] * r[b]
                     for j in range(i, width):
                         M[i, j] += H[end, a, i] * W[a, b] * H[end, b, j]
-        count += 1
-    return count, chi2
+    return chi2
 
 
 @part

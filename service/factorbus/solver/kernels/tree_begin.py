@@ -4,8 +4,8 @@ import numpy as np
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64, I64, part
-from factorbus.solver.kernels.reach import reach
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.reach import follow, reach
 from factorbus.solver.kernels.settle_new import settle_new
 
 # Doubles of the largest Hessian record.
@@ -34,7 +34,10 @@ def begin(
         held = np.empty(v1 - v0, np.int64)
         for v in range(v0, v1):
             held[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
-        if reach(False, v0, f0, f1, var, fac, values, payload, held) >= 0:
+        if (
+            not are_held_in_turn(v0, f0, f1, var, fac, values, payload, held)
+            and reach(False, v0, f0, f1, var, fac, values, payload, held) >= 0
+        ):
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
     state[tl.S_ELIMINATED : tl.S_ROUNDS + 1] = 0
@@ -43,3 +46,15 @@ def begin(
     state[tl.S_STEP] += 1
     state[tl.S_BEGUN] = 1
     return tl.DONE
+
+
+@inline_kernel
+def are_held_in_turn(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> bool:
+    """Whether the factors f0 .. f1−1, each once and in their order, hold all: as they do where a robot drives on."""
+    left = 0
+    for k in range(held.size):
+        left += 1 - held[k]
+    for f in range(f0, f1):
+        if left > 0 and follow(False, f, v0, var, fac, values, payload, held) >= 0:
+            left -= 1
+    return left == 0

@@ -23,9 +23,22 @@ The arenas of a tree are:
     lever   (n,) float64     the largest d √ω of what a variable sees
     pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
                              since they were looked at last
+    marked  (c,) int64       scratch: cliques that an elimination touches
+    saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
+    settings (11,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (4,) float64     what a step found
 """
+
+# The arenas of a tree in its table (`places`).
+ARENAS = (
+    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "lever", "pending",
+    "changed", "moved", "marked", "saved", "state", "account",
+)  # fmt: skip
+(
+    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_LEVER, T_PENDING,
+    T_CHANGED, T_MOVED, T_MARKED, T_SAVED, T_STATE, T_ACCOUNT,
+) = range(len(ARENAS))  # fmt: skip
 
 # Columns of `node`.
 N_CLIQUE = 0  # where it is a frontal; -1: nowhere yet, or fixed

@@ -15,16 +15,21 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
 
 @part
 def order_affected(
-    n: int, affected: I64, factors: I64, orphans: I64, recent: int,
+    n: int, affected: I64, factors: I64, orphans: I64, recent: int, last: int,
     var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64,
 ) -> I64:  # fmt: skip
-    """perm (n,): affected[perm[k]] is eliminated k-th.  Variables with a factor in the last `recent` steps go last."""
+    """perm (n,): affected[perm[k]] is eliminated k-th.
+
+    Variables with a factor in the last `recent` steps go last, and the variable `last` last of all; −1: none does.
+    """
     dims, group = np.empty(n, np.int64), np.zeros(n, np.int64)
     since = state[tl.S_STEP] - recent
     for k in range(n):
         v = affected[k]
         dims[k] = dim_of_variable(var, v)
-        if node[v, tl.N_SEEN] > since:
+        if v == last:
+            group[k] = 2
+        elif node[v, tl.N_SEEN] > since:
             group[k] = 1
     stamp, m = state[tl.S_STAMP], orphans.size
     length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
@@ -67,6 +72,15 @@ def order_affected(
             put[i] += 1
             put[j] += 1
     return eliminate(n, dims, begin, length, elements, kind, near, total, degree, group)
+
+
+@inline_kernel
+def find_newest(count: int, var: I64) -> int:
+    """The newest pose that is free, of the first `count` variables; −1: there is none."""
+    v = count - 1
+    while v >= 0 and (var[v, at.V_COLUMN] < 0 or (var[v, at.V_KIND] != at.SE2 and var[v, at.V_KIND] != at.SE3)):
+        v -= 1
+    return v
 
 
 @part

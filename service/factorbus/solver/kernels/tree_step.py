@@ -19,6 +19,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.cycles import cycles
+from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
 from factorbus.solver.kernels.tree_fronts import (
@@ -31,7 +32,7 @@ from factorbus.solver.kernels.tree_fronts import (
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
-from factorbus.solver.kernels.tree_order import find_lowest, list_pairs, order_affected
+from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
 from factorbus.solver.kernels.tree_solve import find_bent, substitute
 from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
@@ -40,17 +41,9 @@ FREE = 0
 LEAST_CHI2 = 1e-3
 
 
-@kernel(
-    "int64(int64[::1], float64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[:,::1],"
-    " int64[:,::1], int64[:,::1], int64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1],"
-    " float64[:,::1], float64[::1], int64[::1], int64[::1], int64[::1], float64[:,::1], int64[::1], float64[::1])"
-)
-def tree_step(
-    counts: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, clique: I64,
-    lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64, pending: I64, changed: I64,
-    moved: I64, saved: F64, state: I64, account: F64,
-) -> int:  # fmt: skip
-    """Take in what is new in the graph, and solve.
+@kernel("int64(int64[::1], int64[::1])")
+def tree_step(graph: I64, tree: I64) -> int:
+    """Take in what is new in the graph, and solve.  graph, tree: tables of their arenas (`places`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
@@ -58,8 +51,18 @@ def tree_step(
     the last two the tree is as it was before the step.
     """
     began = cycles()
+    counts, var, fac = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
+    values, payload, settings = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD), floats(tree, tl.T_SETTINGS)
+    node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
+    lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
+    lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
+    lever, pending, changed = floats(tree, tl.T_LEVER), ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
+    moved, marked, saved = ints(tree, tl.T_MOVED), ints(tree, tl.T_MARKED), float_rows(tree, tl.T_SAVED)
+    state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
     if state[tl.S_BEGUN] == 0:
+        if len(clique) > marked.size:
+            return tl.NO_ROOM
         status = begin(counts, settings, var, fac, values, payload, node, link, hessian, lin, scalars, saved, state)
         if status != tl.DONE:
             return status
@@ -77,13 +80,13 @@ def tree_step(
         return tl.INFINITE
     wait = state[tl.S_WAIT] != 0
     while True:
-        if not wait:
+        if not wait and state[tl.S_PENDING] > 0:
             some = pending[: state[tl.S_PENDING]]
             relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
         lap(began, tl.LINEARISE, state)
         bow, status = eliminate_again(
             v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, lever, pending, changed, moved, state, account,
+            scalars, stiff, lever, pending, changed, moved, marked, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
@@ -132,13 +135,13 @@ def residual_unit(factors: int, account: F64) -> float:
 def eliminate_again(
     v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
-    pending: I64, changed: I64, moved: I64, state: I64, account: F64,
+    pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
 ) -> tuple[float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, and the status."""
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
-    marked, count = np.empty(state[tl.S_ALIVE], np.int64), 0
+    count = 0
     for f in range(state[tl.S_TAKEN], f1):
         count = touch_ends(f, fac, node, clique, state, marked, count)
     if not wait:
@@ -175,8 +178,11 @@ def eliminate_again(
         order, place, home, records, border_at, border_of = keep_root(n, affected, var)
         lowest = find_lowest(place, orphans, node, clique, lists, state)
     else:
+        # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
+        drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and (wait or state[tl.S_PENDING] == 0)
+        last = find_newest(v1, var) if drives_on else -1
         perm = order_affected(
-            n, affected, factors, orphans, int(settings[tl.P_RECENT]), var, fac, node, clique, lists, state
+            n, affected, factors, orphans, int(settings[tl.P_RECENT]), last, var, fac, node, clique, lists, state
         )
         label = np.empty(n, np.int64)
         for k in range(n):

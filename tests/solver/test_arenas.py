@@ -1,0 +1,73 @@
+"""The table of addresses that kernels find arrays by tells of the arrays that are there now."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from factorbus.solver import Solver
+from factorbus.solver.arenas import Arenas
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.places import WIDTH
+
+
+class Two(Arenas):
+    ARENAS = ("first", "second")
+
+    def __init__(self) -> None:
+        self.first, self.second = np.arange(3), np.zeros((4, 2))
+        self.other = np.zeros(2)
+
+
+def rows(thing: Arenas) -> list[tuple[int, ...]]:
+    return [tuple(row) for row in thing.places().reshape(-1, WIDTH).tolist()]
+
+
+def of(array: np.ndarray) -> tuple[int, ...]:
+    return (array.ctypes.data, *array.shape, 1)[:WIDTH]
+
+
+def test_it_has_address_and_shape_of_each() -> None:
+    two = Two()
+    assert rows(two) == [of(two.first), of(two.second)]
+    assert two.places() is two.places()
+
+
+def test_it_follows_an_assignment() -> None:
+    two = Two()
+    table = two.places()
+    two.other = np.zeros(5)
+    assert two.places() is table
+    two.second = np.ones((8, 2))
+    assert rows(two) == [of(two.first), of(two.second)]
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda two: pickle.loads(pickle.dumps(two))])
+def test_a_copy_has_one_of_its_own(again) -> None:
+    two = Two()
+    two.places()
+    other = again(two)
+    assert rows(other) == [of(other.first), of(other.second)]
+    other.first = np.zeros(9)
+    assert rows(two) == [of(two.first), of(two.second)]
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((4, 4))[:, 1], np.zeros(3, np.float32), np.zeros((2, 2, 2)), np.array(1.0)])
+def test_what_no_kernel_could_work_on_is_refused(wrong: np.ndarray) -> None:
+    two = Two()
+    two.first = wrong
+    with pytest.raises(TypeError, match="first is"):
+        two.places()
+
+
+def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
+    solver = Solver()
+    assert solver._tree
+    tree = solver._tree.tree
+    for thing, names in ((solver._graph, at.ARENAS), (tree, tl.ARENAS)):
+        assert rows(thing) == [of(getattr(thing, name)) for name in names]
+    assert Graph.ARENAS[at.T_FAC] == "fac"
+    assert type(tree).ARENAS[tl.T_ACCOUNT] == "account"
