@@ -81,14 +81,12 @@ class Blocks:
         turned = _changes(free_second) < _changes(free_first)
         hubs, partners = (free_second, free_first) if turned else (free_first, free_second)
         order = np.argsort(hubs, kind="stable") if _changes(hubs) else np.arange(hubs.size)
-        sorted_blocks = np.zeros((first.size, self.width, self.width))
+        blocks = np.zeros((first.size, self.width, self.width))
         cross_blocks(
-            np.ascontiguousarray(hubs[order]), np.ascontiguousarray(partners[order]), f.order, f.scalar, f.node,
-            f.clique, f.lists, f.numbers, f.dims, sorted_blocks,
+            np.ascontiguousarray(hubs[order]), np.ascontiguousarray(partners[order]), order, f.order, f.scalar, f.node,
+            f.clique, f.lists, f.numbers, f.dims, turned, blocks,
         )  # fmt: skip
-        blocks = np.empty_like(sorted_blocks)
-        blocks[order] = sorted_blocks
-        return blocks.transpose(0, 2, 1) if turned else blocks
+        return blocks
 
     def _single_pairs(self, first: I64, second: I64) -> F64:
         """The same, each from the paths of its two ends."""

@@ -78,16 +78,19 @@ def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
     graph, n = blocks.factored.graph, last - first
     ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
     both = np.flatnonzero(ends[:, 1] >= 0)
-    cross = np.zeros((n, blocks.width, blocks.width))
-    if both.size:
+    if both.size == n:
+        cross = blocks.pairs(ends[:, 0], ends[:, 1])
+    else:
+        cross = np.zeros((n, blocks.width, blocks.width))
         cross[both] = blocks.pairs(ends[both, 0], ends[both, 1])
     diagonal, places = _diagonal(blocks, ends)
     dims = _SIZES[graph.fac[first:last, at.F_KIND], 0]
     widest = int(dims.max(initial=1))
     distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, widest, widest))
+    room = _room(min(n, _CHUNK))
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
-        linear = linearised(graph, first + start, first + stop)
+        linear = linearised(graph, first + start, first + stop, room)
         rows = slice(start, stop)
         judge(
             places[rows], linear.sizes, linear.r, linear.A, linear.B, linear.W, diagonal, cross[rows],
@@ -109,15 +112,20 @@ def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
     return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
 
 
-def linearised(graph: Graph, first: int, last: int) -> Linear:
-    """The factors first .. last−1 at the estimate."""
-    n = last - first
-    r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
+def linearised(graph: Graph, first: int, last: int, room: tuple[F64, F64, F64, F64] | None = None) -> Linear:
+    """The factors first .. last−1 at the estimate; in `room`, if there is some, for so long as it is not used again."""
+    r, A, B, W = (array[: last - first] for array in room or _room(last - first))
     evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
     r = np.ascontiguousarray(r[:, :LARGEST])  # without what became of a sight
     fac = graph.fac[first:last]
     ends = np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1])
     return Linear(ends, _SIZES[fac[:, at.F_KIND]], r, A, B, W)
+
+
+def _room(n: int) -> tuple[F64, F64, F64, F64]:
+    """For r, A, B, W of n factors."""
+    A, B, W = (np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
+    return np.zeros((n, at.R_SIZE)), A, B, W
 
 
 def _sizes() -> I64:

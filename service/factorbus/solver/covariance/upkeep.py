@@ -134,8 +134,8 @@ class Upkeep:
         partners[self._scalar[partners] < 0] = -1
         cross = np.zeros((hubs.size, width, width))
         cross_blocks(
-            hubs, partners, self._order(), self._scalar, tree.node, tree.clique, tree.lists, tree.numbers, self._dims,
-            cross,
+            hubs, partners, np.arange(hubs.size), self._order(), self._scalar, tree.node, tree.clique, tree.lists,
+            tree.numbers, self._dims, False, cross,
         )  # fmt: skip
         Z, start = np.zeros((old, len(L), width)), 0
         for k, v in enumerate(ends.tolist()):

@@ -7,9 +7,9 @@ anything else there does not compile these anew.
 from pathlib import Path
 
 from factorbus.solver.kernels import simd
-from factorbus.solver.kernels._jit import DISABLED, F64, I64, KernelFolder
+from factorbus.solver.kernels._jit import BOUNDSCHECK, DISABLED, F64, I64, KernelFolder
 
-__all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
+__all__ = ["BOUNDSCHECK", "DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
 
 _BORROWED = ("layout", "tree_layout", "simd", "simd_llvm", "simd_checked", "simd_plain")
 _FOLDER = KernelFolder(

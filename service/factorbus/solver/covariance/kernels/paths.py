@@ -7,10 +7,14 @@ Y_A is zero but for the cliques between A and its root, so only those are read.
 
 import numpy as np
 
-from factorbus.solver.covariance.kernels.compile import F64, I64, kernel, part
-from factorbus.solver.covariance.kernels.substitute import COLUMNS, forward
+from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.covariance.kernels.squares import padded
+from factorbus.solver.covariance.kernels.substitute import GROUP, forward
+from factorbus.solver.covariance.kernels.tiles import negative
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put
+from factorbus.solver.kernels.simd import at as load
 
 
 @kernel(
@@ -33,22 +37,31 @@ def joint_block(
             rows += dims[lists[s]]
         widest = max(widest, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
     d = len(out)
-    groups = (d + COLUMNS - 1) // COLUMNS
-    y, local, places = np.zeros((groups * COLUMNS, rows)), np.empty((COLUMNS, widest)), np.empty(widest, np.int64)
+    ld = padded(d)
+    local = (rows + d) * ld
+    a = np.zeros(local + widest * min(ld, GROUP * LANES))
     column = 0
     for v in variables:
-        for a in range(dims[v]):
-            y[column, row_of[v] + a] = 1.0
+        for i in range(dims[v]):
+            put(a, (row_of[v] + i) * ld + column, 1.0)
             column += 1
     for c in order:
-        for g in range(groups):
-            forward(clique[c], lists, numbers, dims, row_of, g * COLUMNS, places, local, y)
+        for g in range(0, ld, GROUP * LANES):
+            vectors = min(GROUP, (ld - g) // LANES)
+            forward(clique[c], lists, numbers, dims, row_of, a, g, ld, vectors, local)
+    square(rows, d, a, ld)
     for i in range(d):
         for j in range(i, d):
-            total, yi, yj = 0.0, y[i], y[j]
-            for k in range(rows):
-                total += yi[k] * yj[k]
-            out[i, j] = out[j, i] = total
+            out[i, j] = out[j, i] = -load(a, (rows + i) * ld + j)
+
+
+@inline_kernel
+def square(rows: int, d: int, a: F64, ld: int) -> None:
+    """−YᵀY behind Y, which is at the start of `a`, as far as it is right of the diagonal."""
+    for i in range(0, d, TILE_ROWS):
+        for j in range(i - i % LANES, d, TILE_VECTORS * LANES):
+            some = min(TILE_VECTORS, (d - j + LANES - 1) // LANES)
+            negative(a, min(TILE_ROWS, d - i), some, (rows + i) * ld + j, ld, a, i, 1, ld, j, ld, rows)
 
 
 @part

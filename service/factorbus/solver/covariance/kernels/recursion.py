@@ -11,7 +11,15 @@ covariances of those above the present one stand in a pile.
 import numpy as np
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.covariance.kernels.squares import gather, room_of, row_length, solve_clique, square_size
+from factorbus.solver.covariance.kernels.squares import (
+    gather,
+    room_of,
+    row_length,
+    solve_clique,
+    square_size,
+    working_size,
+)
+from factorbus.solver.covariance.kernels.substitute import fetch
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.simd import at as load
 
@@ -46,11 +54,13 @@ def diagonal_blocks(order: I64, clique: I64, lists: I64, numbers: F64, dims: I64
     out  (n, d, d): upper left corners
     """
     starts, level, widest, first, size = lay_out(order, clique)
-    a = np.zeros(size)
-    column, runs = np.empty(len(dims), np.int64), np.empty(3 * widest, np.int64)
+    a = np.empty(size)
+    column, runs = np.empty(len(dims), np.int64), np.empty(5 * widest, np.int64)
     starts[0] = first
-    for c in order:
+    for k in range(order.size):
+        c = order[k]
         row, depth = clique[c], level[c]
+        fetch(clique[order[min(k + 1, order.size - 1)]], numbers)
         starts[depth + 1] = starts[depth] + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
         if row[tl.C_BORDER] > 0:
             above = clique[row[tl.C_PARENT]]
@@ -78,7 +88,7 @@ def lay_out(order: I64, clique: I64) -> tuple:
     size, starts[0] = first, first
     for c in order:
         starts[level[c] + 1] = starts[level[c]] + square_size(clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER])
-        size = max(size, starts[level[c] + 1])
+        size = max(size, starts[level[c]] + working_size(clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER]))
     return starts, level, widest, first, size
 
 

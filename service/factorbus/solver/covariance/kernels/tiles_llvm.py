@@ -1,0 +1,198 @@
+"""The functions of `tiles` as LLVM, without range checks.  The size of a tile is chosen at run time by a switch."""
+
+from typing import Any
+
+from factorbus.solver.kernels import simd_llvm as simd
+from factorbus.solver.kernels._jit import cgutils, intrinsic, ir, types
+
+_I64 = ir.IntType(64)
+_RUN = ir.VectorType(ir.DoubleType(), 4)
+_INT = types.int64
+_LINE = 8  # doubles in a line of the cache
+_PTR, _INT_PTR = ir.DoubleType().as_pointer(), _I64.as_pointer()
+_PRODUCTS = {m * 4 + v: (m, v) for m in (1, 2, 3, 4) for v in (1, 2, 3)}
+_HEIGHTS = {m: (m,) for m in (1, 2, 3, 4)}
+
+
+@intrinsic
+def copy_runs(_typing: Any, a: Any, _target: Any, _source: Any, runs: Any, _first: Any, _count: Any) -> Any:
+    """Four doubles each: see `tiles_plain.copy_runs`"""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array, target, source, pairs, first, count = args
+        target, source = (simd._address(context, builder, signature, array, where) for where in (target, source))
+        function = simd._define(builder, "factorbus_copy_runs", [_PTR, _PTR, _INT_PTR, _I64], _build_copy_runs)
+        builder.call(function, [target, source, _address(context, builder, runs, pairs, first), count])
+        return context.get_dummy_value()
+
+    return types.void(a, _INT, _INT, runs, _INT, _INT), emit
+
+
+@intrinsic
+def copy_vectors(_typing: Any, a: Any, _target: Any, _source: Any, _count: Any) -> Any:
+    """`count` vectors: see `tiles_plain.copy_vectors`"""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        target, source = (simd._address(context, builder, signature, args[0], where) for where in args[1:3])
+        function = simd._define(builder, "factorbus_copy_vectors", [_PTR, _PTR, _I64], _build_copy_vectors)
+        builder.call(function, [target, source, args[3]])
+        return context.get_dummy_value()
+
+    return types.void(a, _INT, _INT, _INT), emit
+
+
+@intrinsic
+def prefetch(_typing: Any, b: Any, _first: Any, _count: Any) -> Any:
+    """b[first : first+count] is read soon"""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        start = simd._address(context, builder, signature, args[0], args[1])
+        builder.call(simd._define(builder, "factorbus_prefetch", [_PTR, _I64], _build_prefetch), [start, args[2]])
+        return context.get_dummy_value()
+
+    return types.void(b, _INT, _INT), emit
+
+
+@intrinsic
+def subtract(
+    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _x: Any, _row: Any, _column: Any,
+    _y: Any, _ldy: Any, _depth: Any,
+) -> Any:  # fmt: skip
+    """C −= X Y in registers: see `tiles_plain.subtract`"""
+    return _product(a, b, "factorbus_subtract", fresh=False)
+
+
+@intrinsic
+def negative(
+    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _x: Any, _row: Any, _column: Any,
+    _y: Any, _ldy: Any, _depth: Any,
+) -> Any:  # fmt: skip
+    """C = −X Y: see `tiles_plain.negative`"""
+    return _product(a, b, "factorbus_negative", fresh=True)
+
+
+@intrinsic
+def solve_upper(
+    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _u: Any, _ldu: Any
+) -> Any:  # fmt: skip
+    """C = U⁻¹ C: see `tiles_plain.solve_upper`"""
+    return _solution(a, b, "factorbus_solve_upper", upper=True)
+
+
+@intrinsic
+def solve_lower(
+    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _u: Any, _ldu: Any
+) -> Any:  # fmt: skip
+    """C = U⁻ᵀ C: see `tiles_plain.solve_lower`"""
+    return _solution(a, b, "factorbus_solve_lower", upper=False)
+
+
+def _product(a: Any, b: Any, name: str, fresh: bool) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array, rows, vectors, c, ldc, other, x, row, column, y, ldy, depth = args
+        c, y = (simd._address(context, builder, signature, array, where) for where in (c, y))
+        x = _address(context, builder, b, other, x)
+        case = builder.add(builder.mul(rows, _I64(4)), vectors)
+        args = [c, ldc, x, row, column, y, ldy, depth]
+        simd._switch(builder, case, name, _PRODUCTS, args, lambda *given: _build_product(*given, fresh=fresh))
+        return context.get_dummy_value()
+
+    return types.void(a, *[_INT] * 4, b, *[_INT] * 6), emit
+
+
+def _solution(a: Any, b: Any, name: str, upper: bool) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array, rows, vectors, c, ldc, other, u, ldu = args
+        c, u = simd._address(context, builder, signature, array, c), _address(context, builder, b, other, u)
+        build = _build_upper if upper else _build_lower
+        simd._switch(builder, rows, name, _HEIGHTS, [c, ldc, u, ldu, vectors], build)
+        return context.get_dummy_value()
+
+    return types.void(a, *[_INT] * 4, b, *[_INT] * 2), emit
+
+
+def _build_copy_runs(builder: Any, target: Any, source: Any, pairs: Any, count: Any) -> None:
+    with simd._loop(builder, _I64(0), count, 1) as (k, _carried):
+        pair = builder.gep(pairs, [builder.mul(k, _I64(2))])
+        start, into = (builder.load(builder.gep(pair, [_I64(n)])) for n in (0, 1))
+        values = builder.load(builder.bitcast(builder.gep(source, [start]), _RUN.as_pointer()), align=8)
+        builder.store(values, builder.bitcast(builder.gep(target, [into]), _RUN.as_pointer()), align=8)
+
+
+def _build_copy_vectors(builder: Any, target: Any, source: Any, count: Any) -> None:
+    with simd._loop(builder, _I64(0), builder.mul(count, _I64(simd.LANES)), simd.LANES) as (k, _carried):
+        simd._store(builder, simd._load(builder, builder.gep(source, [k])), builder.gep(target, [k]))
+
+
+def _build_prefetch(builder: Any, start: Any, count: Any) -> None:
+    byte, short = ir.IntType(8).as_pointer(), ir.IntType(32)
+    kind = ir.FunctionType(ir.VoidType(), [byte, short, short, short])
+    fetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+    with simd._loop(builder, _I64(0), count, _LINE) as (k, _carried):
+        # To be read, kept in every cache, data.
+        builder.call(fetch, [builder.bitcast(builder.gep(start, [k]), byte), short(0), short(3), short(1)])
+
+
+def _build_product(
+    builder: Any, shape: tuple[int, int], c: Any, ldc: Any, x: Any, row: Any, column: Any, y: Any, ldy: Any, depth: Any,
+    fresh: bool,
+) -> None:  # fmt: skip
+    rows, vectors = shape
+    corners = [
+        builder.gep(c, [builder.add(builder.mul(ldc, _I64(i)), _I64(v * simd.LANES))])
+        for i in range(rows)
+        for v in range(vectors)
+    ]
+    nothing = ir.Constant(simd._VEC, [0.0] * simd.LANES)
+    sums = [nothing if fresh else simd._load(builder, corner) for corner in corners]
+    lines = [builder.gep(x, [builder.mul(row, _I64(i))]) for i in range(rows)]
+    with simd._loop(builder, _I64(0), depth, 1, sums) as (k, carried):
+        offset, across = builder.mul(k, ldy), builder.mul(k, column)
+        line = [
+            simd._load(builder, builder.gep(y, [builder.add(offset, _I64(v * simd.LANES))])) for v in range(vectors)
+        ]
+        for i in range(rows):
+            factor = simd._spread(builder, builder.fneg(builder.load(builder.gep(lines[i], [across]))))
+            for v in range(vectors):
+                carried[i * vectors + v] = simd._multiply_add(builder, factor, line[v], carried[i * vectors + v])
+    for corner, value in zip(corners, carried.final, strict=True):
+        simd._store(builder, value, corner)
+
+
+def _build_upper(builder: Any, shape: tuple[int], c: Any, ldc: Any, u: Any, ldu: Any, vectors: Any) -> None:
+    _build_solution(builder, range(shape[0] - 1, -1, -1), c, ldc, u, ldu, vectors)
+
+
+def _build_lower(builder: Any, shape: tuple[int], c: Any, ldc: Any, u: Any, ldu: Any, vectors: Any) -> None:
+    _build_solution(builder, range(shape[0]), c, ldc, u, ldu, vectors)
+
+
+def _build_solution(builder: Any, order: range, c: Any, ldc: Any, u: Any, ldu: Any, vectors: Any) -> None:
+    """Row by row in `order`, each less what those before it say."""
+
+    def entry(i: int, j: int) -> Any:
+        return builder.load(builder.gep(u, [builder.add(builder.mul(ldu, _I64(i)), _I64(j))]))
+
+    one = ir.Constant(ir.DoubleType(), 1.0)
+    inverse = {i: simd._spread(builder, builder.fdiv(one, entry(i, i))) for i in order}
+    minus = {
+        (i, k): simd._spread(builder, builder.fneg(entry(min(i, k), max(i, k))))
+        for n, i in enumerate(order)
+        for k in order[:n]
+    }
+    with simd._loop(builder, _I64(0), vectors, 1) as (v, _carried):
+        start = builder.mul(v, _I64(simd.LANES))
+        places = {i: builder.gep(c, [builder.add(start, builder.mul(ldc, _I64(i)))]) for i in order}
+        solved: dict[int, Any] = {}
+        for i in order:
+            value = simd._load(builder, places[i])
+            for k in solved:
+                value = simd._multiply_add(builder, minus[i, k], solved[k], value)
+            solved[i] = builder.fmul(value, inverse[i])
+        for i, value in solved.items():
+            simd._store(builder, value, places[i])
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Of an element of an array that is not the first argument."""
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
