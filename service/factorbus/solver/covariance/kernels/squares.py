@@ -2,8 +2,8 @@
 
 A square has a row for every scalar, frontals first, and as many columns, those of the separator from a multiple of
 LANES on; p further rows behind it are scratch while it is made.  So whole vectors can be worked on, and what is beyond
-a matrix is overwritten before it is read.  An arena begins with room for the rows [ K  T ] of one clique, the columns of T in
-reverse: what is zero of it is at the ends of the rows, and the products stop before.
+a matrix is overwritten before it is read.  An arena begins with room for the rows [ K  T ] of one clique, the columns
+of T in reverse: what is zero of it is at the ends of the rows, and the products stop before.
 """
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part

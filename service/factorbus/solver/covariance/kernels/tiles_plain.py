@@ -7,7 +7,7 @@ _RUN = 4
 
 
 def copy_runs(a: F64, target: int, source: int, runs: I64, first: int, count: int) -> None:
-    """Four doubles each, from and to where pairs of `runs` say:  a[target + runs[first+1]] = a[source + runs[first]] .."""
+    """Four doubles each, from and to where `count` pairs:  a[target + runs[first+1]] = a[source + runs[first]] .."""
     for k in range(first, first + 2 * count, 2):
         start, into = source + runs[k], target + runs[k + 1]
         a[into : into + _RUN] = a[start : start + _RUN].copy()
