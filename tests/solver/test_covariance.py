@@ -297,7 +297,7 @@ def kept_up(solver: Solver, batches) -> float:
         width = wanted.shape[1]
         scale = np.abs(wanted).max(axis=(1, 2), initial=1e-300)[:, None, None]
         worst = max(worst, float((np.abs(upkeep.diagonal()[:, :width, :width] - wanted) / scale).max()))
-    assert upkeep.anew < solver.variable_count
+    assert 0 < upkeep.whole < upkeep.anew < solver.variable_count
     return worst
 
 

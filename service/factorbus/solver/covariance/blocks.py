@@ -10,6 +10,7 @@ from factorbus.solver.covariance.factored import DIMS, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks
+from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
 
 # For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
@@ -33,7 +34,8 @@ class Blocks:
         if self._diagonal is None:
             f = self.factored
             self._diagonal = np.zeros((f.count, self.width, self.width))
-            diagonal_blocks(f.order, f.clique, f.lists, f.numbers, f.dims, self._diagonal)
+            roots, none = f.order[f.clique[f.order, tl.C_PARENT] < 0], np.empty(0, np.int64)
+            diagonal_blocks(roots, f.clique, f.lists, f.numbers, f.dims, -1, 0.0, 0, none, self._diagonal)
         return self._diagonal
 
     def of(self, variables: I64) -> F64:

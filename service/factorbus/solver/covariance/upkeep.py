@@ -1,8 +1,9 @@
 """All diagonal blocks kept up from step to step, in the mode "tree".  MATH §10.6.
 
 A step that moves no linearisation point changes Λ by its new factors.  Of these, one for each new variable only says
-where that is; the others, the loops, take from every old block what they tell of it, which is of few ranks.  After
-any other step all blocks are computed anew, and after some hundred in any case, so that rounding errors do not add up.
+where that is; the others, the loops, take from old blocks what they tell of them, which is of few ranks.  After any
+other step the recursion is gone through for what was eliminated anew, and below that.  Both end where a change becomes
+negligible; so that this and rounding errors do not add up, all blocks are computed anew after some steps.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from factorbus.solver.covariance.factored import DIMS, LARGEST
 from factorbus.solver.covariance.kernels.loops import DONE, work_in
 from factorbus.solver.covariance.kernels.paths import joint_block
-from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_cliques
+from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_roots
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph import Graph
 from factorbus.solver.joints import negative_rows
@@ -25,11 +26,15 @@ _MOST_RANKS, _MOST_NEW = 12, 8
 # The smallest share that other factors may have in what a loop measures: of what is subtracted, that many times the
 # rounding error is lost.
 _LEAST_SHARE = 1e-6
-_REFRESH = 256
+# A change of a block by less than this share of a variance is not followed down the tree; and after so many updates
+# without it all blocks are computed anew, so what was left out comes to less than 10⁻⁸.
+_NEGLIGIBLE = 1e-10
+_REFRESH = 64
 _RESIDUAL = np.zeros(1 + max(FACTOR_KIND_OF_CODE), np.int64)
 for _code, _kind in FACTOR_KIND_OF_CODE.items():
     _RESIDUAL[_code] = _kind.dim
 _SIZES = _RESIDUAL.tolist()
+_SIGNED = (at.LINEAR_SE2, at.LINEAR_SE3)  # whose Ω may be negative definite
 
 
 class Upkeep:
@@ -42,7 +47,10 @@ class Upkeep:
         self._blocks: F64 = np.zeros((0, 1, 1))
         self._dims: I64 = np.empty(0, np.int64)
         self._scalar: I64 = np.empty(0, np.int64)
-        self.anew = 0  # updates that computed all blocks anew
+        self._stirred: I64 = np.empty(0, np.int64)
+        self._stamp = -1
+        self.anew = 0  # updates that went through the recursion
+        self.whole = 0  # of these, in the whole tree
 
     def diagonal(self) -> F64:
         """(n, d, d): the covariance of every variable, in the upper left corners, d of the largest there is; a view."""
@@ -51,15 +59,15 @@ class Upkeep:
     def update(self) -> None:
         """After a step, or several."""
         old, first_factor = self._count, self._factors
-        step = int(self._tree.state[tl.S_STEP])
+        state = self._tree.state
+        step = int(state[tl.S_STEP])
         follows = step == self._step + 1 and self._age < _REFRESH
         self._take_in()
-        loops = self._loops(old, first_factor) if follows and not self._tree.state[tl.S_RELINEARISED] else None
-        if loops is None or not self._work_in(loops, old, first_factor):
-            self._compute_anew()
-        else:
-            self._age += 1
-        self._step = step
+        loops = self._loops(old, first_factor) if follows and not state[tl.S_RELINEARISED] else None
+        self._age = self._age + 1 if follows else 0
+        if loops is None or not self._work_in(loops, old, first_factor, step):
+            self._compute(self._stamp if follows else -1, step)
+        self._step, self._stamp = step, int(state[tl.S_STAMP])
 
     def _take_in(self) -> None:
         counts, old = self._graph.counts, self._count
@@ -76,32 +84,35 @@ class Upkeep:
     def _room(self, count: int, width: int) -> None:
         """For so many variables of so many numbers."""
         blocks, dims, scalar = np.zeros((count, width, width)), np.zeros(count, np.int64), np.zeros(count, np.int64)
-        kept = len(self._blocks)
+        kept, stirred = len(self._blocks), np.full(count, -1)
         blocks[:kept, : self._width, : self._width] = self._blocks
-        dims[:kept], scalar[:kept] = self._dims, self._scalar
-        self._blocks, self._dims, self._scalar, self._width = blocks, dims, scalar, width
+        dims[:kept], scalar[:kept], stirred[:kept] = self._dims, self._scalar, self._stirred
+        self._blocks, self._dims, self._scalar, self._stirred, self._width = blocks, dims, scalar, stirred, width
 
-    def _compute_anew(self) -> None:
+    def _compute(self, since: int, step: int) -> None:
+        """Blocks by the recursion, where the tree changed after the elimination `since` and where that changes them."""
         tree, count = self._tree, self._count
-        diagonal_blocks(self._order(), tree.clique, tree.lists, tree.numbers, self._dims[:count], self._blocks[:count])
-        self._age = 0
+        roots = np.empty(count, np.int64)
+        roots = roots[: list_roots(tree.node[:count], tree.clique, roots)]
+        diagonal_blocks(
+            roots, tree.clique, tree.lists, tree.numbers, self._dims[:count], since, _NEGLIGIBLE, step,
+            self._stirred[:count], self._blocks[:count],
+        )  # fmt: skip
         self.anew += 1
-
-    def _order(self) -> I64:
-        tree = self._tree
-        order = np.empty(int(tree.state[tl.S_ALIVE]), np.int64)
-        return order[: list_cliques(tree.node[: self._count], tree.clique, order)]
+        self.whole += since < 0
 
     def _loops(self, old: int, first: int) -> list[int] | None:
         """The new factors but one for each new variable, which places it; None: not all are placed so.
 
         Nor can those of negative weight be worked in one by one.
         """
-        if negative_rows(self._graph, first).size or self._count - old > _MOST_NEW + 1:
+        if self._count - old > _MOST_NEW:
             return None
         free = {v for v in range(old, self._count) if self._scalar[v] >= 0}
         loops = []
         for k, row in enumerate(self._graph.fac[first : self._factors].tolist()):
+            if row[at.F_KIND] in _SIGNED and negative_rows(self._graph, first).size:
+                return None
             ends = [v for v in (row[at.F_I], row[at.F_J]) if v in free]
             if not ends:
                 loops.append(k)
@@ -111,10 +122,10 @@ class Upkeep:
                 return None
         return None if free else loops
 
-    def _work_in(self, loops: list[int], old: int, first: int) -> bool:
+    def _work_in(self, loops: list[int], old: int, first: int, step: int) -> bool:
         """Take what the loops tell from the blocks of old variables, and compute those of new ones.  (10.10)"""
         tree, count = self._tree, self._count
-        if loops and not self._lessen(np.array(loops), old, first):
+        if loops and not self._lessen(np.array(loops), old, first, step):
             return False
         for v in range(old, count):
             if self._scalar[v] >= 0:
@@ -124,7 +135,7 @@ class Upkeep:
                 self._blocks[v, :d, :d] = out
         return True
 
-    def _lessen(self, loops: I64, old: int, first: int) -> bool:
+    def _lessen(self, loops: I64, old: int, first: int, step: int) -> bool:
         """The blocks of old variables; False: too many ranks, or too few digits would be left."""
         graph, tree, count = self._graph, self._tree, self._count
         fac = graph.fac[first : self._factors]
@@ -135,8 +146,8 @@ class Upkeep:
         r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
         evaluate_factors(first, self._factors, graph.var, graph.fac, tree.lin[0], graph.payload, r, A, B, W)
         found = work_in(
-            loops, np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1]), sizes, A, B, W, _LEAST_SHARE, self._order(),
-            self._scalar[:count], tree.node, tree.clique, tree.lists, tree.numbers, self._dims[:count],
-            self._blocks[:old],
+            loops, np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1]), sizes, A, B, W, _LEAST_SHARE, _NEGLIGIBLE, step,
+            self._stirred[:count], self._scalar[:count], tree.node, tree.clique, tree.lists, tree.numbers,
+            self._dims[:count], self._blocks[:old],
         )  # fmt: skip
         return found == DONE

@@ -8,9 +8,11 @@ Y is zero but for the paths of the factors' variables; of Z Zᵀ only what is wi
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.paths import list_paths
+from factorbus.solver.covariance.kernels.recursion import following, is_stirred
 from factorbus.solver.covariance.kernels.squares import padded
 from factorbus.solver.covariance.kernels.substitute import GROUP, backward, fetch, forward
 from factorbus.solver.kernels import tree_layout as tl
@@ -22,33 +24,31 @@ TOO_NEAR, DONE = 0, 1
 
 @kernel(
     "int64(int64[::1], int64[:,::1], int64[::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1], float64,"
-    " int64[::1], int64[::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,:,::1])"
+    " float64, int64, int64[::1], int64[::1], int64[:,::1], int64[:,::1], int64[::1], float64[::1], int64[::1],"
+    " float64[:,:,::1])"
 )
 def work_in(
-    loops: I64, ends: I64, sizes: I64, A: F64, B: F64, W: F64, least: float, order: I64, scalar: I64, node: I64,
-    clique: I64, lists: I64, numbers: F64, dims: I64, blocks: F64,
+    loops: I64, ends: I64, sizes: I64, A: F64, B: F64, W: F64, least: float, negligible: float, tick: int,
+    stirred: I64, scalar: I64, node: I64, clique: I64, lists: I64, numbers: F64, dims: I64, blocks: F64,
 ) -> int:  # fmt: skip
     """Take from `blocks` what the factors `loops` tell; TOO_NEAR, and nothing done, if G may be too near to singular.
 
     in   least: for the eigenvalues of G
          of factors k: ends (k, 2), −1: none   sizes (k,): of r   A, B (k, 6, 6): Jacobians   W (k, 6, 6): Ω
-         order: all cliques, parents first   scalar: where each variable starts, −1: fixed
+         negligible: where no more than this share of a variance is taken from a separator, nothing is done below it
+         tick: `stirred` of variables gets it where more is taken   scalar: where each variable starts, −1: fixed
     out  blocks (n, d, d): of the variables up to n
     """
-    ranks, scalars, widest = 0, 0, 1
+    ranks, scalars = 0, 0
     for k in loops:
         ranks += sizes[k]
     for v in range(len(dims)):
         if scalar[v] >= 0:
             scalars = max(scalars, scalar[v] + dims[v])
-    for c in order:
-        widest = max(widest, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
     ld = padded(ranks)
-    a, local = np.empty((scalars + widest) * ld), scalars * ld
+    a, local = np.empty(2 * scalars * ld), scalars * ld
     path = list_paths(free_ends(loops, ends, scalar), node, clique)
-    on_path = np.zeros(len(clique), np.int64)
     for c in path:
-        on_path[c] = 1
         for s in range(clique[c, tl.C_LIST], clique[c, tl.C_LIST] + clique[c, tl.C_FRONTALS]):
             zero(a, scalar[lists[s]] * ld, dims[lists[s]] * ld)
     put_factors(loops, ends, sizes, A, B, W, scalar, dims, a, ld)
@@ -57,20 +57,40 @@ def work_in(
             forward(clique[c], lists, numbers, dims, scalar, a, g, ld, min(GROUP, (ld - g) // LANES), local)
     if scale(path, ranks, least, clique, lists, dims, scalar, a, ld) == TOO_NEAR:
         return TOO_NEAR
-    for k in range(order.size):
-        row = clique[order[k]]
-        fetch(clique[order[min(k + 1, order.size - 1)]], numbers)
-        for g in range(0, ld, GROUP * LANES):
-            vectors = min(GROUP, (ld - g) // LANES)
-            backward(row, lists, numbers, dims, scalar, a, g, ld, vectors, local, on_path[order[k]] == 0)
-        for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
-            v = lists[s]
-            if v < len(blocks):
-                if dims[v] == 3 and ld == 4:  # with constants the loops are unrolled
-                    lessen(a, scalar[v] * 4, 4, 3, blocks[v])
-                else:
-                    lessen(a, scalar[v] * ld, ld, dims[v], blocks[v])
+    on_path = np.zeros(len(clique), np.bool_)
+    on_path[path] = True
+    for c in path:
+        if clique[c, tl.C_PARENT] < 0:
+            descend(c, on_path, negligible, tick, stirred, scalar, clique, lists, numbers, dims, a, ld, local, blocks)
     return DONE
+
+
+@part
+def descend(
+    root: int, on_path: NDArray[np.bool_], negligible: float, tick: int, stirred: I64, scalar: I64, clique: I64,
+    lists: I64, numbers: F64, dims: I64, a: F64, ld: int, local: int, blocks: F64,
+) -> None:  # fmt: skip
+    """Z and what it takes from the blocks, from a root down to where it is negligible."""
+    c = root
+    while c >= 0:
+        row, child = clique[c], -1
+        if on_path[c] or is_stirred(row, lists, stirred, tick):
+            child = row[tl.C_CHILD]
+            after = child if child >= 0 else row[tl.C_NEXT]
+            if after >= 0:
+                fetch(clique[after], numbers)
+            for g in range(0, ld, GROUP * LANES):
+                vectors = min(GROUP, (ld - g) // LANES)
+                backward(row, lists, numbers, dims, scalar, a, g, ld, vectors, local, not on_path[c])
+            for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
+                v = lists[s]
+                if v >= len(blocks):
+                    stirred[v] = tick
+                elif dims[v] == 3 and ld == 4:  # with constants the loops are unrolled
+                    lessen(a, scalar[v] * 4, 4, 3, negligible, blocks[v], stirred, v, tick)
+                else:
+                    lessen(a, scalar[v] * ld, ld, dims[v], negligible, blocks[v], stirred, v, tick)
+        c = following(c, child, clique)
 
 
 @part
@@ -160,13 +180,15 @@ def trace_of_inverse(n: int, C: F64) -> float:
 
 
 @inline_kernel
-def lessen(a: F64, start: int, ld: int, d: int, block: F64) -> None:
-    """block −= Z Zᵀ"""
+def lessen(a: F64, start: int, ld: int, d: int, negligible: float, block: F64, stirred: I64, v: int, tick: int) -> None:
+    """block −= Z Zᵀ, and whether that was more than a negligible share of a variance."""
     for i in range(d):
         for j in range(i + 1):
             total = 0.0
             for q in range(ld):
                 total += load(a, start + i * ld + q) * load(a, start + j * ld + q)
+            if i == j and total > negligible * block[i, i]:
+                stirred[v] = tick
             block[i, j] -= total
             if i != j:
                 block[j, i] = block[i, j]

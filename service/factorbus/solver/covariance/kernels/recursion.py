@@ -5,7 +5,8 @@ Of a clique with rows [ R_F  R_S ] and the covariance of its separator,
     T = R_F⁻¹,   K = T R_S,   Σ_FS = −K Σ_SS,   Σ_FF = T Tᵀ − Σ_FS Kᵀ                        (10.2)
 
 Its children's separators lie in F ∪ S, so that their Σ_SS are parts of this.  Cliques are visited depth first, and the
-covariances of those above the present one stand in a pile.
+covariances of those above the present one stand in a pile.  What has not changed, and hangs on nothing that has, need
+not be visited again.
 """
 
 import numpy as np
@@ -13,7 +14,6 @@ import numpy as np
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.squares import (
     gather,
-    room_of,
     row_length,
     solve_clique,
     square_size,
@@ -47,59 +47,97 @@ def following(c: int, child: int, clique: I64) -> int:
     return int(child)
 
 
-@kernel("void(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,:,::1])")
-def diagonal_blocks(order: I64, clique: I64, lists: I64, numbers: F64, dims: I64, out: F64) -> None:
-    """The covariance of every variable that is a frontal in one of the cliques `order`, as `list_cliques` gives them.
+@kernel("int64(int64[:,::1], int64[:,::1], int64[::1])")
+def list_roots(node: I64, clique: I64, roots: I64) -> int:
+    """Cliques without a parent that hold variables; gives how many there are."""
+    count = 0
+    for v in range(len(node)):
+        c = node[v, tl.N_CLIQUE]
+        if c >= 0 and node[v, tl.N_PLACE] == 0 and clique[c, tl.C_PARENT] < 0:
+            roots[count] = c
+            count += 1
+    return count
 
+
+@kernel(
+    "int64(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], int64, float64, int64, int64[::1],"
+    " float64[:,:,::1])"
+)
+def diagonal_blocks(
+    roots: I64, clique: I64, lists: I64, numbers: F64, dims: I64, since: int, negligible: float, tick: int,
+    stirred: I64, out: F64,
+) -> int:  # fmt: skip
+    """The covariance of every variable in the trees of `roots`; gives the number of cliques it was computed for.
+
+    in   since: a clique that was not eliminated after that, and whose separator's blocks are as they were in `out`, is
+         left as it is, with all below; −1: none is   negligible: changes up to this share of a variance are none
+         tick: `stirred` of variables gets it where their blocks changed
     out  (n, d, d): upper left corners
     """
-    starts, level, widest, first, size = lay_out(order, clique)
-    a = np.empty(size)
-    column, runs = np.empty(len(dims), np.int64), np.empty(5 * widest, np.int64)
-    starts[0] = first
-    for k in range(order.size):
-        c = order[k]
-        row, depth = clique[c], level[c]
-        fetch(clique[order[min(k + 1, order.size - 1)]], numbers)
-        starts[depth + 1] = starts[depth] + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
-        if row[tl.C_BORDER] > 0:
-            above = clique[row[tl.C_PARENT]]
-            gather(row, above, lists, dims, column, runs, a, starts[depth - 1], starts[depth])
-        solve_clique(row, numbers, a, starts[depth], row[tl.C_CHILD] >= 0)
-        put_diagonal(row, lists, dims, a, starts[depth], out)
-
-
-@part
-def lay_out(order: I64, clique: I64) -> tuple:
-    """Room for the pile of a clique's covariance and those of all above it, behind the scratch.
-
-    out  starts (levels + 2,): for whoever fills it   level (cliques,)
-         the widest clique, scalars; where the pile starts; doubles in all
-    """
-    level = np.empty(len(clique), np.int64)
-    deepest, widest, first = 0, 1, 0
-    for c in order:
-        above = clique[c, tl.C_PARENT]
-        level[c] = 0 if above < 0 else level[above] + 1
-        deepest = max(deepest, level[c])
-        p, m = clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER]
-        widest, first = max(widest, p + m), max(first, room_of(p, m))
-    starts = np.zeros(deepest + 2, np.int64)
-    size, starts[0] = first, first
-    for c in order:
-        starts[level[c] + 1] = starts[level[c]] + square_size(clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER])
-        size = max(size, starts[level[c]] + working_size(clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER]))
-    return starts, level, widest, first, size
+    a, used, column, runs = np.empty(1 << 14), 0, np.empty(len(dims), np.int64), np.empty(5, np.int64)
+    starts = np.zeros(len(clique) + 2, np.int64)
+    for root in roots:
+        c, depth = int(root), 0
+        while c >= 0:
+            row, child = clique[c], -1
+            if since < 0 or row[tl.C_MARK] > since or is_stirred(row, lists, stirred, tick):
+                p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+                if starts[depth] + working_size(p, m) > a.size:
+                    a = grown(a, starts[depth], 2 * (starts[depth] + working_size(p, m)))
+                if 5 * (p + m) > runs.size:
+                    runs = np.empty(10 * (p + m), np.int64)
+                child = row[tl.C_CHILD]
+                after = child if child >= 0 else row[tl.C_NEXT]
+                if after >= 0:
+                    fetch(clique[after], numbers)
+                starts[depth + 1] = starts[depth] + square_size(p, m)
+                if m > 0:
+                    above = clique[row[tl.C_PARENT]]
+                    gather(row, above, lists, dims, column, runs, a, starts[depth - 1], starts[depth])
+                solve_clique(row, numbers, a, starts[depth], child >= 0)
+                put_diagonal(row, lists, dims, a, starts[depth], since >= 0, negligible, tick, stirred, out)
+                used += 1
+            while child < 0 and clique[c, tl.C_PARENT] >= 0:
+                child, c, depth = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT], depth - 1
+            c, depth = child, depth + 1
+    return used
 
 
 @inline_kernel
-def put_diagonal(row: I64, lists: I64, dims: I64, a: F64, target: int, out: F64) -> None:
+def is_stirred(row: I64, lists: I64, stirred: I64, tick: int) -> bool:
+    """Whether a clique's separator has changed."""
+    s = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    end = s + row[tl.C_SEPARATORS]
+    while s < end and stirred[lists[s]] != tick:
+        s += 1
+    return s < end
+
+
+@part
+def grown(a: F64, kept: int, size: int) -> F64:
+    """A copy of the first `kept` with room for `size`."""
+    larger = np.empty(size)
+    larger[:kept] = a[:kept]
+    return larger
+
+
+@part
+def put_diagonal(
+    row: I64, lists: I64, dims: I64, a: F64, target: int, compare: bool, negligible: float, tick: int, stirred: I64,
+    out: F64,
+) -> None:  # fmt: skip
     """The diagonal blocks of a clique's frontals."""
     ld, scalar = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER]), 0
     for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
-        d = dims[lists[s]]
-        for i in range(d):
-            start = target + (scalar + i) * ld + scalar
-            for j in range(d):
-                out[lists[s], i, j] = load(a, start + j)
+        v = lists[s]
+        d, block, corner = dims[v], out[v], target + scalar * ld + scalar
         scalar += d
+        if compare:
+            for i in range(d):
+                for j in range(i + 1):
+                    change, scale = load(a, corner + i * ld + j) - block[i, j], load(a, corner + i * (ld + 1))
+                    if change * change > negligible * negligible * scale * load(a, corner + j * (ld + 1)):
+                        stirred[v] = tick
+        for i in range(d):
+            for j in range(d):
+                block[i, j] = load(a, corner + i * ld + j)

@@ -2,8 +2,8 @@
 
 A square has a row for every scalar, frontals first, and as many columns, those of the separator from a multiple of
 LANES on; p further rows behind it are scratch while it is made.  So whole vectors can be worked on, and what is beyond
-a matrix is overwritten before it is read.  An arena begins with room for the rows [ K  T ] of one clique, the columns
-of T in reverse: what is zero of it is at the ends of the rows, and the products stop before.
+a matrix is overwritten before it is read.  Behind that come the rows [ K  T ], the columns of T in reverse: what is
+zero of it is at the ends of the rows, and the products stop before.
 """
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
@@ -44,13 +44,7 @@ def square_size(p: int, m: int) -> int:
 @inline_kernel
 def working_size(p: int, m: int) -> int:
     """The same with what is behind it while it is made."""
-    return (2 * p + m) * row_length(p, m) + LANES + RUN
-
-
-@inline_kernel
-def room_of(p: int, m: int) -> int:
-    """Where the first square may start: doubles of scratch for a clique."""
-    return p * padded(p + m)
+    return (2 * p + m) * row_length(p, m) + p * padded(p + m) + LANES + RUN
 
 
 @part
@@ -112,34 +106,36 @@ def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> No
     """
     p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
     ld, border, wide = row_length(p, m), padded(p), padded(p + m)
-    high = height(p)
-    solve_rows_of(row, numbers, a, wide)
+    high, w = height(p), target + (2 * p + m) * ld
+    solve_rows_of(row, numbers, a, w, wide)
     for j in range(0, m, TILE_VECTORS * LANES):
         some = min(TILE_VECTORS, (m - j + LANES - 1) // LANES)
         for i in range(0, p, high):
             c, y = target + i * ld + border + j, target + p * ld + border + j
-            negative(a, min(high, p - i), some, c, ld, a, i * wide, wide, 1, y, ld, m)
+            negative(a, min(high, p - i), some, c, ld, a, w + i * wide, wide, 1, y, ld, m)
     transpose(a, p, m, target + border, ld, target + p * ld, ld)
     for k in range(p):
         for i in range(p):
-            put(a, target + (p + m + k) * ld + i, -load(a, i * wide + m + k))
+            put(a, target + (p + m + k) * ld + i, -load(a, w + i * wide + m + k))
     for j in range(0, p, TILE_VECTORS * LANES):
         some = min(TILE_VECTORS, (p - j + LANES - 1) // LANES)
         for i in range(0, min(p, j + some * LANES), high):
             if whole or j < i + high + _DIMS:
                 rows, depth = min(high, p - i), m + p - max(i, j)
-                negative(a, rows, some, target + i * ld + j, ld, a, i * wide, wide, 1, target + p * ld + j, ld, depth)
+                negative(
+                    a, rows, some, target + i * ld + j, ld, a, w + i * wide, wide, 1, target + p * ld + j, ld, depth
+                )
     for i in range(p):
         for j in range(i + 1, p if whole else min(i + _DIMS, p)):
             put(a, target + j * ld + i, load(a, target + i * ld + j))
 
 
 @part
-def solve_rows_of(row: I64, numbers: F64, a: F64, wide: int) -> None:
-    """[ K T ] from R_F [ K T ] = [ R_S I ], some rows at a time from the last."""
+def solve_rows_of(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
+    """[ K T ] at w from R_F [ K T ] = [ R_S I ], some rows at a time from the last."""
     p, m, start, step = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
     for i in range(p):
-        source, v = start + i * step + p, i * wide
+        source, v = start + i * step + p, w + i * wide
         for j in range(m):
             put(a, v + j, load(numbers, source + j))
         zero(a, v + m, wide - m)
@@ -152,7 +148,8 @@ def solve_rows_of(row: I64, numbers: F64, a: F64, wide: int) -> None:
             for j in range(0, width, TILE_VECTORS * LANES):
                 some = min(TILE_VECTORS, (width - j + LANES - 1) // LANES)
                 x = start + top * step + end
-                subtract(a, end - top, some, top * wide + j, wide, numbers, x, step, 1, end * wide + j, wide, p - end)
+                c, y = w + top * wide + j, w + end * wide + j
+                subtract(a, end - top, some, c, wide, numbers, x, step, 1, y, wide, p - end)
         corner = start + top * step + top
-        solve_upper(a, end - top, padded(m + p - top) // LANES, top * wide, wide, numbers, corner, step)
+        solve_upper(a, end - top, padded(m + p - top) // LANES, w + top * wide, wide, numbers, corner, step)
         end = top
