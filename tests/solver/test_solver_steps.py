@@ -13,6 +13,7 @@ from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.factors import LENS_AT
 from factorbus.solver.kernels._jit import DISABLED
 from factorbus.solver.lenses.layout import LIMIT
+from factorbus.solver.report import Shares
 
 TIGHT = {"tolerance": 0.0, "tol": 0.0, "negligible": 1e-20, "max_iterations": 100}
 
@@ -220,3 +221,11 @@ def test_many_factors_are_staged_within_a_second() -> None:
     )
     assert time.process_time() - start < 1.0
     assert solver.step().strategy == "extend"
+
+
+def test_shares_of_a_total() -> None:
+    shares = Shares(("order", "eliminate"), [1, 3], 8.0)
+    assert shares == {"order": 2.0, "eliminate": 6.0}
+    assert Shares(("order",), [0], 0.0) == {"order": 0.0}
+    with pytest.raises(KeyError):
+        shares["commit"]

@@ -1,6 +1,6 @@
 """The account of a step: what was done, why, and how long each part took."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -57,6 +57,26 @@ class StepReport(NamedTuple):
         if self.compiled_ms is None:
             del told["compiled_ms"]
         return told
+
+
+class Shares(Mapping[str, float]):
+    """A total by name, in proportion to counts; worked out when somebody asks, since every step has one and few do."""
+
+    __slots__ = ("_counts", "_names", "_total")
+
+    def __init__(self, names: tuple[str, ...], counts: Sequence[int], total: float) -> None:
+        self._names, self._counts, self._total = names, counts, total
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._total * self._counts[self._names.index(name)] / max(sum(self._counts), 1)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 class Stopwatch:

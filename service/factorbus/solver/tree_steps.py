@@ -20,13 +20,12 @@ from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
 from factorbus.solver.kernels.move import differing
 from factorbus.solver.options import Options
-from factorbus.solver.report import StepReport, Stopwatch
+from factorbus.solver.report import Shares, StepReport, Stopwatch
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
-_UNTIMED: dict[str, float] = dict.fromkeys(tl.PHASES, 0.0)
 
 
 class TreeSteps:
@@ -160,6 +159,7 @@ class TreeSteps:
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         state = self._tree.state[: tl.S_FREE].tolist()
         relinearised, changed = state[tl.S_RELINEARISED], self._moved.size if course else state[tl.S_TOLD]
+        compiled_ms = 1e3 * (compiled - started)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return StepReport._make((
@@ -179,14 +179,7 @@ class TreeSteps:
             float(state[tl.S_FLOPS]),
             0.0,  # damping
             course.converged if course else True,
-            _phases(state, 1e3 * (compiled - started)) if clock else _UNTIMED.copy(),
+            Shares(tl.PHASES, state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
-            1e3 * (compiled - started),
+            compiled_ms,
         ))  # fmt: skip
-
-
-def _phases(state: list[int], compiled_ms: float) -> dict[str, float]:
-    """Milliseconds by phase: the compiled call's in proportion to the cycles they took."""
-    cycles = state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)]
-    share = compiled_ms / max(sum(cycles), 1)
-    return dict(zip(tl.PHASES, [share * count for count in cycles], strict=True))
