@@ -21,10 +21,11 @@ from factorbus.service.core import MapCore
 from factorbus.service.delivery import Delivery
 from factorbus.service.events import Asker, Read
 from factorbus.service.fold import Folder
+from factorbus.service.heap import give_back
 from factorbus.service.host import Host
 from factorbus.service.lane import Lane
 from factorbus.service.library import Kept, Library, make_folder, restored
-from factorbus.service.memory import Memory, OutOfMemory, give_back
+from factorbus.service.memory import Memory, OutOfMemory
 from factorbus.service.questions import Copied, Question, Snapshot
 
 log = logging.getLogger(__name__)

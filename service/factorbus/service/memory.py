@@ -4,8 +4,6 @@ The kernel's own answer to too much memory is to kill the process.  So from a li
 grow is refused, and who is refused is told why; questions, jobs and dropping maps go on.
 """
 
-import ctypes
-import gc
 import os
 from pathlib import Path, PurePosixPath
 
@@ -70,14 +68,6 @@ class Memory:
 
     def _measure(self) -> int:
         return int(os.pread(self._file, 128, 0).split()[1]) * _PAGE
-
-
-def give_back() -> None:
-    """Return what is free to the kernel, after something large has gone: a map is held together by cycles."""
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of the GNU C library
-    if trim is not None:
-        trim(0)
 
 
 def available() -> int:

@@ -1,14 +1,17 @@
-"""What a service does once before it takes anything: compile or load kernels, and settle the interpreter."""
+"""What a service does once before it takes anything: compile or load kernels, and settle heaps and interpreter."""
 
 import gc
 import logging
 import sys
+
+from factorbus.service.heap import lay_out_heaps
 
 log = logging.getLogger(__name__)
 
 
 def get_ready_to_compute(warm: bool) -> None:
     """Have every kernel at hand, if `warm`; afterwards the interpreter pauses as rarely and as shortly as can be."""
+    lay_out_heaps()
     if warm:
         from factorbus.service.warm import warm as warm_all
 
