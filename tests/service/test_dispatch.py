@@ -49,6 +49,24 @@ def test_the_least_busy_worker_first_and_no_more_than_slots() -> None:
     assert places(following) == ["ended", "b"]
 
 
+def test_free_is_what_would_be_begun_at_once() -> None:
+    dispatch = Dispatch()
+    assert dispatch.free == 0
+    dispatch.joined("a", 2)
+    dispatch.joined("b", 1)
+    free = [dispatch.free]
+    sent = []
+    for n in range(4):
+        sent.append(dispatch.submit(job(f"j{n}"), ahead=n // 2))
+        free.append(dispatch.free)
+    assert free == [3, 2, 1, 0, 0]
+    assert [places(effects) for effects in sent] == [["a"], ["b"], ["a"], ["b"]]
+    dispatch.done(tag_of(sent[1]), done("j1"))
+    assert dispatch.free == 0, "the one ahead was begun"
+    dispatch.done(tag_of(sent[0]), done("j0"))
+    assert dispatch.free == 1
+
+
 @pytest.mark.parametrize("failure", ["left", "timeout", "internal"])
 def test_a_job_whose_worker_fails_goes_to_another_and_then_in_place(failure: str) -> None:
     dispatch = Dispatch()

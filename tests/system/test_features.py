@@ -105,6 +105,24 @@ def test_whoever_computes_the_bits_are_the_same(spawn: Spawn, tmp_path: Path, qu
             assert each.wait() == 0
 
 
+def test_while_all_are_busy_a_question_stays_whole(spawn: Spawn, tmp_path: Path, question: Question) -> None:
+    _, y, rows = question
+    with service(spawn, tmp_path) as (_, endpoint, client), into_memory(question) as one, into_memory(question) as two:
+        workers = [worker(spawn, client, endpoint, name) for name in ("a", "b")]
+        for each in workers:
+            each.signal(signal.SIGSTOP)
+        waiting = [client.send(keys.features_key("s"), encode_ask(ask)) for ask, _ in (one, two)]
+        in_flight = iter(lambda: sum(row["in_flight"] for row in client.stats("m")["workers"]), None)
+        assert next(count for count in in_flight if count >= 3) == 3
+        for each in workers:
+            each.signal(signal.SIGCONT)
+        got = [decode_answer(came) for came in (each.get(timeout=PATIENCE_S) for each in waiting)]
+        assert [len(each.shards) for each in got] == [2, 1]
+        for each, (_, array) in zip(got, (one, two), strict=True):
+            assert put_together(each) == y.tobytes()
+            assert array.tobytes() == rows.tobytes()
+
+
 def test_a_question_that_cannot_be_is_refused_with_its_code(spawn: Spawn, tmp_path: Path, question: Question) -> None:
     sighting, *_ = question
     with service(spawn, tmp_path) as (_, endpoint, client):

@@ -96,6 +96,12 @@ class Dispatch:
         return sum(worker.slots for worker in self._workers.values() if not worker.suspect)
 
     @property
+    def free(self) -> int:
+        """Jobs that would be begun at once."""
+        idle = sum(max(0, worker.slots - len(worker.tags)) for worker in self._workers.values() if not worker.suspect)
+        return max(0, idle - len(self._waiting))
+
+    @property
     def suspects(self) -> list[str]:
         """Workers that did not answer in time and have not been heard of since."""
         return [name for name, worker in self._workers.items() if worker.suspect]

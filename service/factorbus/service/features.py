@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from factorbus.proto.features import Shard
+from factorbus.proto.features import Ask, Shard
 from factorbus.proto.features_codec import decode_ask, encode_answer, encode_shard
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Job, JobDone
@@ -22,7 +22,7 @@ from factorbus.service.events import Asker
 from factorbus.service.jobs import Jobs, do_here
 from factorbus.service.lane import Lane
 from factorbus.service.rates import measured
-from factorbus.service.sharding import Rates, cuts, seconds, shards_for, work_of
+from factorbus.service.sharding import Rates, Work, cuts, seconds, shards_for, work_of
 from factorbus.service.trips import Trips
 
 log = logging.getLogger(__name__)
@@ -41,6 +41,17 @@ class _Question:
     parts: list[tuple[bytes, str, float] | None]
     clean: bool = True
     over: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Cutting:
+    """A question that goes to workers, in at most so many shards."""
+
+    payload: bytes
+    ask: Ask
+    most: int
+    work: Work
+    rates: Rates
 
 
 class Features:
@@ -100,7 +111,6 @@ class Features:
             if count == 0:
                 self._here(asker, payload, ask.sighting.count)
                 return
-            shards = [Shard(payload, first, last) for first, last in cuts(ask, count)]
         except Problem as problem:
             self._refuse(asker, problem)
         except Exception:
@@ -108,8 +118,7 @@ class Features:
             log.exception("fault %s: features", reference)
             self._refuse(asker, Internal(reference))
         else:
-            deadline_s = min(self._deadline_s, _BESIDES_S + _PATIENCE * seconds(work, rates, count))
-            self._desk.hand(self._submit, asker, shards, deadline_s)
+            self._desk.hand(self._submit, asker, _Cutting(payload, ask, count, work, rates))
 
     def _here(self, asker: Asker, payload: bytes, count: int) -> None:
         done = do_here(Job("in-place", "idp", encode_shard(Shard(payload, 0, count))))
@@ -123,11 +132,15 @@ class Features:
 
     # ---- on the desk ------------------------------------------------------------------------------------------------
 
-    def _submit(self, asker: Asker, shards: list[Shard], deadline_s: float) -> None:
+    def _submit(self, asker: Asker, cutting: _Cutting) -> None:
         if self._open >= self._most:
             self._refuse(asker, Busy(self._open, 0.05))
             return
         self._open += 1
+        # Into no more shards than are begun at once: a shard that waits only repeats what every shard does.
+        count = min(cutting.most, max(1, self._jobs.free))
+        deadline_s = min(self._deadline_s, _BESIDES_S + _PATIENCE * seconds(cutting.work, cutting.rates, count))
+        shards = [Shard(cutting.payload, first, last) for first, last in cuts(cutting.ask, count)]
         question = _Question(asker, [None] * len(shards))
         for place, shard in enumerate(shards):
             self._jobs.submit(

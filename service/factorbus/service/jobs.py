@@ -46,6 +46,11 @@ class Jobs:
         return self._dispatch.slots
 
     @property
+    def free(self) -> int:
+        """Jobs that a worker would begin at once."""
+        return self._dispatch.free
+
+    @property
     def suspects(self) -> list[str]:
         """Workers that did not answer in time and have not been heard of since."""
         return self._dispatch.suspects
