@@ -32,9 +32,16 @@ demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as
 live: $(READY) ## a graph file of yours, FILE=my.g2o, as a live map in the browser
 	@$(BIN)/factorbus replay $(FILE) --live $(ARGS)
 
+# What starts no processes runs side by side; all else one by one, so that it has the machine to itself.
+IN_PROCESS := tests/solver tests/proto
 test: $(READY_DEV) ## the tests
 	@$(BIN)/factorbus warm
+ifeq ($(strip $(ARGS)),)
+	$(BIN)/python -m pytest -m "not data" -n auto --maxprocesses 4 --dist worksteal $(IN_PROCESS)
+	$(BIN)/python -m pytest -m "not data" $(IN_PROCESS:%=--ignore %)
+else
 	$(BIN)/python -m pytest -m "not data" $(ARGS)
+endif
 
 test-data: $(READY_DEV) ## the long tests on the public data sets (FACTORBUS_DATASETS)
 	@$(BIN)/factorbus warm

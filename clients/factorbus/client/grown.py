@@ -95,7 +95,8 @@ def grown(x: F64, P: F64, sighting: Sighting, answer: Answer, matrix: F64 | None
     if any(each.shard.blocks is not None for each in done):
         _mirror(matrix[m:, m:])
     matrix[:m, :m] = P
-    matrix[:m, m:] = matrix[m:, :m].T
+    for left in range(m, len(matrix), _TILE):
+        matrix[:m, left : left + _TILE] = matrix[left : left + _TILE, :m].T
     y = np.concatenate([each.shard.y for each in done])
     workers, seconds = tuple(each.worker for each in done), max(each.seconds for each in done)
     return Grown(np.concatenate([x, y.reshape(-1)]), matrix, y, workers, seconds)
