@@ -3,6 +3,9 @@
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from factorbus.service import warm as together
 
@@ -21,7 +24,7 @@ def compiled(kernel):
     (Path(sys.argv[2]) / kernel.__name__).touch()
     return ()
 together.iter_compile = compiled
-together._take_turns(Path(sys.argv[1]))
+together._take_turns(Path(sys.argv[1]), print)
 """
 
 
@@ -35,9 +38,29 @@ def test_every_kernel_is_compiled_once_whoever_does_it(tmp_path: Path) -> None:
     assert sorted(log.read_text().split()) == sorted(f"k{n}" for n in range(200))
 
 
-def test_helpers_that_die_leave_their_kernels_to_the_rest(tmp_path: Path, monkeypatch) -> None:
+def test_those_that_die_leave_their_kernels_to_whoever_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(together.sys, "executable", "/bin/false")
     told: list[str] = []
-    monkeypatch.setattr(together, "_list_missing", list)
     together._share_out(2, told.append)
     assert told == []
+
+
+def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is loaded is the same, to the bit, as what a later start loads."""
+    missing = [type("Kernel", (), {"__name__": f"k{n}"}) for n in range(9)]
+    monkeypatch.setattr(together, "_list_missing", lambda: missing)
+    monkeypatch.setattr(together, "iter_compile", pytest.fail)
+    asked: list[list[str]] = []
+    popen = subprocess.Popen
+
+    def compiling(command: list[str], **how: Any) -> subprocess.Popen:
+        asked.append(command)
+        return popen([sys.executable, "-c", f"print('kernel {len(asked)}')"], **how)
+
+    monkeypatch.setattr(together.subprocess, "Popen", compiling)
+    monkeypatch.setattr(together, "_cores", lambda: 2)
+    before, told = together.compiled_seconds(), []
+    together.warm(told.append)
+    assert sorted(told) == ["kernel 1", "kernel 2"]
+    assert {tuple(command[:3]) for command in asked} == {(sys.executable, "-m", "factorbus.service.warm")}
+    assert together.compiled_seconds() > before, "who waits for them says so"

@@ -18,7 +18,7 @@ def command() -> None:
     """
     require("service", "factorbus warm")
     from factorbus.service.warm import warm
-    from factorbus.solver import compiled_seconds
+    from factorbus.service.warm import compiled_seconds
 
     seconds = warm(lambda kernel: note(f"  compiling {kernel}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")

@@ -232,7 +232,7 @@ class Shell:
             self._desk.hand(self._trips.left, worker)
 
     def _about(self) -> dict[str, Any]:
-        from factorbus.solver import compiled_seconds
+        from factorbus.service.warm import compiled_seconds
 
         return {
             "service": self._service,

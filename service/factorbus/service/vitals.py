@@ -43,7 +43,7 @@ class Vitals:
 
     def account(self) -> dict[str, Any]:
         """What admin/stats says, and what the metrics are made of."""
-        from factorbus.solver import compiled_seconds
+        from factorbus.service.warm import compiled_seconds
 
         return {
             "service": self._service,

@@ -2,6 +2,9 @@
 
 A cold start is shared out: one process for each core, and each takes the next kernel that nobody has.  Who has what is
 told by files, made by whoever comes first; the kernels themselves meet on disk.  Then this process loads them all.
+
+It compiles none itself.  Code that has just been compiled and the same from disk are linked in another order, and may
+round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.
 """
 
 import os
@@ -21,46 +24,53 @@ from factorbus.solver.warm import iter_compile, list_missing
 
 _FEW = 4  # kernels that are worth another process
 _MOST = 8  # processes: compiling takes half a gigabyte of memory each
+_apart: list[float] = []  # seconds of waiting for them
 
 
 def warm(progress: Callable[[str], None] | None = None) -> float:
     """Compile (or load from disk) all kernels; gives the seconds that took.
 
-    `progress` is called with the name of each kernel that this process compiles, before it does.
+    `progress` is called with the name of each kernel that is compiled, before it is.
     """
     started = time.monotonic()
     if missing := _list_missing():
-        _share_out(min(_cores(), _MOST, -(-len(missing) // _FEW)) - 1, progress)
+        _share_out(min(_cores(), _MOST, -(-len(missing) // _FEW)), progress)
+        _apart.append(time.monotonic() - started)
     solver.warm()
     warm_idp()
     solver.warm(None, kernels)
     return time.monotonic() - started
 
 
-def _share_out(helpers: int, progress: Callable[[str], None] | None) -> None:
-    """Compile what is missing together with other processes.  One that fails leaves its kernels to the rest."""
+def compiled_seconds() -> float:
+    """Seconds that this process spent compiling kernels, or waiting for those that did it for it."""
+    return solver.compiled_seconds() + sum(_apart)
+
+
+def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
+    """Compile what is missing in other processes.  One that fails leaves its kernels to whoever needs them."""
+    told, tell = os.pipe()
     with tempfile.TemporaryDirectory(prefix="factorbus-warm-") as claims, ExitStack() as stack:
-        started = []
-        for _ in range(helpers):
-            process = subprocess.Popen(
-                [sys.executable, "-m", "factorbus.service.warm", claims], stdin=subprocess.DEVNULL
-            )
-            stack.callback(_end, process)
-            started.append(process)
-        _take_turns(Path(claims), progress)
-        for process in started:
-            process.wait()
+        names = stack.enter_context(os.fdopen(told))
+        with os.fdopen(tell, "w") as end:
+            for _ in range(processes):
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "factorbus.service.warm", claims], stdin=subprocess.DEVNULL, stdout=end
+                )
+                stack.callback(_end, process)
+        for name in names:  # until the last of them has ended
+            if progress:
+                progress(name.strip())
 
 
-def _take_turns(claims: Path, progress: Callable[[str], None] | None = None) -> None:
+def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
     for kernel in _list_missing():
         try:
             (claims / f"{kernel.__module__}.{kernel.__name__}").touch(exist_ok=False)
         except FileExistsError:
             continue
-        if progress:
-            progress(kernel.__name__)
+        progress(kernel.__name__)
         for _ in iter_compile(kernel):
             pass
 
@@ -81,5 +91,5 @@ def _cores() -> int:
 
 
 if __name__ == "__main__":
-    with suppress(FileNotFoundError, KeyboardInterrupt):  # whoever started this has gone
-        _take_turns(Path(sys.argv[1]))
+    with suppress(FileNotFoundError, BrokenPipeError, KeyboardInterrupt):  # whoever started this has gone
+        _take_turns(Path(sys.argv[1]), lambda name: print(name, flush=True))
