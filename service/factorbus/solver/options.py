@@ -37,10 +37,10 @@ class Options:
     recent_poses    "lately": from the last so many poses
     bent            tree: a variable is relinearised when a factor of it is bent by more than this many of the residuals
                     that factors of the map have on average (MATH §9.6); bent_now: and solved for again at once, in up
-                    to `rounds` rounds, when it is by more than that; trust: above that χ² is looked at, and a step that
-                    raised it is replaced
-    look_every, look_turned   tree: it is looked for what is bent every so many steps, and when something turned so far
-                    that this may be bent by this much
+                    to `rounds` rounds, when all that is bent adds more than this share to χ²; trust: where a factor is
+                    bent by more than so many, χ² is looked at, and a step that raised it is replaced
+    look_every, look_moved   tree: it is looked for what is bent every so many steps, and when so much moved since that
+                    this may add this share to χ²
     ripple          tree: δ follows where it is off by more than this many, as above (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
@@ -63,11 +63,11 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 0.03
-    bent_now: float = 1.0
+    bent_now: float = 1e-3
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
-    look_turned: float = 0.3
+    look_moved: float = 1e-2
     ripple: float = 0.05
     recent_steps: int = 3
     split_pivots: int = 24

@@ -33,7 +33,7 @@ class Tree(Arenas):
         self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
         self.settings[[tl.P_EVERY, tl.P_LOOK, tl.P_RECENT]] = (
             options.look_every,
-            options.look_turned,
+            options.look_moved,
             options.recent_steps,
         )
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds

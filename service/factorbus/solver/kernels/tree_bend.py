@@ -15,7 +15,12 @@ against the pose, the Jacobian of the pose's turn is off by that share of d, and
 
     slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
 
-r being the residual at the linearisation point.  Where that is more than the bend, both ends move.  How a sight is
+r being the residual at the linearisation point.  A pose seen from another one slips as well, by much less: errors of
+the gradient largely cancel along a path, and LINKS of it is what counts, with the residual r(x) at the estimate,
+
+    slip = LINKS √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                     (9.15)
+
+Where the slip is more than the bend, both ends move.  How a sight is
 bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
 standard deviations,
 
@@ -28,8 +33,11 @@ import math
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, inline_kernel
+from factorbus.solver.kernels.se3 import rotation
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.lenses.layout import FU
+
+LINKS = 0.1
 
 
 @inline_kernel
@@ -64,7 +72,7 @@ def bend_of(kind: int, root: float, d: float, phi: float, shift: float) -> float
 
 @inline_kernel
 def slip_of(kind: int, root: float, d: float, shift: float, hessian: F64, h: int) -> float:
-    """(9.12); √ω |r| from the gradient of the pose's translation, Ω r.  0 of what sees no landmark."""
+    """(9.12) of what sees a landmark; √ω |r| from the gradient of the pose's translation, Ω r.  0 of all else."""
     if d > 0.0 and kind == at.LANDMARK_SE2:
         g = h + 9 + 6 + 4
         pull = math.sqrt(load(hessian, g) ** 2 + load(hessian, g + 1) ** 2)
@@ -74,6 +82,30 @@ def slip_of(kind: int, root: float, d: float, shift: float, hessian: F64, h: int
     else:
         return 0.0
     return (pull / root + root * shift) * shift / d
+
+
+@inline_kernel
+def slip_between(
+    kind: int, p: F64, k: int, i: int, j: int, root: float, d: float, shift: float, values: F64, hessian: F64, h: int
+) -> float:
+    """(9.15) of the poses at offsets i and j, by the measurement at offset k of p.  0 of all else."""
+    if kind == at.BETWEEN_SE2:
+        c, s = math.cos(load(values, i + 2)), math.sin(load(values, i + 2))
+        dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
+        rx, ry, rz = c * dx + s * dy - load(p, k), c * dy - s * dx - load(p, k + 1), 0.0
+        stiff_turn = load(hessian, h + 9 + 9 + 8)
+    elif kind == at.BETWEEN_SE3:
+        a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(values, i + 3)
+        dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
+        dz = load(values, j + 2) - load(values, i + 2)
+        rx = a0 * dx + a3 * dy + a6 * dz - load(p, k)
+        ry = a1 * dx + a4 * dy + a7 * dz - load(p, k + 1)
+        rz = a2 * dx + a5 * dy + a8 * dz - load(p, k + 2)
+        stiff_turn = load(hessian, h + 36 + 36 + 35)
+    else:
+        return 0.0
+    pull = root * math.sqrt(rx * rx + ry * ry + rz * rz)
+    return LINKS * pull * shift / math.sqrt(d * d + stiff_turn / (root * root))
 
 
 @inline_kernel

@@ -138,7 +138,7 @@ DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
 # Settings of a step.
 P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again
 P_BENT = 1  # what is bent by more is relinearised in the next step
-P_BENT_NOW = 2  # or at once
+P_BENT_NOW = 2  # or at once, where all that is bent adds more than this share to χ²
 P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
 P_EVERY = 5  # so many steps apart it is looked for what is bent
@@ -146,7 +146,7 @@ P_NEGLIGIBLE = 6  # a χ² that is nothing
 P_RECENT = 7  # variables with a factor in the last so many steps go last
 P_ROUNDS = 8  # eliminations in a step, at most
 P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
-P_LOOK = 10  # and where something turned so far that it may be bent by this
+P_LOOK = 10  # and where what moved since may have bent by this share of χ²
 P_SIZE = 11
 
 # The phases of a step, in the order of `tree_step`.
@@ -157,5 +157,5 @@ LINEARISE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
 A_CHI2 = 0  # χ² of the linear problem at its solution
 A_BEND = 1  # the largest bend of what moved, units of (9.6)
 A_CONSTANT = 2  # χ² of factors between fixed variables
-A_TURN = 3  # the largest ½ d √ω φ² of what moved, σ
+A_ALARM = 3  # what may have bent since it was looked last, σ² (9.13)
 A_SIZE = 4

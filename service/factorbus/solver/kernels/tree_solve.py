@@ -14,11 +14,13 @@ from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
-from factorbus.solver.kernels.tree_bend import bend_of, shift_between, slip_of, turn_of
+from factorbus.solver.kernels.tree_bend import bend_of, shift_between, slip_between, slip_of, turn_of
 from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
+
+FINE = 0.1
 
 
 @part
@@ -43,7 +45,7 @@ def substitute(
             row[tl.C_FIRST] = 0
             state[tl.S_SOLVED] += 1
             move_frontals(
-                row, var, node, lists, numbers, delta, lin[0], lin[2], lever, values, changed, moved, state, account
+                row, var, node, lists, numbers, scalars, lin[0], lin[2], lever, values, changed, moved, state, account
             )
             c = next_clique(row[tl.C_CHILD], c, far, var, clique, lists, numbers, delta, weight)
 
@@ -107,16 +109,20 @@ def solve_rows(row: I64, numbers: F64) -> None:
 
 @inline_kernel
 def move_frontals(
-    row: I64, var: I64, node: I64, lists: I64, numbers: F64, delta: F64, lin: F64, before: F64, lever: F64,
+    row: I64, var: I64, node: I64, lists: I64, numbers: F64, scalars: F64, lin: F64, before: F64, lever: F64,
     values: F64, changed: I64, moved: I64, state: I64, account: F64,
 ) -> None:  # fmt: skip
     """The estimate of the frontals whose δ is another one."""
     start, solved, step = row[tl.C_LIST], row[tl.C_USED], state[tl.S_STEP]
+    delta, weight = scalars[0], scalars[1]
     for s in range(start, start + row[tl.C_FRONTALS]):
         v = lists[s]
-        kind, d, differs = var[v, at.V_KIND], var[v, at.V_SCALAR], False
+        kind, d, differs, far = var[v, at.V_KIND], var[v, at.V_SCALAR], False, 0.0
+        shifts = 2 if kind == at.SE2 else 3
         for a in range(dim_of_variable(var, v)):
-            differs |= load(delta, d + a) != load(numbers, solved)
+            gap = load(numbers, solved) - load(delta, d + a)
+            differs |= gap != 0.0
+            far += gap * gap * (load(weight, d + a) if a < shifts else lever[v] * lever[v])
             put(delta, d + a, load(numbers, solved))
             solved += 1
         if differs:
@@ -133,22 +139,43 @@ def move_frontals(
                 state[tl.S_MOVED] += 1
             move_to(kind, lin, x, delta, d, values)
             phi = turn_of(kind, delta, d)
-            account[tl.A_TURN] = max(account[tl.A_TURN], 0.5 * lever[v] * phi * phi)
+            account[tl.A_ALARM] += phi * phi * far  # (9.13)
 
 
 @part
 def find_bent(
+    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
+    scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
+) -> tuple[float, float]:  # fmt: skip
+    """Add to `pending` what is to be relinearised, and empty `moved`; gives what `look` does.
+
+    Where that cannot wait, (9.14), all that is bent by FINE of the threshold goes along: what is relinearised alone
+    bends its neighbours, and each round would have to take in some more.
+    """
+    bent = settings[tl.P_BENT]
+    most, strain = look(
+        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, pending, moved, state
+    )  # fmt: skip
+    if strain > settings[tl.P_BENT_NOW]:
+        look(FINE * bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, pending, moved, state)
+    for k in range(state[tl.S_MOVED]):
+        node[moved[k], tl.N_LISTED] = 0
+    state[tl.S_MOVED] = 0
+    return most, strain
+
+
+@part
+def look(
     bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
     scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
-) -> float:  # fmt: skip
+) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
-    more than `bent`, (9.4), with the landmark where that is what has moved, (9.5) and (9.12), and both ends of one for
-    which that is computed, (9.11).  Gives the largest bend, and empties `moved`.
+    more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.15), and both ends of
+    one for which that is computed, (9.11).  Gives the largest bend, and Σ bend² of those bent by more than `bent`.
     """
-    most, delta = 0.0, scalars[0]
+    most, strain, delta = 0.0, 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
         v = moved[k]
-        node[v, tl.N_LISTED] = 0
         phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
         if phi == 0.0 and state[tl.S_EXACT] == 0:
             continue
@@ -156,25 +183,27 @@ def find_bent(
         slot = node[v, tl.N_ADJ]
         while slot >= 0:
             f = slot // 2
-            if link[f, tl.L_KIND] >= tl.EXACT:
+            kind, y, h = link[f, tl.L_KIND], link[f, tl.L_FAR], link[f, tl.L_AT]
+            if kind >= tl.EXACT:
                 bend = exact_bend(f, var, fac, lin, values, payload, delta)
                 most = max(most, bend)
                 if bend > bent:
+                    strain += 0.5 * bend * bend  # half of it for each end
                     await_ends(f, fac, var, node, pending, state)
-            elif slot % 2 == 0 and phi > 0.0 and link[f, tl.L_FAR] >= 0:
-                shift = shift_between(planar, x, link[f, tl.L_FAR], values, lin)
-                kind = link[f, tl.L_KIND]
-                bend = bend_of(kind, stiff[f, 1], stiff[f, 0], phi, shift)
-                slip = slip_of(kind, stiff[f, 1], stiff[f, 0], shift, hessian, link[f, tl.L_AT])
+            elif slot % 2 == 0 and phi > 0.0 and y >= 0:
+                d, root, shift = stiff[f, 0], stiff[f, 1], shift_between(planar, x, y, values, lin)
+                bend = bend_of(kind, root, d, phi, shift)
+                slip = slip_of(kind, root, d, shift, hessian, h)
+                slip += slip_between(kind, payload, fac[f, at.F_AT], x, y, root, d, shift, values, hessian, h)
                 most = max(most, bend + slip)
                 if bend + slip > bent:
+                    strain += (bend + slip) * (bend + slip)
                     await_move(v, node, pending, state)
                     both = kind == at.BEARING_RANGE_SE2 or slip > bend
                     if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
                         await_move(link[f, tl.L_SECOND], node, pending, state)
             slot = next_incidence(slot, link)
-    state[tl.S_MOVED] = 0
-    return most
+    return most, strain
 
 
 @inline_kernel

@@ -71,8 +71,8 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled = settings.copy()
     scaled[tl.P_RIPPLE] *= unit
     scaled[tl.P_BENT] *= unit
-    scaled[tl.P_BENT_NOW] *= unit
-    scaled[tl.P_LOOK] *= unit
+    scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1)  # a share of χ²
+    scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = old = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, lever, state)
     if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state):
@@ -84,7 +84,7 @@ def tree_step(graph: I64, tree: I64) -> int:
             some = pending[: state[tl.S_PENDING]]
             relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
         lap(began, tl.LINEARISE, state)
-        bow, status = eliminate_again(
+        bow, strain, status = eliminate_again(
             v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
             scalars, stiff, lever, pending, changed, moved, marked, state, account,
         )  # fmt: skip
@@ -109,7 +109,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        if wait or not bow > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
+        if wait or not strain > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
     state[tl.S_TOLD] = count_differing(old, v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
@@ -136,8 +136,8 @@ def eliminate_again(
     v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
     pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
-) -> tuple[float, int]:  # fmt: skip
-    """Steps 3 to 8; gives the largest bend of what moved, and the status."""
+) -> tuple[float, float, int]:  # fmt: skip
+    """Steps 3 to 8; gives the largest bend of what moved, Σ bend² of what is bent, and the status."""
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
@@ -170,7 +170,7 @@ def eliminate_again(
     orphans = orphans[:hanging]
     if n == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
-        return 0.0, tl.DONE
+        return 0.0, 0.0, tl.DONE
     factors = gather_factors(n, affected, state[tl.S_TAKEN], f1, node, link, fac, var)
     now = lap(now, tl.MARK, state)
     # 4, 5
@@ -193,11 +193,11 @@ def eliminate_again(
         order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
     update = np.empty((orphans.size, 3), np.int64)
     if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
-        return 0.0, tl.NO_ROOM
+        return 0.0, 0.0, tl.NO_ROOM
     ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
     if not placed:
         give_back_updates(update, numbers, state)
-        return 0.0, tl.NO_ROOM
+        return 0.0, 0.0, tl.NO_ROOM
     now = lap(now, tl.SYMBOLIC, state)
     # 6
     failed = eliminate_fronts(
@@ -208,7 +208,7 @@ def eliminate_again(
         state[tl.S_FAILED] = failed
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
-        return 0.0, tl.FAILED
+        return 0.0, 0.0, tl.FAILED
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(
@@ -223,21 +223,20 @@ def eliminate_again(
         state[tl.S_PENDING] = 0
     now = lap(now, tl.COMMIT, state)
     # 8
-    account[tl.A_TURN] = 0.0
     substitute(
         ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, lever, values, changed, moved,
         state, account,
     )  # fmt: skip
-    bow = 0.0
+    bow = strain = 0.0
     # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
-    if due or account[tl.A_TURN] > settings[tl.P_LOOK]:
-        bow = find_bent(
-            settings[tl.P_BENT], var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, pending,
-            moved, state,
-        )  # fmt: skip
+    if due or account[tl.A_ALARM] > settings[tl.P_LOOK]:
+        bow, strain = find_bent(
+            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, pending, moved, state
+        )
+        account[tl.A_ALARM] = 0.0
     lap(now, tl.SUBSTITUTE, state)
-    return bow, tl.DONE
+    return bow, strain, tl.DONE
 
 
 @inline_kernel
