@@ -17,8 +17,7 @@ def command() -> None:
     factorbus warm
     """
     require("service", "factorbus warm")
-    from factorbus.service.warm import warm
-    from factorbus.service.warm import compiled_seconds
+    from factorbus.service.warm import compiled_seconds, warm
 
     seconds = warm(lambda kernel: note(f"  compiling {kernel}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")

@@ -73,7 +73,7 @@ class TreeSteps:
             before = self._graph.values.copy()
             course = self._batch(before, settle=False)
             because = "χ² would have risen: a batch from where the estimate stood"
-        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else account[tl.A_CHI2]
+        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else max(account[tl.A_CHI2], 0.0)
         return self._account(started, compiled, course, chi2, because)
 
     def changed(self) -> I64:
