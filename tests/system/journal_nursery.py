@@ -24,18 +24,18 @@ def main() -> None:
     solver.warm()
     idp.warm()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
-    print("nursery", flush=True)
+    say("nursery")
     for line in sys.stdin:
         word, *rest = line.split(maxsplit=2)
         if word == "quiet":
-            print("quiet", flush=True)
+            say("quiet")
             continue
         endpoint, given = rest[0], json.loads(rest[1])
         pid = os.fork()
         if pid == 0:
             os.close(0)
             run(checked(Config(**{"listen": (endpoint,), "warm": False, "create": ("m",), **given})))
-        print("born", pid, flush=True)
+        say("born", pid)
 
 
 def run(config: Config) -> None:
@@ -44,12 +44,17 @@ def run(config: Config) -> None:
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     code = 0
     try:
-        serve(config, lambda endpoints: print("ready", *endpoints, flush=True), stop)
+        serve(config, lambda endpoints: say("ready", *endpoints), stop)
     except Problem as problem:
-        print("cannot", problem.code, flush=True)
+        say("cannot", problem.code)
         logging.error("%s", problem)
         code = 2
     os._exit(code)
+
+
+def say(*words: object) -> None:
+    """A line in one piece, whatever its children say at the same time."""
+    os.write(1, (" ".join(map(str, words)) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def command(endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, .
     """
     require("gateway", "factorbus gateway")
     from factorbus.cli.exits import Stopped
-    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.cli.stopping import stop_on_signals, wait_until
     from factorbus.client import connect
     from factorbus.gateway import make_app
     from factorbus.gateway.server import serving
@@ -40,6 +40,6 @@ def command(endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, .
         try:
             with serving(make_app(bus, hosts), host, port) as bound:
                 click.echo(f"{READY}http://{'127.0.0.1' if host == '0.0.0.0' else host}:{bound}")
-                stop.wait()
+                wait_until(stop)
         except OSError as error:
             raise Stopped("port_taken", f"{host}:{port}: {error.strerror}; give another --port") from error

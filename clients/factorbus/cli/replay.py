@@ -232,11 +232,11 @@ def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
 def _stay() -> None:
     """Until Ctrl-C or SIGTERM."""
     from factorbus.cli.screen import note
-    from factorbus.cli.stopping import stop_on_signals
+    from factorbus.cli.stopping import stop_on_signals, wait_until
 
     with stop_on_signals(until_eof=False) as stop:
         note("the page stays until Ctrl-C")
-        stop.wait()
+        wait_until(stop)
 
 
 def _write(request: Request, target: Any) -> None:

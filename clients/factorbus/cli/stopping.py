@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 from factorbus.cli.exits import INTERRUPTED
 
+_LOOK_S = 0.5
+
 
 @contextmanager
 def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
@@ -32,6 +34,12 @@ def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def wait_until(stop: threading.Event) -> None:
+    """Until it is set.  No wait in it is long: Python sees a signal that comes right before one only when it ends."""
+    while not stop.wait(_LOOK_S):
+        pass
 
 
 @contextmanager

@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
 # A service sends no more than there are slots, but several services may send.
 _WAITING_PER_SLOT = 16
+# Python does not see a signal that comes right before a wait until that ends.
+_LOOK_S = 0.5
 
 
 def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event) -> None:
@@ -115,7 +117,8 @@ def _take_jobs(
     token = session.liveliness().declare_token(keys.worker_token(name, slots))
     log.info("worker %s takes %d jobs at a time", name, slots)
     on_ready(name)
-    stop.wait()
+    while not stop.wait(_LOOK_S):
+        pass
     for _ in threads:
         waiting.put(None)  # behind everything queued, which is refused from now on
     for thread in threads:
