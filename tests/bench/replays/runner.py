@@ -132,7 +132,7 @@ def _do(settings: Settings, problem: Problem, job: dict[str, Any], progress: Pro
     job = {**job, "problem": problem.as_json(), "sampling": settings.sampling.as_json(), "core": settings.core}
     paths = os.pathsep.join(filter(None, (str(_HERE.parents[1]), os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONUNBUFFERED": "1"}
-    for library in ("OPENBLAS", "OMP", "MKL", "NUMBA"):
+    for library in ("OPENBLAS", "OMP", "MKL"):  # kernels have no threads, and with NUMBA_ settings they are others
         environment[f"{library}_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as folder, open(Path(folder) / "said", "w+") as said:
         order = Path(folder) / "job.json"
