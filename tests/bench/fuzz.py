@@ -306,7 +306,8 @@ def main() -> int:
         "live": live(options.live, options.seed),
     }
     if options.json:
-        print(json.dumps({name: asdict(each) for name, each in outcomes.items()}, indent=2))
+        rows = {name: {**asdict(each), "answers": dict(each.answers)} for name, each in outcomes.items()}
+        print(json.dumps(rows, indent=2))
     else:
         for name, each in outcomes.items():
             print(f"{name}: {each.messages} messages in {each.seconds:.0f} s, slowest {each.slowest_ms:.1f} ms")
