@@ -89,6 +89,68 @@ def test_bounds_checked_kernels_are_others(kernels):
     assert "IndexError" in checked.stderr
 
 
+PARTS = """
+from kernels import _jit
+
+@_jit.part
+def entry(a, k):
+    return a[k]
+
+@_jit.part
+def entries(a, k):
+    return entry(a, k) + entry(a, k + 1)
+
+@_jit.kernel("float64(float64[::1], int64)")
+def pair(a, k):
+    return entries(a, k)
+
+@_jit.kernel("float64(float64[::1])")
+def pairs(a):
+    return pair(a, 0) + entry(a, 2) + pair(a, {last})
+"""
+CALL_PARTS = """
+import numpy as np
+from kernels import _jit, parts
+a = np.arange(4.0)
+print(parts.pairs(a), parts.pair(a, 1), parts.entries(a, 1), _jit.is_on_disk(parts.pairs))
+"""
+LIST_SYMBOLS = """
+from kernels import _jit, parts
+list(_jit.iter_compile(parts.pairs))
+(result,) = parts.pairs.overloads.values()
+print(*sorted(one.name for one in result.library.get_defined_functions() if one.linkage.name != "internal"))
+print(*sorted([result.fndesc.llvm_func_name, result.fndesc.llvm_cpython_wrapper_name]))
+"""
+
+
+def test_parts_and_kernels_are_called_by_kernels_and_from_python_compiled_and_from_disk(kernels):
+    (kernels / "parts.py").write_text(PARTS.format(last=2))
+    for _ in range(2):
+        done = run(kernels, CALL_PARTS)
+        assert (done.stdout, done.stderr) == ("8.0 3.0 3.0 True\n", "")
+
+
+def test_an_index_out_of_bounds_in_a_part_of_a_part_is_told(kernels):
+    (kernels / "parts.py").write_text(PARTS.format(last=3))
+    for _ in range(2):
+        checked = run(kernels, CALL_PARTS, NUMBA_BOUNDSCHECK="1")
+        assert checked.returncode != 0
+        assert "IndexError" in checked.stderr
+
+
+def test_a_kernel_shows_others_nothing_of_its_parts(kernels):
+    (kernels / "parts.py").write_text(PARTS.format(last=2))
+    done = run(kernels, LIST_SYMBOLS)
+    shown, own = done.stdout.splitlines()
+    assert shown == own
+
+
+def test_a_variable_that_does_not_change_the_code_leaves_the_folder(kernels):
+    _, _, name = results(kernels)
+    assert results(kernels, NUMBA_NUM_THREADS="1") == (4.0, False, name)
+    assert results(kernels, NUMBA_OPT="1")[2] != name
+
+
 def test_without_compilation_nothing_is_compiled(kernels):
     value, compiled, _ = results(kernels, NUMBA_DISABLE_JIT="1")
     assert (value, compiled) == (4.0, False)

@@ -7,6 +7,7 @@ It compiles none itself.  Code that has just been compiled and the same from dis
 round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.
 """
 
+import gc
 import os
 import subprocess
 import sys
@@ -24,6 +25,8 @@ from factorbus.solver.warm import iter_compile, list_missing
 
 _FEW = 4  # kernels that are worth another process
 _MOST = 8  # processes: compiling takes half a gigabyte of memory each
+# Numba colours the messages of the attempts that it gives up: a twentieth of the time.
+_PLAIN_MESSAGES = {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
 _apart: list[float] = []  # seconds of waiting for them
 
 
@@ -55,7 +58,10 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
         with os.fdopen(tell, "w") as end:
             for _ in range(processes):
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "factorbus.service.warm", claims], stdin=subprocess.DEVNULL, stdout=end
+                    [sys.executable, "-m", "factorbus.service.warm", claims],
+                    stdin=subprocess.DEVNULL,
+                    stdout=end,
+                    env=os.environ | _PLAIN_MESSAGES,
                 )
                 stack.callback(_end, process)
         for name in names:  # until the last of them has ended
@@ -65,6 +71,7 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
 
 def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
+    gc.set_threshold(20_000, 20, 1000)  # looking for what the compiler has dropped took a tenth of the time
     for kernel in _list_missing():
         try:
             (claims / f"{kernel.__module__}.{kernel.__name__}").touch(exist_ok=False)

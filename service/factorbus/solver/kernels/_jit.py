@@ -5,6 +5,9 @@
 `inline_kernel`  melts into the kernels that call it; for what runs in their innermost loops.
 `part`           a step of a kernel, called by it and compiled apart: one large function takes far longer to compile.
 
+Numba types a part once in a process; each kernel that calls it, also by way of other parts, links a copy of its own.
+A kernel that is called by another is a part there.
+
 The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
 numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
 stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder
@@ -16,6 +19,7 @@ NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 check
 """
 
 import atexit
+import functools
 import hashlib
 import os
 import platform
@@ -35,8 +39,10 @@ import numpy as np
 from llvmlite import ir
 from numba.core import caching, cgutils, config, event, types
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
+from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import register_pass
+from numba.core.typed_passes import NativeLowering
 from numpy.typing import NDArray
 
 __all__ = [
@@ -73,22 +79,114 @@ _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 _EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
+# Of numba's variables, those that leave the code as it is: no kernel is parallel.
+_NO_MATTER = {"NUMBA_NUM_THREADS", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"}
 _KEPT_FOLDERS = 6
 
 
 class _PartLibrary(JITCodeLibrary):
-    """The code of a part: optimised where it is linked, in every kernel that calls it, and only there.
+    """The code of a part as it was written.  It is linked, optimised and made machine code in the kernels that call it.
 
-    Numba's own libraries are optimised at every level of calls, which makes compiling a third longer.
+    Numba's own libraries do all of that at every level of calls, and wrap each function for Python and for C.
     """
 
+    def add_linking_library(self, library: Any) -> None:
+        _add_linked(self._linking_libraries, library)
+
+    def finalize(self) -> None:
+        self._finalized = True
+
+
+class _KernelLibrary(JITCodeLibrary):
+    """The code of a kernel and of all parts that it calls, directly or not."""
+
+    def add_linking_library(self, library: Any) -> None:
+        library._ensure_finalized()
+        _add_linked(self._linking_libraries, library)
+
     def _optimize_final_module(self) -> None:
-        pass
+        """Then what the kernel calls is its own: nothing of another kernel is taken for it, whatever came first."""
+        super()._optimize_final_module()
+        for function in self._final_module.functions:
+            if function.linkage == llvmlite.binding.Linkage.linkonce_odr and not function.is_declaration:
+                function.linkage = llvmlite.binding.Linkage.internal
+
+    def _get_module_for_linking(self) -> Any:
+        """What is kept on disk beside the machine code, to be linked by others: nobody does, so only the names."""
+        if self._shared_module is None:
+            external = llvmlite.binding.Linkage.external
+            names = [function.name for function in self.get_defined_functions() if function.linkage == external]
+            text = "\n".join(f'define void @"{name}"() {{ ret void }}' for name in names)
+            self._shared_module = llvmlite.binding.parse_assembly(text)
+        return self._shared_module
+
+
+def _add_linked(linked: list[Any], library: Any) -> None:
+    """`library`, and what it links itself if it is a part's.  Callers stand before what they call: LLVM links only what
+    it knows to be called."""
+    for one in (library, *library._linking_libraries) if isinstance(library, _PartLibrary) else (library,):
+        if one in linked:
+            linked.remove(one)
+        linked.append(one)
+
+
+class _Flags(Flags):
+    """Numba's flags, compared in a tenth of the time: it looks all functions up by the flags they are called with."""
+
+    __slots__ = ()
+    _defaults = Flags().values()
+    _hash = hash(Flags())
+
+    def values(self) -> dict[str, Any]:
+        return {**self._defaults, **self._values}
+
+    def __hash__(self) -> int:
+        return self._hash  # of the names alone, as numba has it
+
+
+class _KernelCompiler(Compiler):
+    """Numba's own compiler, with our library for a kernel."""
+
+    def __init__(
+        self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
+    ) -> None:
+        if library is None:
+            library = _KernelLibrary(targetctx.codegen(), "kernel")
+            library.enable_object_caching()
+        ours: Any = _Flags(flags)
+        ours.no_cfunc_wrapper = True  # nobody calls it from C
+        super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _PartLowering(NativeLowering):
+    """Lowering that ends with the code that others link."""
+
+    _name = "part_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = state.flags.no_compile = True
+        super().run_pass(state)
+        state.library.finalize()
+        called_by = object()  # the name by which the code of others calls it
+        state.cr = state.cr._replace(cfunc=called_by)
+        state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
+        return True
 
 
 class _PartCompiler(Compiler):
-    def __init__(self, typingctx: Any, targetctx: Any, library: Any, *rest: Any) -> None:
-        super().__init__(typingctx, targetctx, library or _PartLibrary(targetctx.codegen(), "part"), *rest)
+    def __init__(
+        self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
+    ) -> None:
+        library = library or _PartLibrary(targetctx.codegen(), "part")
+        super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), names)
+
+    def define_pipelines(self) -> list[Any]:
+        pipelines = super().define_pipelines()
+        for pipeline in pipelines:
+            pipeline.passes = [(_PartLowering if one is NativeLowering else one, why) for one, why in pipeline.passes]
+            pipeline.finalize()
+        return pipelines
 
 
 class KernelFolder:
@@ -118,13 +216,13 @@ class KernelFolder:
         """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
         if DISABLED:
             return function
-        return _ours(numba.njit(forceinline=True, pipeline_class=_PartCompiler, **self._flags)(function))
+        return self._linked(function, forceinline=True)
 
     def part(self, function: Callable[..., Any]) -> Any:
         """A step of a kernel, kept on disk with the kernel that calls it."""
         if DISABLED:
             return function
-        return _ours(numba.njit(pipeline_class=_PartCompiler, **self._flags)(function))
+        return self._linked(function)
 
     def path(self) -> Path:
         """The cache folder, made when it is first asked for."""
@@ -135,11 +233,26 @@ class KernelFolder:
     def _compiled(self, function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
         if DISABLED:
             return function
-        dispatcher = _ours(numba.njit(**self._flags)(function))
+        dispatcher = _ours(numba.njit(pipeline_class=_KernelCompiler, **self._flags)(function))
+        part = functools.cache(lambda: self._linked(function))  # what other kernels link
+        dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
+        dispatcher.get_overload = lambda signature: part().get_overload(signature)
         dispatcher._cache = self._cache(function)
         dispatcher.factorbus_signatures = signatures
         if signatures:
             dispatcher._compile_for_args = _on_first_call(dispatcher)
+        return dispatcher
+
+    def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
+        """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
+        dispatcher = _ours(numba.njit(pipeline_class=_PartCompiler, **flags, **self._flags)(function))
+
+        @functools.cache
+        def alone() -> Any:
+            return _ours(numba.njit(pipeline_class=_KernelCompiler, **self._flags)(function))
+
+        dispatcher.add_overload = lambda result: dispatcher.overloads.update({tuple(result.signature.args): result})
+        dispatcher._compile_for_args = lambda *_args, **_kwargs: alone()
         return dispatcher
 
     def _make(self) -> Path:
@@ -200,12 +313,16 @@ def sources_hash(folder: Path, *also: Path) -> str:
                 platform.machine(),
                 (np.__version__, numba.__version__, llvmlite.__version__),
                 (llvmlite.binding.get_host_cpu_name(), features),
-                sorted((name, value) for name, value in os.environ.items() if name.startswith("NUMBA_")),
+                sorted((name, value) for name, value in os.environ.items() if _changes_code(name)),
                 sorted(_FASTMATH),
             )
         ).encode()
     )
     return digest.hexdigest()[:20]
+
+
+def _changes_code(variable: str) -> bool:
+    return variable.startswith("NUMBA_") and variable not in _NO_MATTER
 
 
 def _compile_declared(dispatcher: Any) -> None:
