@@ -39,7 +39,7 @@ def test_every_step_is_the_dense_gauss_newton_solution(seed: int, mode: str) -> 
         assert report.chi2 <= report.chi2_before
         assert twin.gauss_newton(iterations=2) < 1e-9
         for key, (kind, value) in by_key(solver.estimate()).items():
-            assert distance(kind, value, twin.values[key]) < 1e-8
+            assert distance(kind, value, twin.values[key]) < 5e-8  # what χ², good to 1e-16 of it, can tell
         assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
 
 

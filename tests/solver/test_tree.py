@@ -228,7 +228,7 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, 
 
 
 def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
-    """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.14)."""
+    """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.16)."""
     solver, ratios = Solver(Options(mode="tree")), []
     for n, step in enumerate(manhattan(600, 11)):
         solver.stage(step.batch)

@@ -5,6 +5,7 @@ This is the memory of `kernels/tree_step.py`, which does the work in one call; h
 
 import numpy as np
 
+from factorbus.solver import pages
 from factorbus.solver.arenas import Arenas
 from factorbus.solver.graph import Graph, grown
 from factorbus.solver.kernels import fronts as fr
@@ -16,7 +17,6 @@ from factorbus.solver.kernels.tree_moved import exchange, list_moved
 from factorbus.solver.kernels.tree_step import tree_step
 from factorbus.solver.options import Options
 
-_LINE = 8  # doubles in a cache line
 _FEW = 8  # new variables for which good first values are looked for
 
 
@@ -42,11 +42,11 @@ class Tree(Arenas):
         self.link: I64 = np.empty((16, tl.L_WIDTH), np.int64)
         self.clique: I64 = np.empty((16, tl.C_WIDTH), np.int64)
         self.lists: I64 = np.empty(256, np.int64)
-        self.numbers: F64 = _aligned(4096)
+        self.numbers: F64 = pages.zeros(4096)
         self.hessian: F64 = np.empty(1024)
         self.lin: F64 = np.empty((3, 64))
         self.scalars: F64 = np.zeros((3, 64))
-        self.stiff: F64 = np.empty((16, 2))
+        self.stiff: F64 = np.zeros((16, 4))
         self.lever: F64 = np.empty(16)
         self.pending: I64 = np.empty(16, np.int64)
         self.changed: I64 = np.empty(16, np.int64)
@@ -106,7 +106,7 @@ class Tree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + 4) + factors * (tl.L_WIDTH + 2) + cliques * tl.C_WIDTH
+        rows = variables * (tl.N_WIDTH + 4) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
@@ -120,9 +120,7 @@ class Tree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            larger = _aligned(max(need, 2 * self.numbers.size))
-            larger[: self.numbers.size] = self.numbers
-            self.numbers = larger
+            pages.enlarge(self, "numbers", max(need, 2 * self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 
     def _make_room_for_graph(self) -> None:
@@ -144,13 +142,6 @@ class Tree(Arenas):
             self.hessian = grown(self.hessian, need)
         if 2 * new > len(self.saved):
             self.saved = np.empty((4 * new, 8))
-
-
-def _aligned(size: int) -> F64:
-    """Doubles that start at a cache line, and a line more: tiles are read whole."""
-    raw = np.zeros(size + 2 * _LINE)
-    skip = (-raw.ctypes.data // 8) % _LINE
-    return raw[skip : skip + size]
 
 
 def _widened(array: F64, need: int) -> F64:

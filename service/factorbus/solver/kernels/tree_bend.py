@@ -18,7 +18,12 @@ against the pose, the Jacobian of the pose's turn is off by that share of d, and
 r being the residual at the linearisation point.  A pose seen from another one slips as well, by much less: errors of
 the gradient largely cancel along a path, and LINKS of it is what counts, with the residual r(x) at the estimate,
 
-    slip = LINKS √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                     (9.15)
+    slip = LINKS √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                     (9.13)
+
+and as u is off by |sⱼ − sᵢ| + φ (d + |r₀|) at most from what it was at the linearisation point, where the residual was
+r₀, that is not looked at where it cannot matter,
+
+    |r(x)| ≤ |r₀| + |sⱼ − sᵢ| + φ (d + |r₀|)                                                             (9.14)
 
 Where the slip is more than the bend, both ends move.  How a sight is
 bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
@@ -71,24 +76,29 @@ def bend_of(kind: int, root: float, d: float, phi: float, shift: float) -> float
 
 
 @inline_kernel
-def slip_of(kind: int, root: float, d: float, shift: float, hessian: F64, h: int) -> float:
-    """(9.12) of what sees a landmark; √ω |r| from the gradient of the pose's translation, Ω r.  0 of all else."""
-    if d > 0.0 and kind == at.LANDMARK_SE2:
-        g = h + 9 + 6 + 4
-        pull = math.sqrt(load(hessian, g) ** 2 + load(hessian, g + 1) ** 2)
-    elif d > 0.0 and kind == at.LANDMARK_SE3:
-        g = h + 36 + 18 + 9
-        pull = math.sqrt(load(hessian, g) ** 2 + load(hessian, g + 1) ** 2 + load(hessian, g + 2) ** 2)
-    else:
-        return 0.0
-    return (pull / root + root * shift) * shift / d
+def slip_of(kind: int, root: float, d: float, shift: float, pull: float) -> float:
+    """(9.12) of what sees a landmark, √ω |r| as |Ω r| / √ω; pull is |Ω r|.  0 of all else."""
+    if d > 0.0 and (kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3):
+        return (pull / root + root * shift) * shift / d
+    return 0.0
+
+
+@inline_kernel
+def may_slip(
+    kind: int, root: float, d: float, phi: float, shift: float, residual: float, stiff_turn: float, room: float
+) -> bool:
+    """Whether (9.13) can come to `room`, by (9.14); the residual is that at the linearisation point."""
+    if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
+        return False
+    most = LINKS * root * root * (residual + shift + phi * (d + residual)) * shift
+    return not (room > 0.0 and most * most < room * room * (d * d * root * root + stiff_turn))
 
 
 @inline_kernel
 def slip_between(
     kind: int, p: F64, k: int, i: int, j: int, root: float, d: float, shift: float, values: F64, hessian: F64, h: int
 ) -> float:
-    """(9.15) of the poses at offsets i and j, by the measurement at offset k of p.  0 of all else."""
+    """(9.13) of the poses at offsets i and j, by the measurement at offset k of p.  0 of all else."""
     if kind == at.BETWEEN_SE2:
         c, s = math.cos(load(values, i + 2)), math.sin(load(values, i + 2))
         dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)

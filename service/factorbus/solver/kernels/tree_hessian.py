@@ -1,5 +1,7 @@
 """The Hessian of a factor at its variables' linearisation points, kept until one of them moves.  MATH §9.2."""
 
+import math
+
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
@@ -18,25 +20,43 @@ def hessian_size(di: int, dj: int) -> int:
 
 @part
 def linearise_factor(
-    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, r: F64, H: F64, W: F64, state: I64
-) -> None:
-    """Write the Hessian of factor f at the linearisation points.  r (7,), H (4, 6, 6), W (6, 6) are scratch."""
+    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, stiff: F64, r: F64, H: F64, W: F64,
+    state: I64,
+) -> None:  # fmt: skip
+    """Write the Hessian of factor f at the linearisation points, and what its slip depends on there.
+
+    r (7,), H (4, 6, 6), W (6, 6) are scratch
+    """
     kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
     p = fac[f, at.F_AT] + information_at(kind)
     more = evaluate_apart(f, var, fac, lin, payload, r, H[0], H[1])
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
         _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
+        stiff[f, 2], stiff[f, 3] = math.sqrt(r[0] * r[0] + r[1] * r[1]), hessian[h + 9 + 9 + 8]
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
         _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
+        stiff[f, 2] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
         _write(6, 6, 6, p, more, payload, r, H, W, h, hessian)
+        stiff[f, 2] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        stiff[f, 3] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
         _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
+        stiff[f, 2] = gradient_norm(3, h + 36 + 18 + 9, hessian)
     else:
         _write_other(kind, p, more, payload, r, H, W, h, hessian)
         if kind >= at.IDP_FIRST:
             note_sleep(f, r[at.R_STATUS] != GOOD, link, state)
+
+
+@inline_kernel
+def gradient_norm(count: int, g: int, hessian: F64) -> float:
+    """|Ω r| of what is seen: the gradient of the pose's translation, from offset g on."""
+    total = 0.0
+    for a in range(count):
+        total += hessian[g + a] * hessian[g + a]
+    return math.sqrt(total)
 
 
 @inline_kernel

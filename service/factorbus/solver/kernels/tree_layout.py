@@ -15,7 +15,8 @@ The arenas of a tree are:
     lists   int64            variables of cliques
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
-    stiff   (m, 2) float64   d and √ω of each factor, (9.4)
+    stiff   (m, 4) float64   of each factor d and √ω, (9.4); between poses |r| of the translation where it was
+                             linearised, and ω_θ, (9.14); of a landmark |Ω r| there, (9.12)
     lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
@@ -157,5 +158,5 @@ LINEARISE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
 A_CHI2 = 0  # χ² of the linear problem at its solution
 A_BEND = 1  # the largest bend of what moved, units of (9.6)
 A_CONSTANT = 2  # χ² of factors between fixed variables
-A_ALARM = 3  # what may have bent since it was looked last, σ² (9.13)
+A_ALARM = 3  # what may have bent since it was looked last, σ² (9.15)
 A_SIZE = 4

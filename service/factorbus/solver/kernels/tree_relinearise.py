@@ -16,7 +16,7 @@ WAITS, MOVES = 1, 2
 @part
 def relinearise(
     pending: I64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64,
-    scalars: F64, state: I64,
+    scalars: F64, stiff: F64, state: I64,
 ) -> None:  # fmt: skip
     """Move the pending variables to the estimate, and linearise their factors there."""
     for k in range(pending.size):
@@ -30,13 +30,13 @@ def relinearise(
             scalars[2, d + a], scalars[0, d + a] = scalars[0, d + a], 0.0
         node[v, tl.N_FLAGS] = MOVES
         state[tl.S_RELINEARISED] += 1
-    linearise_around(pending, var, fac, payload, node, link, hessian, lin, state)
+    linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
 
 
 @part
 def go_back(
     pending: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
-    state: I64,
+    stiff: F64, state: I64,
 ) -> None:  # fmt: skip
     """Undo `relinearise`: its variables wait again."""
     for k in range(pending.size):
@@ -48,13 +48,14 @@ def go_back(
             scalars[0, d + a] = scalars[2, d + a]
         node[v, tl.N_FLAGS] = WAITS
         state[tl.S_RELINEARISED] -= 1
-    linearise_around(pending, var, fac, payload, node, link, hessian, lin, state)
+    linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
 
 
 @part
 def linearise_around(
-    variables: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, state: I64
-) -> None:
+    variables: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, stiff: F64,
+    state: I64,
+) -> None:  # fmt: skip
     """Linearise the factors of some variables, each once."""
     r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
     state[tl.S_SWEEP] += 1
@@ -64,5 +65,5 @@ def linearise_around(
             f = slot // 2
             if link[f, tl.L_STAMP] != state[tl.S_SWEEP]:
                 link[f, tl.L_STAMP] = state[tl.S_SWEEP]
-                linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
+                linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
             slot = next_incidence(slot, link)

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
-from factorbus.solver.kernels.tree_bend import bend_of, shift_between, slip_between, slip_of, turn_of
+from factorbus.solver.kernels.tree_bend import bend_of, may_slip, shift_between, slip_between, slip_of, turn_of
 from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
@@ -97,14 +97,19 @@ def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -
 
 @inline_kernel
 def solve_rows(row: I64, numbers: F64) -> None:
-    """δ_F = R_F⁻¹ (d − R_S δ_S)"""
+    """δ_F = R_F⁻¹ (d − R_S δ_S), the product first: its rows do not wait for each other."""
     p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
     width = p + row[tl.C_BORDER]
+    for i in range(p):
+        line, total = row[tl.C_ROWS] + i * ld, 0.0
+        for k in range(p, width):
+            total += load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, load(numbers, line + width) - total)
     for i in range(p - 1, -1, -1):
         line, total = row[tl.C_ROWS] + i * ld, 0.0
-        for k in range(i + 1, width):
+        for k in range(i + 1, p):
             total += load(numbers, line + k) * load(numbers, used + k)
-        put(numbers, used + i, (load(numbers, line + width) - total) / load(numbers, line + i))
+        put(numbers, used + i, (load(numbers, used + i) - total) / load(numbers, line + i))
 
 
 @inline_kernel
@@ -139,7 +144,7 @@ def move_frontals(
                 state[tl.S_MOVED] += 1
             move_to(kind, lin, x, delta, d, values)
             phi = turn_of(kind, delta, d)
-            account[tl.A_ALARM] += phi * phi * far  # (9.13)
+            account[tl.A_ALARM] += phi * phi * far  # (9.15)
 
 
 @part
@@ -149,7 +154,7 @@ def find_bent(
 ) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is to be relinearised, and empty `moved`; gives what `look` does.
 
-    Where that cannot wait, (9.14), all that is bent by FINE of the threshold goes along: what is relinearised alone
+    Where that cannot wait, (9.16), all that is bent by FINE of the threshold goes along: what is relinearised alone
     bends its neighbours, and each round would have to take in some more.
     """
     bent = settings[tl.P_BENT]
@@ -170,7 +175,7 @@ def look(
     scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
-    more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.15), and both ends of
+    more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.13), and both ends of
     one for which that is computed, (9.11).  Gives the largest bend, and Σ bend² of those bent by more than `bent`.
     """
     most, strain, delta = 0.0, 0.0, scalars[0]
@@ -193,8 +198,9 @@ def look(
             elif slot % 2 == 0 and phi > 0.0 and y >= 0:
                 d, root, shift = stiff[f, 0], stiff[f, 1], shift_between(planar, x, y, values, lin)
                 bend = bend_of(kind, root, d, phi, shift)
-                slip = slip_of(kind, root, d, shift, hessian, h)
-                slip += slip_between(kind, payload, fac[f, at.F_AT], x, y, root, d, shift, values, hessian, h)
+                slip = slip_of(kind, root, d, shift, stiff[f, 2])
+                if may_slip(kind, root, d, phi, shift, stiff[f, 2], stiff[f, 3], bent - bend):
+                    slip = slip_between(kind, payload, fac[f, at.F_AT], x, y, root, d, shift, values, hessian, h)
                 most = max(most, bend + slip)
                 if bend + slip > bent:
                     strain += (bend + slip) * (bend + slip)

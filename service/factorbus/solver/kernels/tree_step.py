@@ -82,7 +82,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     while True:
         if not wait and state[tl.S_PENDING] > 0:
             some = pending[: state[tl.S_PENDING]]
-            relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, state)
+            relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, state)
         lap(began, tl.LINEARISE, state)
         bow, strain, status = eliminate_again(
             v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
@@ -96,7 +96,7 @@ def tree_step(graph: I64, tree: I64) -> int:
             if not wait:
                 some = pending[: state[tl.S_PENDING]]
                 relinearised = some.size > 0
-                go_back(some, var, fac, payload, node, link, hessian, lin, scalars, state)
+                go_back(some, var, fac, payload, node, link, hessian, lin, scalars, stiff, state)
             if state[tl.S_ROUNDS] > 0:
                 break
             if relinearised:

@@ -54,7 +54,7 @@ def take_in_factors(
         link[f, tl.L_FAR] = var[j, at.V_AT] if j >= 0 else -1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-        linearise_factor(f, var, fac, lin[0], payload, link, hessian, r, H, W, state)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1])
         _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
         if j >= 0:

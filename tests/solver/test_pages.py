@@ -1,0 +1,58 @@
+"""Arrays that grow in place keep what they hold, whoever looks at them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from factorbus.solver import pages
+from factorbus.solver.kernels._jit import F64
+
+
+@dataclass
+class Owner:
+    numbers: F64 = field(default_factory=lambda: pages.zeros(1000))
+
+
+def test_what_grows_keeps_its_numbers_and_the_rest_is_zero() -> None:
+    owner = Owner()
+    owner.numbers[:] = np.arange(1000)
+    for size in (1001, 5000, 3_000_000):
+        pages.enlarge(owner, "numbers", size)
+        assert owner.numbers.size == size
+        assert owner.numbers.flags.carray
+        assert owner.numbers.ctypes.data % 64 == 0
+        assert np.array_equal(owner.numbers[:1000], np.arange(1000))
+        assert not owner.numbers[1000:].any()
+
+
+def test_nothing_is_copied_where_pages_can_be_moved() -> None:
+    owner = Owner()
+    base = owner.numbers.base.obj  # type: ignore[union-attr]
+    pages.enlarge(owner, "numbers", 100_000)
+    assert owner.numbers.base.obj is base  # type: ignore[union-attr]
+
+
+def test_a_view_that_somebody_has_stays_as_it_is() -> None:
+    owner = Owner()
+    owner.numbers[:] = 7.0
+    view = owner.numbers[10:20]
+    pages.enlarge(owner, "numbers", 4000)
+    owner.numbers[:] = 8.0
+    assert (view == 7.0).all()
+
+
+def test_an_array_from_elsewhere_is_copied() -> None:
+    owner = Owner(np.ones(50))
+    pages.enlarge(owner, "numbers", 60)
+    assert owner.numbers.sum() == 50.0
+    assert owner.numbers.size == 60
+
+
+def test_without_memory_nothing_has_changed() -> None:
+    owner = Owner()
+    owner.numbers[:] = 3.0
+    with pytest.raises(MemoryError, match="doubles"):
+        pages.enlarge(owner, "numbers", 1 << 50)
+    assert owner.numbers.size == 1000
+    assert (owner.numbers == 3.0).all()
