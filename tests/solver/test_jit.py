@@ -241,6 +241,59 @@ def test_a_kernel_with_a_signature_takes_nothing_else():
     assert any_first(np.ones(6)[::2]) == 1.0
 
 
+@_jit.part
+def larger(a, n):
+    """`a`, or a copy with room for n: what is given back may be what was given."""
+    if a.size >= n:
+        return a
+    b = np.zeros(n)
+    b[: a.size] = a
+    return b
+
+
+@_jit.part
+def first_row(rows):
+    return rows[0]
+
+
+@_jit.kernel("float64(float64[:,::1], int64)")
+def sum_of_first(rows, n):
+    """Of its own arrays none may go too soon, whoever has given them on."""
+    own = larger(first_row(rows).copy(), 0)
+    for k in range(n):
+        own = larger(first_row(np.ones((1, 1))) if k == 0 else own, k)
+    total = 0.0
+    for k in range(own.size):
+        total += own[k]
+    return total
+
+
+@_jit.kernel("Tuple((float64, float64[::1]))(float64[:,::1])")
+def last_row(rows):
+    return rows[0, 0], rows[len(rows) - 1]
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without compilation Python counts")
+def test_arrays_live_as_long_as_they_are_used():
+    rows = np.ones((2, 3))
+    sum_of_first(rows, 0)
+    before = sys.getrefcount(rows)
+    for n in (0, 5, 5000):
+        assert sum_of_first(rows, n) == (3.0 if n == 0 else 1.0)
+    assert sys.getrefcount(rows) == before
+    _, row = last_row(rows)
+    del rows
+    spoiled = [np.full((2, 3), 7.0) for _ in range(100)]
+    assert row.tolist() == [1.0, 1.0, 1.0]
+    assert len(spoiled) == 100
+    pair = np.ones((2, 3))
+    last_row(pair)
+    before = sys.getrefcount(pair)
+    for _ in range(10):
+        last_row(pair)
+    assert sys.getrefcount(pair) == before, "a row that is given back is counted, and let go again"
+
+
 def test_first_calls_from_many_threads():
     start, answers = threading.Barrier(4), []
 
