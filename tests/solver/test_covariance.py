@@ -87,6 +87,21 @@ def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, in
         np.testing.assert_allclose(found[: dims[a], : dims[b]], whole[: dims[a], dims[a] :], rtol=1e-9, atol=1e-14)
 
 
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
+    solver = solved(seed, "tree", steps=12)
+    alone, every = Blocks(solver.factored()), np.arange(solver.variable_count)
+    diagonal = alone.diagonal()
+    for hub in every[:: max(1, len(every) // 4)]:
+        blocks, here = Blocks(solver.factored()), np.full(len(every), hub)
+        np.testing.assert_array_equal(blocks.diagonal(int(hub)), diagonal)
+        wanted = alone._single_pairs(here, every)
+        scale = np.sqrt(np.abs(diagonal[hub]).max() * np.abs(diagonal).max()) + 1e-12
+        np.testing.assert_allclose(blocks.pairs(here, every), wanted, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(blocks.pairs(every, here), wanted.transpose(0, 2, 1), rtol=0, atol=1e-10 * scale)
+
+
 def test_in_place_is_what_the_copy_says() -> None:
     solver = Solver(Options(mode="tree"))
     for step in manhattan(200, 4):

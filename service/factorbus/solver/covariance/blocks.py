@@ -9,8 +9,7 @@ import numpy as np
 from factorbus.solver.covariance.factored import DIMS, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
-from factorbus.solver.covariance.kernels.recursion import diagonal_blocks
-from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.covariance.kernels.whole import whole_blocks
 from factorbus.solver.kernels._jit import F64, I64
 
 # For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
@@ -28,14 +27,20 @@ class Blocks:
         self.factored = factored
         self.width = int(factored.dims.max(initial=1))
         self._diagonal: F64 | None = None
+        self._hub, self._column = -1, np.zeros((0, self.width, self.width))
 
-    def diagonal(self) -> F64:
-        """(n, width, width): of every variable, in the upper left corners."""
+    def diagonal(self, hub: int = -1) -> F64:
+        """(n, width, width): of every variable, in the upper left corners.
+
+        When they are computed, so is on the way what `pairs` will be asked for of variable `hub`, unless that is −1.
+        """
         if self._diagonal is None:
             f = self.factored
-            self._diagonal = np.zeros((f.count, self.width, self.width))
-            roots, none = f.order[f.clique[f.order, tl.C_PARENT] < 0], np.empty(0, np.int64)
-            diagonal_blocks(roots, f.clique, f.lists, f.numbers, f.dims, -1, 0.0, 0, none, self._diagonal)
+            hub = hub if hub >= 0 and f.scalar[hub] >= 0 else -1
+            diagonal = np.zeros((f.count, self.width, self.width))
+            column = np.zeros_like(diagonal) if hub >= 0 else self._column
+            whole_blocks(f.order, hub, f.node, f.scalar, f.clique, f.lists, f.numbers, f.dims, diagonal, column)
+            self._diagonal, self._hub, self._column = diagonal, hub, column
         return self._diagonal
 
     def of(self, variables: I64) -> F64:
@@ -77,6 +82,11 @@ class Blocks:
     def pairs(self, first: I64, second: I64) -> F64:
         """(k, width, width): between first[k] (rows) and second[k] (columns), each in the upper left corner."""
         f = self.factored
+        if self._hub >= 0 and first.size:
+            if (first == self._hub).all():
+                return self._column[second]
+            if (second == self._hub).all():
+                return np.ascontiguousarray(self._column[first].transpose(0, 2, 1))
         if first.size <= _FEW_PAIRS or f.order.size == 0:
             return self._single_pairs(first, second)
         free_first, free_second = (np.where(f.scalar[ends] >= 0, ends, -1) for ends in (first, second))

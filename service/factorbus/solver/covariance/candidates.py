@@ -78,33 +78,39 @@ def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
     graph, n = blocks.factored.graph, last - first
     ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
     both = np.flatnonzero(ends[:, 1] >= 0)
+    diagonal, places = _diagonal(blocks, ends, _hub(ends[both]))
     if both.size == n:
         cross = blocks.pairs(ends[:, 0], ends[:, 1])
     else:
         cross = np.zeros((n, blocks.width, blocks.width))
         cross[both] = blocks.pairs(ends[both, 0], ends[both, 1])
-    diagonal, places = _diagonal(blocks, ends)
-    dims = _SIZES[graph.fac[first:last, at.F_KIND], 0]
+    sizes = _SIZES[graph.fac[first:last, at.F_KIND]]
+    dims = sizes[:, 0].copy()
     widest = int(dims.max(initial=1))
     distance, gain, predicted = np.empty(n), np.empty(n), np.empty((n, widest, widest))
-    room = _room(min(n, _CHUNK))
+    r, A, B, W = _room(min(n, _CHUNK))
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
-        linear = linearised(graph, first + start, first + stop, room)
         rows = slice(start, stop)
-        judge(
-            places[rows], linear.sizes, linear.r, linear.A, linear.B, linear.W, diagonal, cross[rows],
-            predicted[rows], distance[rows], gain[rows],
-        )  # fmt: skip
+        evaluate_factors(first + start, first + stop, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+        judge(places[rows], sizes[rows], r, A, B, W, diagonal, cross[rows], predicted[rows], distance[rows], gain[rows])
     if not np.isfinite(distance).all():
         raise errors.NotFinite("the distance of a candidate")
     return Candidates(ends, dims, distance, gain, predicted)
 
 
-def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
+def _hub(ends: I64) -> int:
+    """The variable that is an end of all, at the same side; −1: none is."""
+    for side in (0, 1):
+        if len(ends) and (ends[:, side] == ends[0, side]).all():
+            return int(ends[0, side])
+    return -1
+
+
+def _diagonal(blocks: Blocks, ends: I64, hub: int) -> tuple[F64, I64]:
     """Covariances of the variables that occur, and where those of `ends` are among them; −1 stays."""
     if blocks.prefers_all(ends.size):
-        return blocks.diagonal(), ends
+        return blocks.diagonal(hub), ends
     different, which = np.unique(ends, return_inverse=True)
     known = different >= 0
     diagonal = np.zeros((different.size, blocks.width, blocks.width))
@@ -112,9 +118,9 @@ def _diagonal(blocks: Blocks, ends: I64) -> tuple[F64, I64]:
     return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
 
 
-def linearised(graph: Graph, first: int, last: int, room: tuple[F64, F64, F64, F64] | None = None) -> Linear:
-    """The factors first .. last−1 at the estimate; in `room`, if there is some, for so long as it is not used again."""
-    r, A, B, W = (array[: last - first] for array in room or _room(last - first))
+def linearised(graph: Graph, first: int, last: int) -> Linear:
+    """The factors first .. last−1 at the estimate."""
+    r, A, B, W = _room(last - first)
     evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
     r = np.ascontiguousarray(r[:, :LARGEST])  # without what became of a sight
     fac = graph.fac[first:last]

@@ -1,6 +1,6 @@
 """What a map expects of a factor that it has not taken in.  MATH §10.3.
 
-T = H Σ Hᵀ,   S = T + Ω⁻¹,   d² = rᵀ S⁻¹ r,   gain = ½ ln det S + ½ ln det Ω               (10.5)
+T = H Σ Hᵀ,   Ω = L Lᵀ,   M = I + Lᵀ T L,   d² = (Lᵀ r)ᵀ M⁻¹ Lᵀ r,   gain = ½ ln det M       (10.5), (10.6)
 """
 
 import math
@@ -21,19 +21,19 @@ def judge(
 ) -> None:
     """Factors between ends[k, 0] and ends[k, 1] (−1: none).
 
-    in   sizes (n, 3): of the residual and of the ends   r (n, 6)  A, B, W (n, 6, 6)
+    in   sizes (n, 3): of the residual and of the ends   r (n, 6 or more)  A, B, W (n, 6, 6)
          diagonal (variables, d, d)  cross (n, d, d): Σ between the ends
     out  T (n, e, e)   distance (n,): d²   gain (n,): nats
     """
-    G, S, y = np.empty((_DIM, _DIM)), np.empty((_DIM, _DIM)), np.empty(_DIM)
+    G, M, y = np.empty((_DIM, _DIM)), np.empty((_DIM, _DIM)), np.empty(_DIM)
     for k in range(len(ends)):
         dr, di, dj, i, j = sizes[k, 0], sizes[k, 1], sizes[k, 2], ends[k, 0], max(0, ends[k, 1])
         if dr == 3 and di == 3 and dj == 3:  # with constants the loops are unrolled: three times as fast
-            expect(3, 3, 3, A[k], B[k], diagonal[i], diagonal[j], cross[k], G, S, T[k])
-            distance[k], gain[k] = hold(3, r[k], W[k], T[k], G, S, y)
+            expect(3, 3, 3, A[k], B[k], diagonal[i], diagonal[j], cross[k], G, M, T[k])
+            distance[k], gain[k] = hold(3, r[k], W[k], T[k], G, M, y)
         else:
-            expect(dr, di, dj, A[k], B[k], diagonal[i], diagonal[j], cross[k], G, S, T[k])
-            distance[k], gain[k] = hold(dr, r[k], W[k], T[k], G, S, y)
+            expect(dr, di, dj, A[k], B[k], diagonal[i], diagonal[j], cross[k], G, M, T[k])
+            distance[k], gain[k] = hold(dr, r[k], W[k], T[k], G, M, y)
 
 
 @inline_kernel
@@ -53,21 +53,31 @@ def expect(
 
 
 @inline_kernel
-def hold(dr: int, r: F64, W: F64, T: F64, L: F64, S: F64, y: F64) -> tuple[float, float]:
+def hold(dr: int, r: F64, W: F64, T: F64, L: F64, M: F64, y: F64) -> tuple[float, float]:
     """(d², gain)"""
-    invert(dr, W, L, S)
     for a in range(dr):
-        for b in range(dr):
-            S[a, b] += T[a, b]
-    lower(dr, S)
-    total, root = 0.0, 1.0  # √det(I + ΩT)
+        for b in range(a + 1):
+            L[a, b] = W[a, b]
+    lower(dr, L)
     for a in range(dr):
-        value = r[a]
+        y[a] = 0.0
+        for k in range(a, dr):
+            y[a] += L[k, a] * r[k]
+        for b in range(a + 1):
+            total = 1.0 if a == b else 0.0
+            for k in range(a, dr):
+                for c in range(b, dr):
+                    total += L[k, a] * T[k, c] * L[c, b]
+            M[a, b] = total
+    lower(dr, M)
+    total, root = 0.0, 1.0  # √det M
+    for a in range(dr):
+        value = y[a]
         for b in range(a):
-            value -= S[a, b] * y[b]
-        y[a] = value / S[a, a]
+            value -= M[a, b] * y[b]
+        y[a] = value / M[a, a]
         total += y[a] * y[a]
-        root *= S[a, a] * L[a, a]
+        root *= M[a, a]
     return total, math.log(root)
 
 
@@ -97,24 +107,3 @@ def lower(n: int, S: F64) -> None:
             for k in range(b):
                 total -= S[a, k] * S[b, k]
             S[a, b] = math.sqrt(total) if a == b else total / S[b, b]
-
-
-@inline_kernel
-def invert(n: int, W: F64, L: F64, out: F64) -> None:
-    """out = W⁻¹, and L the Cholesky factor of W."""
-    for a in range(n):
-        for b in range(n):
-            L[a, b] = W[a, b]
-    lower(n, L)
-    for c in range(n):
-        # L z = e_c, then Lᵀ x = z: x is column c.
-        for a in range(n):
-            value = 1.0 if a == c else 0.0
-            for b in range(a):
-                value -= L[a, b] * out[b, c]
-            out[a, c] = value / L[a, a]
-        for a in range(n - 1, -1, -1):
-            value = out[a, c]
-            for b in range(a + 1, n):
-                value -= L[b, a] * out[b, c]
-            out[a, c] = value / L[a, a]

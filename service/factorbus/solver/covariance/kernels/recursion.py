@@ -134,10 +134,10 @@ def put_diagonal(
         scalar += d
         if compare:
             for i in range(d):
-                for j in range(i + 1):
+                for j in range(i, d):
                     change, scale = load(a, corner + i * ld + j) - block[i, j], load(a, corner + i * (ld + 1))
                     if change * change > negligible * negligible * scale * load(a, corner + j * (ld + 1)):
                         stirred[v] = tick
         for i in range(d):
-            for j in range(d):
-                block[i, j] = load(a, corner + i * ld + j)
+            for j in range(i, d):
+                block[i, j] = block[j, i] = load(a, corner + i * ld + j)

@@ -7,13 +7,21 @@ zero of it is at the ends of the rows, and the products stop before.
 """
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
-from factorbus.solver.covariance.kernels.tiles import RUN, copy_runs, negative, solve_upper, subtract
+from factorbus.solver.covariance.kernels.tiles import (
+    RUN,
+    copy_runs,
+    negative,
+    solve_upper,
+    subtract,
+    transpose,
+    transpose_negative,
+)
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put, zero
 from factorbus.solver.kernels.simd import at as load
 
 _DIMS = 6  # of the largest variable
-_STRIP = 8
+_TOGETHER = 3  # rows that are copied together: a variable of the plane has as many
 
 
 @inline_kernel
@@ -65,10 +73,10 @@ def gather(
             runs[first + 2 * moves], runs[first + 2 * moves + 1] = start + n, runs[3 * k + 2] + n
             moves += 1
     for k in range(count):
-        for i in range(runs[3 * k + 1]):
+        for i in range(0, runs[3 * k + 1], _TOGETHER):
             line, into = source + (runs[3 * k] + i) * wide, target + (p + runs[3 * k + 2] + i) * ld + padded(p)
-            # Too much is copied at the end of a run: the next run, row or step overwrites it.
-            copy_runs(a, into, line, runs, first, moves)
+            # Too much is copied at the end of a run: the next run or step overwrites it.
+            copy_runs(a, min(_TOGETHER, runs[3 * k + 1] - i), into, ld, line, wide, runs, first, moves)
 
 
 @inline_kernel
@@ -89,20 +97,10 @@ def list_runs(row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I6
     return count
 
 
-@inline_kernel
-def transpose(a: F64, rows: int, columns: int, source: int, step: int, target: int, ld: int) -> None:
-    """The transpose of a matrix at `source`, rows `step` apart, to `target`, rows `ld` apart."""
-    for first in range(0, columns, _STRIP):
-        last = min(first + _STRIP, columns)
-        for i in range(rows):
-            for k in range(first, last):
-                put(a, target + k * ld + i, load(a, source + i * step + k))
-
-
 @part
 def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> None:
     """The square at `target` has Σ_SS and gets Σ_FS, Σ_SF and Σ_FF; unless `whole`, of that only what is near its
-    diagonal.
+    diagonal and right of it.
     """
     p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
     ld, border, wide = row_length(p, m), padded(p), padded(p + m)
@@ -114,9 +112,7 @@ def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> No
             c, y = target + i * ld + border + j, target + p * ld + border + j
             negative(a, min(high, p - i), some, c, ld, a, w + i * wide, wide, 1, y, ld, m)
     transpose(a, p, m, target + border, ld, target + p * ld, ld)
-    for k in range(p):
-        for i in range(p):
-            put(a, target + (p + m + k) * ld + i, -load(a, w + i * wide + m + k))
+    transpose_negative(a, p, p, w + m, wide, target + (p + m) * ld, ld)
     for j in range(0, p, TILE_VECTORS * LANES):
         some = min(TILE_VECTORS, (p - j + LANES - 1) // LANES)
         for i in range(0, min(p, j + some * LANES), high):
@@ -125,9 +121,8 @@ def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> No
                 negative(
                     a, rows, some, target + i * ld + j, ld, a, w + i * wide, wide, 1, target + p * ld + j, ld, depth
                 )
-    for i in range(p):
-        for j in range(i + 1, p if whole else min(i + _DIMS, p)):
-            put(a, target + j * ld + i, load(a, target + i * ld + j))
+        if whole and j > 0:
+            transpose(a, j, min(some * LANES, p - j), target + j, ld, target + j * ld, ld)
 
 
 @part

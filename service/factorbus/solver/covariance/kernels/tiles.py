@@ -15,6 +15,8 @@ if DISABLED:
         solve_lower,
         solve_upper,
         subtract,
+        transpose,
+        transpose_negative,
     )
 elif BOUNDSCHECK:
     from factorbus.solver.covariance.kernels.tiles_checked import (
@@ -25,6 +27,8 @@ elif BOUNDSCHECK:
         solve_lower,
         solve_upper,
         subtract,
+        transpose,
+        transpose_negative,
     )
 else:
     from factorbus.solver.covariance.kernels.tiles_llvm import (
@@ -35,8 +39,21 @@ else:
         solve_lower,
         solve_upper,
         subtract,
+        transpose,
+        transpose_negative,
     )
 
-__all__ = ["RUN", "copy_runs", "copy_vectors", "negative", "prefetch", "solve_lower", "solve_upper", "subtract"]
+__all__ = [
+    "RUN",
+    "copy_runs",
+    "copy_vectors",
+    "negative",
+    "prefetch",
+    "solve_lower",
+    "solve_upper",
+    "subtract",
+    "transpose",
+    "transpose_negative",
+]
 
 RUN = 4  # doubles that `copy_runs` copies at a time

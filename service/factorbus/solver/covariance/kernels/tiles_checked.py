@@ -7,18 +7,41 @@ from factorbus.solver.kernels._jit import vector_lanes
 prefetch = tiles_llvm.prefetch  # reaches nothing
 _LANES = vector_lanes()
 _RUN = 4
+_STRIP = tiles_llvm.STRIP
 _copy_runs, _copy_vectors = tiles_llvm.copy_runs, tiles_llvm.copy_vectors
+_transpose, _transpose_negative = tiles_llvm.transpose, tiles_llvm.transpose_negative
 _subtract, _negative = tiles_llvm.subtract, tiles_llvm.negative
 _solve_upper, _solve_lower = tiles_llvm.solve_upper, tiles_llvm.solve_lower
 
 
 @inline_kernel
-def copy_runs(a: F64, target: int, source: int, runs: I64, first: int, count: int) -> None:
+def copy_runs(
+    a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64, first: int, count: int
+) -> None:
     """See `tiles_plain`; likewise below."""
     for k in range(first, first + 2 * count, 2):
-        _within(a, source + runs[k], _RUN)
-        _within(a, target + runs[k + 1], _RUN)
-    _copy_runs(a, target, source, runs, first, count)
+        _within(a, source + runs[k], (rows - 1) * lds + _RUN)
+        _within(a, target + runs[k + 1], (rows - 1) * ldt + _RUN)
+    _copy_runs(a, rows, target, ldt, source, lds, runs, first, count)
+
+
+@inline_kernel
+def transpose(a: F64, rows: int, columns: int, source: int, step: int, target: int, ld: int) -> None:
+    _transpose_within(a, rows, columns, source, step, target, ld)
+    _transpose(a, rows, columns, source, step, target, ld)
+
+
+@inline_kernel
+def transpose_negative(a: F64, rows: int, columns: int, source: int, step: int, target: int, ld: int) -> None:
+    _transpose_within(a, rows, columns, source, step, target, ld)
+    _transpose_negative(a, rows, columns, source, step, target, ld)
+
+
+@inline_kernel
+def _transpose_within(a: F64, rows: int, columns: int, source: int, step: int, target: int, ld: int) -> None:
+    if rows > 0 and columns > 0:
+        _within(a, source, (rows - 1) * step + (columns + _LANES - 1) // _LANES * _LANES)
+        _within(a, target, (columns - 1) * ld + (rows + _STRIP - 1) // _STRIP * _STRIP)
 
 
 @inline_kernel

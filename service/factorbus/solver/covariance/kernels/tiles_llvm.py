@@ -9,23 +9,43 @@ _I64 = ir.IntType(64)
 _RUN = ir.VectorType(ir.DoubleType(), 4)
 _INT = types.int64
 _LINE = 8  # doubles in a line of the cache
+STRIP = min(4, simd.LANES)  # rows that are transposed together
 _PTR, _INT_PTR = ir.DoubleType().as_pointer(), _I64.as_pointer()
 _PRODUCTS = {m * 4 + v: (m, v) for m in (1, 2, 3, 4) for v in (1, 2, 3)}
 _HEIGHTS = {m: (m,) for m in (1, 2, 3, 4)}
 
 
 @intrinsic
-def copy_runs(_typing: Any, a: Any, _target: Any, _source: Any, runs: Any, _first: Any, _count: Any) -> Any:
-    """Four doubles each: see `tiles_plain.copy_runs`"""
+def copy_runs(
+    _typing: Any, a: Any, _rows: Any, _target: Any, _ldt: Any, _source: Any, _lds: Any, runs: Any, _first: Any,
+    _count: Any,
+) -> Any:  # fmt: skip
+    """Four doubles each, of some rows: see `tiles_plain.copy_runs`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array, target, source, pairs, first, count = args
+        array, rows, target, ldt, source, lds, pairs, first, count = args
         target, source = (simd._address(context, builder, signature, array, where) for where in (target, source))
-        function = simd._define(builder, "factorbus_copy_runs", [_PTR, _PTR, _INT_PTR, _I64], _build_copy_runs)
-        builder.call(function, [target, source, _address(context, builder, runs, pairs, first), count])
+        given = [target, ldt, source, lds, _address(context, builder, runs, pairs, first), count]
+        simd._switch(builder, rows, "factorbus_copy_runs", _HEIGHTS, given, _build_copy_runs)
         return context.get_dummy_value()
 
-    return types.void(a, _INT, _INT, runs, _INT, _INT), emit
+    return types.void(a, *[_INT] * 5, runs, _INT, _INT), emit
+
+
+@intrinsic
+def transpose(
+    _typing: Any, a: Any, _rows: Any, _columns: Any, _source: Any, _step: Any, _target: Any, _ld: Any
+) -> Any:  # fmt: skip
+    """See `tiles_plain.transpose`"""
+    return _transposed(a, "factorbus_transpose", negative=False)
+
+
+@intrinsic
+def transpose_negative(
+    _typing: Any, a: Any, _rows: Any, _columns: Any, _source: Any, _step: Any, _target: Any, _ld: Any
+) -> Any:  # fmt: skip
+    """See `tiles_plain.transpose_negative`"""
+    return _transposed(a, "factorbus_transpose_negative", negative=True)
 
 
 @intrinsic
@@ -111,12 +131,83 @@ def _solution(a: Any, b: Any, name: str, upper: bool) -> Any:
     return types.void(a, *[_INT] * 4, b, *[_INT] * 2), emit
 
 
-def _build_copy_runs(builder: Any, target: Any, source: Any, pairs: Any, count: Any) -> None:
+def _transposed(a: Any, name: str, negative: bool) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        array, rows, columns, source, step, target, ld = args
+        source, target = (simd._address(context, builder, signature, array, where) for where in (source, target))
+        given = [rows, columns, source, step, target, ld]
+        kinds = [arg.type for arg in given]
+        build = lambda inner, *args: _build_transpose(inner, *args, negative=negative)  # noqa: E731
+        builder.call(simd._define(builder, name, kinds, build), given)
+        return context.get_dummy_value()
+
+    return types.void(a, *[_INT] * 6), emit
+
+
+def _build_copy_runs(
+    builder: Any, shape: tuple[int], target: Any, ldt: Any, source: Any, lds: Any, pairs: Any, count: Any
+) -> None:
     with simd._loop(builder, _I64(0), count, 1) as (k, _carried):
         pair = builder.gep(pairs, [builder.mul(k, _I64(2))])
         start, into = (builder.load(builder.gep(pair, [_I64(n)])) for n in (0, 1))
-        values = builder.load(builder.bitcast(builder.gep(source, [start]), _RUN.as_pointer()), align=8)
-        builder.store(values, builder.bitcast(builder.gep(target, [into]), _RUN.as_pointer()), align=8)
+        for i in range(shape[0]):
+            line, out = (builder.add(at, builder.mul(ld, _I64(i))) for at, ld in ((start, lds), (into, ldt)))
+            values = builder.load(builder.bitcast(builder.gep(source, [line]), _RUN.as_pointer()), align=8)
+            builder.store(values, builder.bitcast(builder.gep(target, [out]), _RUN.as_pointer()), align=8)
+
+
+def _build_transpose(
+    builder: Any, rows: Any, columns: Any, source: Any, step: Any, target: Any, ld: Any, negative: bool
+) -> None:
+    """STRIP rows of a vector each at a time.  At the ends the last row or column comes again, and is written last."""
+
+    def up_to(k: Any, n: int, count: Any) -> Any:
+        k, last = builder.add(k, _I64(n)), builder.sub(count, _I64(1))
+        return builder.select(builder.icmp_signed("<", k, last), k, last)
+
+    with (
+        simd._loop(builder, _I64(0), rows, STRIP) as (i, _outer),
+        simd._loop(builder, _I64(0), columns, simd.LANES) as (k, _inner),
+    ):
+        corner = builder.gep(source, [k])
+        lines = [simd._load(builder, builder.gep(corner, [builder.mul(up_to(i, n, rows), step)])) for n in range(STRIP)]
+        if negative:
+            lines = [builder.fneg(line) for line in lines]
+        strips = _woven(builder, lines)
+        for n in reversed(range(simd.LANES)):
+            place = builder.gep(target, [builder.add(builder.mul(up_to(k, n, columns), ld), i)])
+            builder.store(strips[n], builder.bitcast(place, strips[n].type.as_pointer()), align=8)
+
+
+def _woven(builder: Any, lines: list[Any]) -> list[Any]:
+    """Vectors of which the n-th has the n-th lanes of all `lines`."""
+    groups, size = [[line] for line in lines], 1
+    while len(groups) > 1:
+        groups = [
+            [
+                _shuffled(builder, a, b, [_lane(half, j, size) for j in range(simd.LANES)])
+                for a, b in zip(first, second, strict=True)
+                for half in (0, 1)
+            ]
+            for first, second in zip(groups[::2], groups[1::2], strict=True)
+        ]
+        size *= 2
+    each = simd.LANES // STRIP
+    return [
+        _shuffled(builder, one, one, list(range(part * STRIP, (part + 1) * STRIP)))
+        for one in groups[0]
+        for part in range(each)
+    ]
+
+
+def _lane(half: int, j: int, size: int) -> int:
+    """Where lane j of one half of two vectors comes from when they are interleaved by `size` lanes."""
+    group = j // size
+    return group % 2 * simd.LANES + half * simd.LANES // 2 + group // 2 * size + j % size
+
+
+def _shuffled(builder: Any, a: Any, b: Any, lanes: list[int]) -> Any:
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes))
 
 
 def _build_copy_vectors(builder: Any, target: Any, source: Any, count: Any) -> None:
