@@ -52,7 +52,7 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _sight(kind, *ends, z)
     if kind.startswith("linear"):
-        return _linear(ends, z)
+        return _linear(kind, ends, z)
     if kind.startswith(("position", "heading", "attitude")):
         return _absolute(kind, ends[0], z)
     if kind.startswith("prior_point"):
@@ -87,16 +87,32 @@ def _absolute(kind: str, x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return T[:3, :3].T @ there - seen
 
 
-def _linear(ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
+def linear_ends(kind: str) -> list[str]:
+    """What a linear factor of this name is of."""
+    _, *of = kind.split("_")
+    return of if of[0] != "pair" else of[1:] * (2 if len(of) == 2 else 1)
+
+
+def boxminus(kind: str, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """x ⊟ y as linear factors have it."""
+    if kind.startswith("point"):
+        return x - y
+    if kind == "idp":
+        return np.where(np.arange(6) == 3, np.angle(np.exp(1j * (x - y))), x - y)
+    error = _pose_error(np.linalg.inv(pose_matrix(y)) @ pose_matrix(x))
+    return error if kind == "se2" else error * np.array([1, 1, 1, 2, 2, 2])
+
+
+def _linear(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     """Σ H (x ⊟ y) + b."""
-    size, d, count = len(ends[0]), 3 if len(ends[0]) == 3 else 6, len(ends)
-    r = z[-d:].copy()
-    for e, x in enumerate(ends):
-        H = z[count * size + e * d * d :][: d * d].reshape(d, d)
-        error = _pose_error(np.linalg.inv(pose_matrix(z[e * size : (e + 1) * size])) @ pose_matrix(x))
-        if d == 6:
-            error[3:] *= 2.0
-        r += H @ error
+    of = linear_ends(kind)
+    rows, sizes = min(TANGENT[end] for end in of), [len(x) for x in ends]
+    *ys, rest = np.split(z, np.cumsum(sizes))
+    r = rest[-rows:].copy()
+    for end, x, y in zip(of, ends, ys, strict=True):
+        H, rest = np.split(rest, [rows * TANGENT[end]])
+        r += H.reshape(rows, TANGENT[end]) @ boxminus(end, x, y)
+    assert len(rest) == rows
     return r
 
 

@@ -26,8 +26,18 @@ CONNECTS = {
     "bearing_se3": ["se3", "point3"],
     "linear_se2": ["se2"],
     "linear_se3": ["se3"],
+    "linear_point2": ["point2"],
+    "linear_point3": ["point3"],
+    "linear_idp": ["idp"],
     "linear_pair_se2": ["se2", "se2"],
     "linear_pair_se3": ["se3", "se3"],
+    "linear_pair_point2": ["point2", "point2"],
+    "linear_pair_point3": ["point3", "point3"],
+    "linear_pair_idp": ["idp", "idp"],
+    "linear_pair_se2_point2": ["se2", "point2"],
+    "linear_pair_se3_point3": ["se3", "point3"],
+    "linear_pair_se3_idp": ["se3", "idp"],
+    "linear_pair_point3_idp": ["point3", "idp"],
 }
 
 

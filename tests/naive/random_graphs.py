@@ -23,6 +23,8 @@ def random_value(kind: str, rng: np.random.Generator) -> np.ndarray:
     if kind == "se3":
         q = rng.normal(size=4)
         return np.concatenate([rng.normal(0, 3, 3), q / np.linalg.norm(q)])
+    if kind == "idp":
+        return np.array([*rng.normal(0, 3, 3), *rng.uniform(-np.pi, np.pi, 2) * [1.0, 0.4], rng.uniform(0.05, 2.0)])
     return rng.normal(0, 3, 2 if kind == "point2" else 3)
 
 

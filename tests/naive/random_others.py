@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from naive.dense_factors import boxplus, pose_matrix
-from naive.dense_least_squares import CONNECTS
+from naive.dense_factors import TANGENT, boxminus, boxplus, linear_ends, pose_matrix
 from naive.random_graphs import factor, random_information, random_value
 
 from factorbus.proto.kinds import FACTOR_KINDS
@@ -17,6 +16,8 @@ OTHERS = tuple(name for name in FACTOR_KINDS if name.startswith(_BEGINNINGS))
 
 def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
     """What a factor of such a kind would measure at these values, with noise."""
+    if kind.startswith("linear"):
+        return _random_linear(kind, ends, noise, rng)
     T = pose_matrix(ends[0])
     n = len(T) - 1
     if kind.startswith("position"):
@@ -28,13 +29,6 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
         there = rng.normal(size=3)
         seen = T[:3, :3].T @ there / np.linalg.norm(there) + noise * rng.normal(size=3)
         return np.concatenate([2.0 * seen, there])
-    if kind.startswith("linear"):
-        at = [boxplus(CONNECTS[kind][0], end, 0.1 * rng.normal(size=n * (n + 1) // 2)) for end in ends]
-        d = FACTOR_KINDS[kind].dim
-        blocks = [np.eye(d) * (1 if e else -1) + 0.2 * rng.normal(size=(d, d)) for e in range(len(ends))]
-        off = [np.append(*_apart(T, y, end)) for y, end in zip(at, ends, strict=True)]
-        rest = -sum(H @ e for H, e in zip(blocks, off, strict=True)) + noise * rng.normal(size=d)
-        return np.concatenate([*at, *(H.ravel() for H in blocks), rest])
     seen = (np.linalg.inv(T) @ np.append(ends[1], 1.0))[:-1]
     if kind.startswith("range"):
         return np.array([abs(np.linalg.norm(seen) + noise * rng.normal())])
@@ -43,14 +37,15 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
     return 3.0 * (seen / np.linalg.norm(seen) + noise * rng.normal(size=3))
 
 
-def _apart(_: np.ndarray, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x ⊟ y as (translation, rotation)."""
-    E = np.linalg.inv(pose_matrix(y)) @ pose_matrix(x)
-    if len(E) == 3:
-        return E[:2, 2], np.array([np.arctan2(E[1, 0], E[0, 0])])
-    w = 0.5 * np.sqrt(max(1.0 + np.trace(E[:3, :3]), 0.0))
-    skew = E[:3, :3] - E[:3, :3].T
-    return E[:3, 3], np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / (2.0 * w)
+def _random_linear(kind: str, ends: list[np.ndarray], noise: float, rng: np.random.Generator) -> np.ndarray:
+    of, rows = linear_ends(kind), FACTOR_KINDS[kind].dim
+    y = [boxplus(end, x, 0.1 * rng.normal(size=TANGENT[end])) for end, x in zip(of, ends, strict=True)]
+    H = [
+        np.eye(rows, TANGENT[end]) * (1 if e else -1) + 0.2 * rng.normal(size=(rows, TANGENT[end]))
+        for e, end in enumerate(of)
+    ]
+    off = sum(J @ boxminus(end, x, at) for J, end, x, at in zip(H, of, ends, y, strict=True))
+    return np.concatenate([*y, *(J.ravel() for J in H), noise * rng.normal(size=rows) - off])
 
 
 def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") -> Iterator[Batch]:
@@ -84,6 +79,8 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
             factors += [factor("between_se3", [y - 1, y], truth, noise, rng)]
             factors += [made("linear_pair_se2", x - 1, x), made("linear_pair_se3", y, y - 1)]
             factors += [made("range_se2", x, l - 1), made("bearing_se3", y, p - 1)]
+            factors += [made("linear_pair_point2", l, l - 1), made("linear_pair_point3", p - 1, p)]
+            factors += [made("linear_pair_se2_point2", x, l - 1), made("linear_pair_se3_point3", y - 1, p)]
         factors += [
             made("range_se2", x, l),
             made("bearing_se2", x, l),
@@ -93,5 +90,6 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         factors += [factor("prior_point2", [l], truth, noise, rng), factor("prior_point3", [p], truth, noise, rng)]
         if n % 2:
             factors += [made(kind, x) for kind in ("position_se2", "heading_se2", "linear_se2")]
+            factors += [made("linear_point2", l), made("linear_point3", p)]
             factors += [made(kind, y) for kind in ("position_se3", "attitude_se3", "linear_se3")]
         yield Batch(tuple(variables), tuple(factors))

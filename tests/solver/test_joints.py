@@ -8,6 +8,7 @@ import pytest
 from naive.dense_factors import TANGENT, _pose_error, boxplus, pose_matrix, residual
 from naive.dense_least_squares import DenseGraph, distance, full
 
+from factorbus.pieces import MOST, Pieces, cut
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
@@ -17,7 +18,7 @@ from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import judge_candidates
 from factorbus.solver.covariance.why import why_variable
 from factorbus.solver.groups import FactorGroup
-from factorbus.solver.joints import MOST, find_joints, negative_rows, split
+from factorbus.solver.joints import find_joints, negative_rows
 from factorbus.solver.repair import find_loops, repair
 
 MODES = ("tree", "inc-l", "all-batch")
@@ -182,7 +183,7 @@ def test_the_pieces_sum_to_the_form_wherever_the_poses_are(kind: str, seed: int)
     A[:, rng.integers(n * d)] = 0.0  # something of which nothing is known
     Lambda, eta = A.T @ A, A.T @ rng.normal(size=len(A))
     y = [random_pose(kind, rng, 5.0) for _ in range(n)]
-    groups = split(kind, x(*range(n)), y, Lambda, eta)
+    groups = cut([kind] * n, x(*range(n)), y, Lambda, eta)
     assert sum(int((g.information[:, 0] < 0).sum()) for g in groups) == n
     least = eta @ np.linalg.pinv(Lambda, rcond=1e-12) @ eta
     for far in (0.0, 1e-3, 1.0):
@@ -220,7 +221,7 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
     after, _, report, counted = solver.with_changes(marginalise(*gone), settle=True)
     assert counted["removed_variables"] == 8
     (joint,) = find_joints(after._graph)
-    assert len(joint.poses) >= 3, "else it shows nothing"
+    assert len(joint.variables) >= 3, "else it shows nothing"
     assert all(distance(of, row, estimate[key][1]) < 1e-9 for key, (of, row) in values(after).items())
     np.testing.assert_allclose(covariance(after, *names), sure, rtol=0, atol=1e-8 * np.abs(sure).max())
     assert report.chi2 >= 0.0
@@ -264,7 +265,7 @@ def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
     a, b = covariance(at_once, *range(10, 18)), covariance(slowly, *range(10, 18))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * np.abs(a).max())
     assert len(find_joints(slowly._graph)) == 1
-    assert negative_rows(slowly._graph).size == len(find_joints(slowly._graph)[0].poses)
+    assert negative_rows(slowly._graph).size == len(find_joints(slowly._graph)[0].variables)
     assert slowly.chi2() == pytest.approx(at_once.chi2(), rel=1e-6)
 
 
@@ -282,7 +283,7 @@ def test_pieces_stay_together_or_go_together() -> None:
     pair = next(f for f in ids if f not in negative)
     for changes in (
         [Change("remove_factors", np.array(ids[:1]))],
-        [Change("remove_variables", keys=solver._graph.keys[[find_joints(solver._graph)[0].poses[0]]])],
+        [Change("remove_variables", keys=solver._graph.keys[[find_joints(solver._graph)[0].variables[0]]])],
         [Change("weigh", np.array(negative), weight=np.full(len(negative), 2.0))],
         [Change("loss", np.array(negative[:1]), loss="huber", scale=np.ones(1))],
         [Change("loss", np.array([pair]), loss="huber", scale=np.ones(1))],
@@ -398,17 +399,17 @@ def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
 
 
 def test_a_crowd_of_pieces_is_refused_before_it_costs_anything() -> None:
-    rng, count = np.random.default_rng(1), 140
+    rng, count = np.random.default_rng(1), 2 * MOST + 1
     y = [random_pose("se2", rng) for _ in range(count)]
     A = rng.normal(size=(3 * count, 3 * count))
-    groups = split("se2", x(*range(count)), y, A.T @ A, np.zeros(3 * count))
+    groups = cut(["se2"] * count, x(*range(count)), y, A.T @ A, np.zeros(3 * count))
     solver = Solver(Options())
-    with pytest.raises(errors.Apart, match="140 poses"):
+    with pytest.raises(errors.Apart, match="257 variables"):
         solver.stage(Batch((Variables("se2", x(*range(count)), np.array(y)),), tuple(_sent(g) for g in groups)))
     assert solver.variable_count == 0
 
 
-def _sent(group: FactorGroup) -> Factors:
+def _sent(group: FactorGroup | Pieces) -> Factors:
     return Factors(group.kind, group.keys, group.measured, group.information)
 
 
@@ -422,7 +423,7 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
         solver.with_changes(marginalise(0))
     assert refused.value.detail["border"] == x(*range(1, count)).tolist()
     after, *_ = solver.with_changes(marginalise(0, 1), settle=True)
-    assert len(find_joints(after._graph)[0].poses) == MOST
+    assert len(find_joints(after._graph)[0].variables) == MOST
     assert apart(after, solver) < 1e-9
     l = np.array([symbol("l", 1)])
     seen = [
@@ -450,7 +451,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
             solver, *_ = solver.with_changes(marginalise(*range(first, first + every)))
             first += every
             sizes.append(solver.memory_bytes())
-            widest = max([widest, *(len(joint.poses) for joint in find_joints(solver._graph))])
+            widest = max([widest, *(len(joint.variables) for joint in find_joints(solver._graph))])
     assert widest >= 4, "loops make it more than a chain"
     assert loops > poses / 10
     half = len(sizes) // 2

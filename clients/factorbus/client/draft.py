@@ -4,39 +4,23 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypedDict, TypeVar, Unpack
+from typing import TypeAlias, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
+from factorbus.client.linear import linear_pieces
 from factorbus.client.mounted import moved_se2, moved_se3
 from factorbus.proto.camera import Camera
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadInformation, BadLoss, BadShape, UnknownKind
+from factorbus.proto.problems import BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol, parse_symbol
 
 Key: TypeAlias = str | int
 _Kind = TypeVar("_Kind")
 _Row: TypeAlias = NDArray[np.float64]
-# How far an information matrix may be from symmetric, relative to its largest entry: rounding, not meaning.
-_ASYMMETRY = 1e-9
-
-
-class Certainty(TypedDict, total=False):
-    """How certain a measurement is: one of the two.
-
-    sigmas (r,): standard deviations in the units and order of the residual.
-    information: the inverse covariance, a symmetric (r, r) matrix or its upper triangle (r(r+1)/2,) row by row.
-    The rotation part of an se3 residual is the vector part of a quaternion, so half an angle: for a standard
-    deviation of s radians say s/2.
-    loss: what it counts where it is far off, ("huber", 1.345) say: one of `factorbus.proto.kinds.LOSSES` and its scale,
-    standard deviations.
-    """
-
-    sigmas: ArrayLike
-    information: ArrayLike
-    loss: tuple[str, float] | None
 
 
 class Draft:
@@ -51,6 +35,7 @@ class Draft:
     def __init__(self) -> None:
         self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row]]] = {}
         self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
+        self._linear: list[Factors] = []
 
     def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
         """A pose in the plane: x y (metres), theta (radians)."""
@@ -106,7 +91,7 @@ class Draft:
         if mount is not None:
             where = self._between(first, second, "between_se2")
             measured, A = moved_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = _carried(where, FACTOR_KINDS["between_se2"], certainty, A)
+            certainty = carried(where, 3, certainty, A)
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -125,7 +110,7 @@ class Draft:
         if mount is not None:
             where = self._between(first, second, "between_se3")
             measured, A = moved_se3(where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7))
-            certainty = _carried(where, FACTOR_KINDS["between_se3"], certainty, A)
+            certainty = carried(where, 6, certainty, A)
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -207,18 +192,23 @@ class Draft:
         values: Sequence[ArrayLike],
         jacobians: Sequence[ArrayLike],
         residual: ArrayLike,
+        *,
+        kinds: Sequence[str] | None = None,
         **certainty: Unpack[Certainty],
     ) -> "Draft":
-        """What you have linearised yourself, of one pose or two of a kind: r = sum H (x - y) + b.
+        """What you have linearised yourself, of up to 128 variables: r = sum H (x - y) + b.
 
-        x - y is the local increment; values: y of each, as poses are stored; jacobians: H of each, (3, 3) or (6, 6);
-        residual: b, (3,) or (6,).  Rows that you do not need: zeros in H and b, and any certainty.
+        x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
+        jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2; residual: b,
+        (m,), of any m, and the certainty is of these m.
+        kinds: of each; without, three numbers are a point3 where there are others of space, else an se2.
+        What is of more than two variables, or has more rows than the smaller has scalars, is sent as several factors,
+        which sum to it: they stay or go together, and have no loss.
         """
-        rows = [np.asarray(value, np.float64).ravel() for value in values]
-        space = "se2" if rows and rows[0].size == VARIABLE_KINDS["se2"].size else "se3"
-        numbers = [*rows, *(np.asarray(H, np.float64).ravel() for H in jacobians), np.asarray(residual, np.float64)]
-        kind = f"linear_{space}" if len(keys) == 1 else f"linear_pair_{space}"
-        return self.factor(kind, keys, np.concatenate(numbers), **certainty)
+        numbers = [_number(key) for key in keys]
+        for pieces in linear_pieces(numbers, values, jacobians, residual, kinds, certainty):
+            self._linear.append(pieces)
+        return self
 
     def idp_first(
         self,
@@ -278,8 +268,8 @@ class Draft:
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
-        name, scale = _loss(where, certainty.get("loss"))
-        triangle = _triangle(where, of, certainty.get("sigmas"), certainty.get("information"))
+        name, scale = loss_of(where, certainty.get("loss"))
+        triangle = triangle_of(where, of.dim, certainty)
         all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
         scales.append(scale)
         all_keys.append(numbers)
@@ -298,16 +288,19 @@ class Draft:
                 Variables(kind, np.array(keys, np.int64), np.array(rows) if valued else None, fixed)
                 for (kind, valued, fixed), (keys, rows) in self._variables.items()
             ),
-            tuple(
-                Factors(
-                    kind,
-                    np.array(keys, np.int64),
-                    np.array(measured),
-                    np.array(information),
-                    loss,
-                    np.array(scales) if loss else None,
-                )
-                for (kind, loss), (keys, measured, information, scales) in self._factors.items()
+            (
+                *(
+                    Factors(
+                        kind,
+                        np.array(keys, np.int64),
+                        np.array(measured),
+                        np.array(information),
+                        loss,
+                        np.array(scales) if loss else None,
+                    )
+                    for (kind, loss), (keys, measured, information, scales) in self._factors.items()
+                ),
+                *self._linear,
             ),
         )
 
@@ -327,55 +320,3 @@ def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")
     return row
-
-
-def _loss(where: str, loss: tuple[str, float] | None) -> tuple[str, float]:
-    """(name, scale); ("", 0) for none."""
-    if loss is None:
-        return "", 0.0
-    name, scale = loss
-    if name not in LOSSES:
-        raise BadLoss(where, repr(name), f"one of {', '.join(LOSSES)}")
-    if not (np.isfinite(scale) and scale > 0.0):
-        raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
-    return name, float(scale)
-
-
-def _carried(where: str, kind: FactorKind, certainty: Certainty, A: _Row) -> Certainty:
-    """The certainty of r' where this is that of r = A r'."""
-    upper = np.triu_indices(kind.dim)
-    W = np.zeros((kind.dim, kind.dim))
-    W[upper] = _triangle(where, kind, certainty.get("sigmas"), certainty.get("information"))
-    W += np.triu(W, 1).T
-    return {"information": (A.T @ W @ A)[upper], "loss": certainty.get("loss")}
-
-
-def _triangle(
-    where: str, kind: FactorKind, sigmas: ArrayLike | None = None, information: ArrayLike | None = None
-) -> _Row:
-    if (sigmas is None) == (information is None):
-        raise BadInformation(where, "both or neither of sigmas and information", "one of the two")
-    if information is None:
-        return _from_sigmas(where, kind.dim, np.array(sigmas, np.float64))
-    return _from_matrix(where, kind, np.array(information, np.float64))
-
-
-def _from_sigmas(where: str, dim: int, sigmas: _Row) -> _Row:
-    if sigmas.shape != (dim,):
-        raise BadShape(f"{where}: sigmas", f"shape {sigmas.shape}", f"({dim},)")
-    if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
-        raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
-    return np.diag(1.0 / sigmas**2)[np.triu_indices(dim)]
-
-
-def _from_matrix(where: str, kind: FactorKind, matrix: _Row) -> _Row:
-    if matrix.shape == (kind.information_size,):
-        return matrix
-    if matrix.shape != (kind.dim, kind.dim):
-        wanted = f"({kind.dim}, {kind.dim}), or ({kind.information_size},) for its upper triangle row by row"
-        raise BadShape(f"{where}: information", f"shape {matrix.shape}", wanted)
-    with np.errstate(invalid="ignore"):  # what is not finite the service refuses, with its place
-        worst = np.abs(matrix - matrix.T).max()
-    if worst > _ASYMMETRY * np.abs(matrix).max():
-        raise BadInformation(f"{where}: information", f"asymmetric by {worst:g}", "a symmetric matrix")
-    return matrix[np.triu_indices(kind.dim)]

@@ -52,6 +52,20 @@ VARIABLE_KINDS = {
     )
 }
 
+
+def _linear(*ends: str) -> FactorKind:
+    """What is known of one variable, or of two together: of as many rows as the smaller has scalars."""
+    kinds = [VARIABLE_KINDS[end] for end in ends]
+    name = "_".join(["linear", *(ends if len(ends) == 1 else ("pair", *dict.fromkeys(ends)))])
+    rows = min(kind.dim for kind in kinds)
+    values, blocks = sum(kind.size for kind in kinds), [f"{rows} x {kind.dim}" for kind in kinds]
+    size = values + rows * sum(kind.dim for kind in kinds) + rows
+    if len(ends) == 1:
+        return FactorKind(name, ends, size, rows, f"y ({values}), H ({blocks[0]}), b ({rows})")
+    of_both = f"2 x {blocks[0]}" if blocks[0] == blocks[1] else " and ".join(blocks)
+    return FactorKind(name, ends, size, rows, f"y of both ({values}), H of both ({of_both}), b ({rows})")
+
+
 FACTOR_KINDS = {
     kind.name: kind
     for kind in (
@@ -77,10 +91,9 @@ FACTOR_KINDS = {
         FactorKind("range_se3", ("se3", "point3"), 1, 1, "distance (metres)"),
         FactorKind("bearing_se2", ("se2", "point2"), 1, 1, "bearing (radians), from the pose"),
         FactorKind("bearing_se3", ("se3", "point3"), 3, 3, "direction from the pose (any length)"),
-        FactorKind("linear_se2", ("se2",), 15, 3, "y (3), H (3 x 3), b (3)"),
-        FactorKind("linear_se3", ("se3",), 49, 6, "y (7), H (6 x 6), b (6)"),
-        FactorKind("linear_pair_se2", ("se2", "se2"), 27, 3, "y of both (6), H of both (2 x 3 x 3), b (3)"),
-        FactorKind("linear_pair_se3", ("se3", "se3"), 92, 6, "y of both (14), H of both (2 x 6 x 6), b (6)"),
+        *(_linear(kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
+        *(_linear(kind, kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
+        *(_linear(*b) for b in (("se2", "point2"), ("se3", "point3"), ("se3", "idp"), ("point3", "idp"))),
     )
 }
 

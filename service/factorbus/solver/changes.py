@@ -95,7 +95,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         if make is None:
             raise errors.UnknownKind("change", change.change, CHANGES)
         make(graph, edits, change, touched)
-    check_kept(graph, edits.kept)
+    check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
         "removed_factors": int(np.count_nonzero(~edits.kept)),

@@ -246,12 +246,12 @@ class InUse(SolverError):
 class TooConnected(SolverError):
     code = "too_connected"
 
-    def __init__(self, key: int, count: int, border: Sequence[int]) -> None:
+    def __init__(self, key: int, count: int, border: Sequence[int], most: int) -> None:
         listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
         super().__init__(
             f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
-            f"factors with {len(border)} others, {listed}; wanted at most 32 poses of a kind, or a point that they "
-            "determine: marginalise some of these as well, or remove some of its factors first",
+            f"factors with {len(border)} others, {listed}; wanted at most {most}: marginalise some of these as well, "
+            "or remove some of its factors first",
             key=key,
             border=list(border),
         )

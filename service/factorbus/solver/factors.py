@@ -33,6 +33,16 @@ class FactorKind:
         return self.name
 
 
+def _linear(*ends: VariableKind) -> FactorKind:
+    """What is known of one variable, or of two together: of as many rows as the smaller has scalars."""
+    names = [end.name for end in ends]
+    of = names[:1] if len(ends) == 1 else ["pair", *dict.fromkeys(names)]
+    name, rows = "_".join(["linear", *of]), min(end.dim for end in ends)
+    size = sum(end.size + rows * end.dim for end in ends) + rows
+    code = getattr(layout, name.upper())
+    return FactorKind(name, code, ends, size, rows, "y, H, b" if len(ends) == 1 else "y₁ y₂, H₁ H₂, b", "MATH (3.26)")
+
+
 FACTOR_KINDS = {
     kind.name: kind
     for kind in (
@@ -58,10 +68,9 @@ FACTOR_KINDS = {
         FactorKind("range_se3", layout.RANGE_SE3, (SE3, POINT3), 1, 1, "distance", "MATH (3.23)"),
         FactorKind("bearing_se2", layout.BEARING_SE2, (SE2, POINT2), 1, 1, "radians", "MATH (3.24)"),
         FactorKind("bearing_se3", layout.BEARING_SE3, (SE3, POINT3), 3, 3, "direction", "MATH (3.25)"),
-        FactorKind("linear_se2", layout.LINEAR_SE2, (SE2,), 15, 3, "y, H, b", "MATH (3.26)"),
-        FactorKind("linear_se3", layout.LINEAR_SE3, (SE3,), 49, 6, "y, H, b", "MATH (3.26)"),
-        FactorKind("linear_pair_se2", layout.LINEAR_PAIR_SE2, (SE2, SE2), 27, 3, "y₁ y₂, H₁ H₂, b", "MATH (3.26)"),
-        FactorKind("linear_pair_se3", layout.LINEAR_PAIR_SE3, (SE3, SE3), 92, 6, "y₁ y₂, H₁ H₂, b", "MATH (3.26)"),
+        *(_linear(kind) for kind in (SE2, SE3, POINT2, POINT3, IDP)),
+        *(_linear(kind, kind) for kind in (SE2, SE3, POINT2, POINT3, IDP)),
+        *(_linear(*both) for both in ((SE2, POINT2), (SE3, POINT3), (SE3, IDP), (POINT3, IDP))),
     )
 }
 LENS_AT = {"idp_first": 3, "idp_seen": 2, "point_seen": 2}  # where in a measurement the code of its lens is

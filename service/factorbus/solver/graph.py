@@ -8,6 +8,7 @@ A factor's id is the number of factors that the map took in before it, and stays
 ids of the first rows are listed, those of the rows behind them follow each other without gaps.
 """
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -154,23 +155,31 @@ class Graph(Arenas):
         gather(rows, self.var, self.keys, self.values, keys, values)
         return Group(kind.name, keys, values, fixed=bool(label % 2))
 
-    def factors(self, most: int | None = None) -> list[FactorGroup]:
-        """All factors, or the first `most`: a copy, a group for each kind and loss."""
+    def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:
+        """All factors, or the first `most`: a copy, a group for each kind and loss.
+
+        apart: rows that are to stay in their order: behind the others, groups for each of these.
+        """
         fac = self.fac[: self.counts[at.FACTORS]][:most]
         label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + (fac[:, at.F_FLAGS] >> at.LOSS_SHIFT)
-        groups = []
-        for code in np.flatnonzero(np.bincount(label)).tolist():
-            kind = FACTOR_KIND_OF_CODE[code >> at.LOSS_SHIFT]
-            loss = LOSS_OF_CODE.get(code & ((1 << at.LOSS_SHIFT) - 1), "")
-            rows = fac[label == code]
-            ends = self.keys[rows[:, at.F_I : at.F_I + len(kind.connects)]]
-            width = kind.size + kind.triangle + (1 if loss else 0)
-            numbers = self.payload[rows[:, at.F_AT, None] + np.arange(width)]
-            measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
-            own = scale[:, 0].copy() if loss else None
-            ids = self.ids_of(np.flatnonzero(label == code))
-            groups.append(FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, ids))
-        return groups
+        others, runs = np.ones(len(fac), bool), []
+        for rows in apart:
+            of = np.array(rows)[np.array(rows) < len(fac)]
+            others[of] = False
+            runs += np.split(of, np.flatnonzero(np.diff(label[of])) + 1)
+        runs = [np.flatnonzero(others & (label == code)) for code in np.flatnonzero(np.bincount(label[others]))] + runs
+        return [self._group(fac, rows) for rows in runs if rows.size]
+
+    def _group(self, fac: I64, rows: I64) -> FactorGroup:
+        """Factors of one kind and loss."""
+        kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(fac[rows[0], at.F_FLAGS]) >> at.LOSS_SHIFT
+        loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
+        ends = self.keys[picked[:, at.F_I : at.F_I + len(kind.connects)]]
+        width = kind.size + kind.triangle + (1 if loss else 0)
+        numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
+        measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
+        own = scale[:, 0].copy() if loss else None
+        return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
 
     def factors_of(self, variable: int) -> list[str]:
         """The factors on one variable, for a person: "between_se2 (x1, x2)"."""

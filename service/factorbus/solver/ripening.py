@@ -37,7 +37,15 @@ def find_ripe(graph: Graph, below: float) -> I64:
     guessed = 1.0 / np.sqrt(graph.payload[firsts[:, at.F_AT] + _GUESS])
     known = found[features] * np.abs(graph.values[graph.var[features, at.V_AT] + 5]) / 4.0
     found[features[guessed < _SURER * known]] = np.inf
+    found[is_held(graph)] = np.inf
     return np.flatnonzero(found < below)
+
+
+def is_held(graph: Graph) -> np.ndarray:
+    """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
+    fac, held = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
+    held[fac[fac[:, at.F_KIND] >= at.LINEAR_SE2, at.F_I : at.F_J + 1]] = True
+    return held[:-1]
 
 
 def with_points(graph: Graph, features: I64) -> Graph:

@@ -20,7 +20,7 @@ from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import Addition, BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
-from factorbus.solver.joints import check_joints
+from factorbus.solver.joints import check_joints, find_apart
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.settle_new import settle_new
@@ -28,7 +28,7 @@ from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.packing import Packing
 from factorbus.solver.report import StepReport, Stopwatch
-from factorbus.solver.ripening import find_ripe, with_points
+from factorbus.solver.ripening import find_ripe, is_held, with_points
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.strategy import Plan
 from factorbus.solver.symbolic import Symbolic
@@ -180,6 +180,9 @@ class Solver:
                 raise errors.UnknownVariable(key, "turning features into points")
             if (kind := int(self._graph.var[v, at.V_KIND])) != at.IDP:
                 raise errors.KindMismatch(key, "turning features into points", VARIABLE_KIND_OF_CODE[kind].name, "idp")
+            if is_held(self._graph)[v]:
+                seen, wanted = "idp with a linear factor", "idp that cameras see"
+                raise errors.KindMismatch(key, "turning features into points", seen, wanted)
         made = Solver(self._options)
         made._graph.take(with_points(self._graph, picked))
         return made, made.step()
@@ -221,12 +224,13 @@ class Solver:
         return self._graph.memory_bytes() + (self._tree.tree if self._tree else self._system).memory_bytes()
 
     def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
-        """A copy of everything: variables with their present values, and factors by kind in the order of their ids.
+        """A copy of everything: variables with their present values, and factors by kind in the order of their ids;
+        but those that are one factor in pieces behind the others, in their order.
 
         variables, factors: no more than the first so many.
         """
         picked = None if variables is None else np.arange(min(variables, self.variable_count))
-        return self._graph.variables(picked), self._graph.factors(factors)
+        return self._graph.variables(picked), self._graph.factors(factors, find_apart(self._graph))
 
     def content(self) -> Graph:
         """A copy of everything, as of the last step, for computations elsewhere."""

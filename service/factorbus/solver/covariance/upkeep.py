@@ -34,7 +34,6 @@ _RESIDUAL = np.zeros(1 + max(FACTOR_KIND_OF_CODE), np.int64)
 for _code, _kind in FACTOR_KIND_OF_CODE.items():
     _RESIDUAL[_code] = _kind.dim
 _SIZES = _RESIDUAL.tolist()
-_SIGNED = (at.LINEAR_SE2, at.LINEAR_SE3)  # whose Ω may be negative definite
 
 
 class Upkeep:
@@ -111,7 +110,7 @@ class Upkeep:
         free = {v for v in range(old, self._count) if self._scalar[v] >= 0}
         loops = []
         for k, row in enumerate(self._graph.fac[first : self._factors].tolist()):
-            if row[at.F_KIND] in _SIGNED and negative_rows(self._graph, first).size:
+            if at.LINEAR_SE2 <= row[at.F_KIND] < at.LINEAR_PAIR_SE2 and negative_rows(self._graph, first).size:
                 return None
             ends = [v for v in (row[at.F_I], row[at.F_J]) if v in free]
             if not ends:

@@ -12,7 +12,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.se2 import wrap
-from factorbus.solver.kernels.sizes import dim_of, kinds_of_ends, residual_dim
+from factorbus.solver.kernels.sizes import dim_of, kinds_of_ends, linear_ends, residual_dim, size_of
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -194,15 +194,17 @@ def check_other(kind: int, p: int, payload: F64) -> int:
     """What is wrong with a measurement of the kinds from POSITION_SE2 on; directions and quaternions become unit."""
     if (kind == at.RANGE_SE2 or kind == at.RANGE_SE3) and not payload[p] > 0.0:
         return at.BAD_RANGE
-    attitude, pair = kind == at.ATTITUDE_SE3, kind == at.LINEAR_PAIR_SE3
+    attitude = kind == at.ATTITUDE_SE3
     if (attitude or kind == at.BEARING_SE3) and not make_direction(payload, p):
         return at.BAD_DIRECTION
     if attitude and not make_direction(payload, p + 3):
         return at.BAD_DIRECTION
-    if (pair or kind == at.LINEAR_SE3) and not make_unit(payload, p + 3):
-        return at.BAD_QUATERNION
-    if pair and not make_unit(payload, p + 10):
-        return at.BAD_QUATERNION
+    if kind >= at.LINEAR_SE2:
+        first, second = linear_ends(kind)
+        if first == at.SE3 and not make_unit(payload, p + 3):
+            return at.BAD_QUATERNION
+        if second == at.SE3 and not make_unit(payload, p + size_of(first) + 3):
+            return at.BAD_QUATERNION
     return at.GOOD
 
 

@@ -14,7 +14,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.absolute import attitude_se3, heading_se2, position_se2, position_se3
 from factorbus.solver.kernels.directions import bearing_se2, bearing_se3, range_se2, range_se3
-from factorbus.solver.kernels.linear import linear_se2, linear_se3
+from factorbus.solver.kernels.linear import linear, linear_se2
 from factorbus.solver.kernels.losses import soften
 from factorbus.solver.kernels.points import prior_point2, prior_point3
 from factorbus.solver.kernels.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
@@ -123,7 +123,7 @@ def evaluate_other(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A:
     elif kind == at.LINEAR_SE2 or kind == at.LINEAR_PAIR_SE2:
         linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
     else:
-        linear_se3(x, i, j, 1 if kind == at.LINEAR_SE3 else 2, p, k, r, A, B)
+        linear(kind, x, i, j, p, k, r, A, B)
 
 
 @part

@@ -1,0 +1,108 @@
+"""What a front end has linearised itself, as factors that a map takes in: one where it can be, else in pieces."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
+from factorbus.pieces import MOST, as_pieces, dims_of
+from factorbus.proto.arrays import F64
+from factorbus.proto.kinds import VARIABLE_KINDS
+from factorbus.proto.messages import Factors
+from factorbus.proto.problems import BadInformation, BadLoss, BadShape, UnknownKind
+from factorbus.proto.symbols import format_symbol
+
+_SPACE = (6, 7)  # numbers of an idp and of an se3: what is with them and has three is a point3
+_BY_SIZE = {2: "point2", 3: "se2", 6: "idp", 7: "se3"}
+
+
+def linear_pieces(
+    keys: Sequence[int],
+    values: Sequence[ArrayLike],
+    jacobians: Sequence[ArrayLike],
+    residual: ArrayLike,
+    kinds: Sequence[str] | None,
+    certainty: Certainty,
+) -> list[Factors]:
+    """|Σ H (x ⊟ y) + b|² by Ω as factors, in their order; see `Draft.linear`.
+
+    Raises BadShape, UnknownKind, BadInformation, BadLoss.
+    """
+    where = " ".join(["linear", *map(format_symbol, keys)])
+    y = [np.array(value, np.float64) for value in values]
+    names = _kinds_of(where, y) if kinds is None else list(kinds)
+    b = np.array(residual, np.float64)
+    _check_counts(where, keys, len(y), len(jacobians), len(names))
+    dims = _checked_dims(where, names, y)
+    if b.ndim != 1 or not b.size:
+        raise BadShape(f"{where}: residual", f"shape {b.shape}", "(m,)")
+    H = np.column_stack(
+        [_block(f"{where}: jacobian of a {n}", J, (b.size, d)) for n, J, d in zip(names, jacobians, dims, strict=True)]
+    )
+    triangle, (loss, scale) = triangle_of(where, b.size, certainty), loss_of(where, certainty.get("loss"))
+    if len(keys) <= 2 and b.size <= min(dims):
+        (piece,) = as_pieces(names, np.array(keys), y, H, b)
+        information = _filled(triangle, b.size, min(dims))
+        return [Factors(*piece[:3], information[None], loss, np.array([scale]) if loss else None)]
+    if loss:
+        limit = f"{min(dims)} rows" if len(keys) <= 2 else "two variables"
+        raise BadLoss(where, repr(loss), f"none: a linear factor of more than {limit} is sent in pieces")
+    root = _root(where, full(triangle, b.size))
+    return [Factors(*piece) for piece in as_pieces(names, np.array(keys), y, root @ H, root @ b)]
+
+
+def _check_counts(where: str, keys: Sequence[int], *counts: int) -> None:
+    if not 1 <= len(keys) <= MOST:
+        raise BadShape("linear: keys", len(keys), f"1 to {MOST}")
+    if len(set(keys)) < len(keys):
+        raise BadShape(f"{where}: keys", "one of them twice", "each once; add up its jacobians")
+    for name, count in zip(("values", "jacobians", "kinds"), counts, strict=True):
+        if count != len(keys):
+            raise BadShape(f"{where}: {name}", count, f"{len(keys)}, one for each key")
+
+
+def _checked_dims(where: str, names: Sequence[str], y: Sequence[F64]) -> list[int]:
+    """Scalars in the tangent of each."""
+    for name, value in zip(names, y, strict=True):
+        if name not in VARIABLE_KINDS:
+            raise UnknownKind("draft", name, tuple(VARIABLE_KINDS))
+        if value.shape != (VARIABLE_KINDS[name].size,):
+            raise BadShape(f"{where}: value of a {name}", f"shape {value.shape}", f"({VARIABLE_KINDS[name].size},)")
+    try:
+        return dims_of(names)
+    except ValueError as problem:
+        wanted = "all of the plane (se2, point2), or all of space (se3, point3, idp)"
+        raise BadShape(f"{where}: kinds", ", ".join(names), wanted) from problem
+
+
+def _kinds_of(where: str, y: Sequence[F64]) -> list[str]:
+    """By how many numbers their values have."""
+    for value in y:
+        if value.ndim != 1 or value.size not in _BY_SIZE:
+            wanted = "(3,) of an se2 or point3, (7,) of an se3, (2,) of a point2, (6,) of an idp"
+            raise BadShape(f"{where}: values", f"shape {value.shape}", wanted)
+    space = any(value.size in _SPACE for value in y)
+    return ["point3" if space and value.size == 3 else _BY_SIZE[value.size] for value in y]
+
+
+def _block(where: str, given: ArrayLike, shape: tuple[int, int]) -> F64:
+    block = np.array(given, np.float64)
+    if block.shape != shape:
+        raise BadShape(where, f"shape {block.shape}", f"{shape}")
+    return block
+
+
+def _filled(triangle: F64, rows: int, dim: int) -> F64:
+    """The upper triangle of Ω with rows for zeros in H and b, of weight one."""
+    whole = np.eye(dim)
+    whole[:rows, :rows] = full(triangle, rows)
+    return whole[np.triu_indices(dim)]
+
+
+def _root(where: str, information: F64) -> F64:
+    """A with AᵀA = Ω."""
+    try:
+        return np.asarray(np.linalg.cholesky(information).T, np.float64)
+    except np.linalg.LinAlgError:
+        raise BadInformation(f"{where}: information", "not positive definite", "a positive definite matrix") from None
