@@ -19,7 +19,7 @@ from factorbus.solver import errors
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.quadratic import quadratic
 
 SINGLE = {n: k.code for n, k in FACTOR_KINDS.items() if at.LINEAR_SE2 <= k.code < at.LINEAR_PAIR_SE2}
@@ -112,9 +112,18 @@ def check_joints(graph: Graph, first: int = 0) -> None:
             raise errors.Apart(keys[:_MOST_TOGETHER], ids[:_MOST_PIECES], many)
         form = quadratic(graph, joint.rows, [])
         scale = np.where(form.plus > 0.0, 1.0 / np.sqrt(np.where(form.plus > 0.0, form.plus, 1.0)), 1.0)
-        lowest = np.linalg.eigvalsh(form.information * scale * scale[:, None]).min(initial=0.0)
-        if not lowest >= -_ROUNDING:
+        share = form.information * scale * scale[:, None]
+        if not _is_semidefinite(share):
+            lowest = np.linalg.eigvalsh(share).min(initial=0.0) if np.isfinite(share).all() else np.nan
             raise errors.Apart(keys, ids, f"their sum has the eigenvalue {lowest:.3g} (of the share of their diagonal)")
+
+
+def _is_semidefinite(share: F64) -> bool:
+    try:
+        np.linalg.cholesky(share + _ROUNDING * np.eye(len(share)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _linear(graph: Graph) -> tuple[np.ndarray, np.ndarray]:

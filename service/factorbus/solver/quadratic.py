@@ -1,15 +1,15 @@
 """What some factors say of their variables together, to second order at the estimate: dense, for a few of them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE, FactorKind
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64
-from factorbus.solver.kernels.linearise import evaluate_one
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.candidates import evaluate_factors
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VariableKind
 
 
@@ -35,24 +35,40 @@ def quadratic(graph: Graph, rows: Iterable[int], first: list[int]) -> Quadratic:
     for v in variables:
         starts[v], size = size, size + kind_of(graph, v).dim
     information, eta, plus = np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    r, J, W = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros((6, 6))
-    for f in rows:
-        row = graph.fac[f]
-        kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
-        evaluate_one(f, graph.var, graph.fac, graph.values, graph.payload, r, J[0], J[1])
-        upper = np.triu_indices(kind.dim)
-        W[upper] = graph.payload[row[at.F_AT] + kind.size : row[at.F_AT] + kind.size + kind.triangle]
-        omega = np.triu(W[: kind.dim, : kind.dim]) + np.triu(W[: kind.dim, : kind.dim], 1).T
-        here = [(e, int(row[at.F_I + e])) for e in range(len(kind.connects)) if int(row[at.F_I + e]) in starts]
-        if not here:
-            continue
-        H = np.concatenate([J[e, : kind.dim, : kind_of(graph, v).dim] for e, v in here], axis=1)
-        places = np.concatenate([starts[v] + np.arange(kind_of(graph, v).dim) for _, v in here])
-        added = H.T @ omega @ H
-        information[np.ix_(places, places)] += added
-        eta[places] -= H.T @ omega @ r[: kind.dim]
-        plus[places] += np.maximum(added.diagonal(), 0.0)
+    for kind, of in _by_kind(graph, rows):
+        J, W, r = _evaluated(graph, kind, of)
+        there = graph.fac[of, at.F_I : at.F_I + len(kind.connects)]
+        place = np.array([[starts.get(v, -1) for v in ends] for ends in there.tolist()])
+        for e, end in enumerate(kind.connects):
+            WJ = W @ J[e]
+            at_e = place[:, e, None] + np.arange(end.dim)
+            inside = place[:, e] >= 0
+            np.subtract.at(eta, at_e[inside], (WJ.transpose(0, 2, 1) @ r[:, :, None])[inside, :, 0])
+            for f, other in enumerate(kind.connects):
+                both = inside & (place[:, f] >= 0)
+                at_f = place[:, f, None] + np.arange(other.dim)
+                added = (J[f].transpose(0, 2, 1) @ WJ)[both]
+                np.add.at(information, (at_f[both][:, :, None], at_e[both][:, None, :]), added)
+                if e == f:
+                    np.add.at(plus, at_e[both], np.maximum(added.diagonal(axis1=1, axis2=2), 0.0))
     return Quadratic(variables, starts, information, eta, plus)
+
+
+def _by_kind(graph: Graph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
+    picked = np.array(rows, np.int64)
+    codes = graph.fac[picked, at.F_KIND]
+    for code in np.unique(codes).tolist():
+        yield FACTOR_KIND_OF_CODE[code], picked[codes == code]
+
+
+def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:
+    """Of factors of one kind the Jacobian of each end (n, dim, d), Ω (n, dim, dim) and r (n, dim)."""
+    fac, n = np.ascontiguousarray(graph.fac[rows]), rows.size
+    r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, 6, 6)) for _ in range(3))
+    evaluate_factors(0, n, graph.var, fac, graph.values, graph.payload, r, A, B, W)
+    d = kind.dim
+    blocks = [J[:, :d, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
+    return blocks, W[:, :d, :d], r[:, :d]
 
 
 def kind_of(graph: Graph, v: int) -> VariableKind:

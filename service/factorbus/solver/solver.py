@@ -199,8 +199,8 @@ class Solver:
         edits = collect(self._graph, changes)
         made = Solver(self._options)
         made._graph.take(edited(self._graph, edits))
-        made._add(edits.added)
         check_joints(made._graph)
+        made._add(edits.added)
         variables, factors = made.variable_count, made.factor_count
         first = made._graph.next_id if batch is None else made.stage(batch)
         new = made.variable_count - variables, made.factor_count - factors
