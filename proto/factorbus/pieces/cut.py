@@ -129,7 +129,20 @@ def cut(
     rest = np.zeros((1, d))
     rest[0, 0] = math.sqrt(max((least if constant is None else constant) - told, 0.0))
     number = _pieces(f"linear_{kinds[0]}", keys[:1, None], [_values(y, np.array([0])), np.zeros((1, d, d)), rest])
-    return [number, *excess, *sure, *pairs]
+    return _together([number, *excess, *reversed(sure), *pairs])
+
+
+def _together(pieces: Sequence[Pieces]) -> list[Pieces]:
+    """Those of a kind that follow each other as one: an insert has room for so many groups only."""
+    made: list[Pieces] = []
+    for each in pieces:
+        if made and made[-1].kind == each.kind:
+            last = made.pop()
+            keys, measured = np.concatenate([last.keys, each.keys]), np.concatenate([last.measured, each.measured])
+            made.append(Pieces(each.kind, keys, measured, np.concatenate([last.information, each.information])))
+        else:
+            made.append(each)
+    return made
 
 
 def _pairs(a: int, b: int, same: bool) -> tuple[I64, I64]:

@@ -163,7 +163,7 @@ class Solver:
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
-        return self._tree.chi2() if self._tree else self._done.chi2
+        return self._tree.chi2() if self._tree else max(self._done.chi2, 0.0)
 
     def ripe(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
@@ -410,7 +410,7 @@ class Solver:
             strategy=plan.strategy,
             because=plan.because,
             iterations=course.iterations,
-            chi2=course.chi2,
+            chi2=max(course.chi2, 0.0),
             chi2_before=self._done.chi2 + added,
             new_variables=self.variable_count - self._done.graph[at.VARIABLES],
             new_factors=self.factor_count - self._done.graph[at.FACTORS],

@@ -73,8 +73,8 @@ class TreeSteps:
             before = self._graph.values.copy()
             course = self._batch(before, settle=False)
             because = "χ² would have risen: a batch from where the estimate stood"
-        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else max(account[tl.A_CHI2], 0.0)
-        return self._account(started, compiled, course, chi2, because)
+        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else account[tl.A_CHI2]
+        return self._account(started, compiled, course, max(chi2, 0.0), because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -84,7 +84,7 @@ class TreeSteps:
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
-        return self._sum_chi2(self._mark[at.FACTORS])
+        return max(self._sum_chi2(self._mark[at.FACTORS]), 0.0)  # pieces of a form sum to zero but for rounding
 
     def _check_held(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
