@@ -64,7 +64,7 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         return group._replace(loss=loss, scale=np.array([1.5])) if loss else group
 
     for n in range(steps):
-        x, y, l, p = (symbol(letter, n) for letter in "xylp")
+        x, y, l, p, f = (symbol(letter, n) for letter in "xylpf")
         plane, space = random_value("se2", rng), random_value("se3", rng)
         if n:
             plane = boxplus("se2", truth[x - 1], np.array([1.0, 0.1, rng.normal(0, 0.6)]))
@@ -72,6 +72,7 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
         variables = [new("se2", "x", n, plane), new("se3", "y", n, space)]
         variables += [new("point2", "l", n, plane[:2] + rng.uniform(1, 3, 2), given=True)]
         variables += [new("point3", "p", n, space[:3] + rng.uniform(1, 3, 3), given=True)]
+        variables += [new("idp", "f", n, random_value("idp", rng), given=True)]
         if n == 0:
             factors = [factor("prior_se2", [x], truth, noise, rng), factor("prior_se3", [y], truth, noise, rng)]
         else:
@@ -81,7 +82,10 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
             factors += [made("range_se2", x, l - 1), made("bearing_se3", y, p - 1)]
             factors += [made("linear_pair_point2", l, l - 1), made("linear_pair_point3", p - 1, p)]
             factors += [made("linear_pair_se2_point2", x, l - 1), made("linear_pair_se3_point3", y - 1, p)]
+            factors += [made("linear_pair_idp", f, f - 1), made("linear_pair_se3_idp", y, f - 1)]
+            factors += [made("linear_pair_point3_idp", p - 1, f)]
         factors += [
+            made("linear_idp", f),
             made("range_se2", x, l),
             made("bearing_se2", x, l),
             made("range_se3", y, p),

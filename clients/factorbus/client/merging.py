@@ -19,12 +19,12 @@ from factorbus.client.frames import (
     compose,
     difference,
     inverse,
-    is_relative,
-    moved_factors,
     moved_values,
-    says_nothing,
 )
+from factorbus.client.moved import moved_factors
+from factorbus.client.moved_linear import is_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
@@ -33,10 +33,8 @@ ABSOLUTE = ("refuse", "leave_out", "keep")
 _PRIORS = ("prior_se2", "prior_se3")
 _OF_THE_WORLD = (
     *_PRIORS, "prior_point2", "prior_point3", "position_se2", "position_se3", "heading_se2", "attitude_se3",
-    "linear_se2", "linear_se3",
+    *LINEAR,
 )  # fmt: skip
-_PAIRS = ("linear_pair_se2", "linear_pair_se3")
-_LINEAR = ("linear_se2", "linear_se3")
 _BETWEEN = ("between_se2", "between_se3")
 _SHOWN = 5
 
@@ -186,9 +184,9 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
     fixed = sum(group.keys.size for group in batch.variables if group.fixed)
     if fixed:
         held["fixed"] = fixed
-    factors, pairs, joint = [], [group for group in batch.factors if group.kind in _PAIRS], _joint(batch)
+    factors, pairs, joint = [], [group for group in batch.factors if group.kind in LINEAR_PAIRS], _joint(batch)
     for group in batch.factors:
-        if group.kind in _LINEAR:
+        if group.kind in LINEAR:
             group = _rows(group, ~says_nothing(group, pairs))
         stays = _stays(group, joint)
         if not stays.all():
@@ -201,13 +199,13 @@ def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:
 
 
 def _joint(batch: Batch) -> I64:
-    """Poses with a linear factor of negative weight: of those, only all linear factors together mean anything."""
-    negative = [g.keys[g.information[:, 0] < 0.0, 0] for g in batch.factors if g.kind in _LINEAR]
+    """Variables with a linear factor of negative weight: of those, only all linear factors together mean anything."""
+    negative = [g.keys[g.information[:, 0] < 0.0, 0] for g in batch.factors if g.kind in LINEAR]
     return np.concatenate([np.empty(0, np.int64), *negative])
 
 
 def _stays(group: Factors, joint: I64) -> np.ndarray:
-    if group.kind in _PAIRS:
+    if group.kind in LINEAR_PAIRS:
         return is_relative(group) & ~np.isin(group.keys, joint).all(axis=1)
     return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
 

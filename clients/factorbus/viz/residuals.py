@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
 from factorbus.proto.messages import Factors, Variables
 
 _WIDEST = 7  # numbers of a pose in space
@@ -120,19 +121,32 @@ def _distance(pose: F64, point: F64, z: F64, n: int) -> F64:
     return np.linalg.norm(point[:, :n] - pose[:, :n], axis=1, keepdims=True) - z
 
 
-def _linear(*ends_and_z: F64) -> F64:
+def _linear(kind: str) -> Callable[..., F64]:
     """Σ H (x ⊟ y) + b."""
-    *ends, z = ends_and_z
-    size, d = (3, 3) if z.shape[1] in (15, 27) else (7, 6)
-    r = z[:, -d:].copy()
-    for e, x in enumerate(ends):
-        y = z[:, e * size : (e + 1) * size]
-        step = _less_se2(y, x) if d == 3 else _less_se3(y, x)[:, :6] * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0)
-        first = len(ends) * size + e * d * d
-        r += np.einsum("mij,mj->mi", z[:, first : first + d * d].reshape(-1, d, d), step)
-    return r
+
+    def residual(*ends_and_z: F64) -> F64:
+        *ends, z = ends_and_z
+        of, y, H, b = parts_of(kind, z)
+        steps = (_LESS[end](at, x) for end, at, x in zip(of, y, ends, strict=True))
+        return b + sum(np.einsum("mij,mj->mi", J, step) for J, step in zip(H, steps, strict=True))
+
+    return residual
 
 
+def _less_idp(y: F64, x: F64) -> F64:
+    step = x[:, :6] - y
+    step[:, 3] = _wrap(step[:, 3])
+    return step
+
+
+# x ⊟ y, as linear factors have it.
+_LESS: Mapping[str, Callable[[F64, F64], F64]] = {
+    "se2": _less_se2,
+    "se3": lambda y, x: _less_se3(y, x)[:, :6] * (1.0, 1.0, 1.0, 2.0, 2.0, 2.0),
+    "point2": lambda y, x: x[:, :2] - y,
+    "point3": lambda y, x: x[:, :3] - y,
+    "idp": _less_idp,
+}
 _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "prior_se2": lambda x, z: _less_se2(z, x),
     "prior_se3": lambda x, z: _less_se3(z, x)[:, :6],
@@ -151,8 +165,5 @@ _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "range_se3": lambda a, p, z: _distance(a, p, z, 3),
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
-    "linear_se2": _linear,
-    "linear_se3": _linear,
-    "linear_pair_se2": _linear,
-    "linear_pair_se3": _linear,
+    **{kind: _linear(kind) for kind in (*LINEAR, *LINEAR_PAIRS)},
 }
