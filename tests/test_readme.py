@@ -38,13 +38,13 @@ def test_the_rest_of_the_readme(tmp_path: Path) -> None:
 
 def test_the_client_librarys_guide(tmp_path: Path) -> None:
     programs = [block for block in blocks("clients/README.md") if block[0] == "python"]
-    assert len(programs) == 5
+    assert len(programs) == 6
     with walker(tmp_path) as run:
         run("bash", "factorbus serve")
         said = [run(*program) for program in programs]
-    assert "unknown_variable" in said[2]
-    assert said[3].rstrip().endswith("False")
-    assert said[4] == "2\n[1. 0. 0.]\n"
+    assert "unknown_variable" in said[3]
+    assert said[4].rstrip().endswith("False")
+    assert said[5] == "2\n[1. 0. 0.]\n"
 
 
 def test_the_filter_front_end_of_the_workers_guide(tmp_path: Path) -> None:

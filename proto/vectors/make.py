@@ -20,6 +20,7 @@ import numpy as np
 from factorbus.proto import asking, codec
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import repair_codec as repairs
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import (
     Accepted,
     Batch,
@@ -67,6 +68,7 @@ def vectors() -> dict[str, bytes]:
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
+        "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
         "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
         "insert_marginalise": codec.encode_insert(
@@ -224,6 +226,35 @@ def _other_kinds() -> Batch:
             Factors("linear_pair_se3", np.array([[y, y + 1]]), np.array([[*turned, *turned, *H3, *H3, *b3]]), unit6),
         )
     )
+
+
+def _linear_kinds() -> Batch:
+    """Linear factors of points and features, and a form in pieces: its number, what is too much, the rest, the pair."""
+    plane, space = (symbol("x", 1), symbol("l", 1)), (symbol("y", 1), symbol("p", 1), symbol("f", 1))
+    sent = ("linear_se2", "linear_se3", "linear_pair_se2", "linear_pair_se3")  # in `_other_kinds`
+    names = [name for name in FACTOR_KINDS if name.startswith("linear") and name not in sent]
+    of = {"se2": plane[0], "point2": plane[1], "se3": space[0], "point3": space[1], "idp": space[2]}
+    groups = []
+    for name in names:
+        kind = FACTOR_KINDS[name]
+        keys = np.array([[of[end] + (e if kind.connects[0] == end else 0) for e, end in enumerate(kind.connects)]])
+        numbers = (np.arange(kind.size) % 8 - 3.0) / 4.0
+        if kind.connects[0] == "se3":
+            numbers[3:7] = 0.0, 0.0, 0.6, 0.8
+        groups.append(Factors(name, keys, numbers[None], np.eye(kind.dim)[np.triu_indices(kind.dim)][None]))
+    two, three = (np.eye(r)[np.triu_indices(r)] for r in (2, 3))
+    here, there = [1.0, 2.0, 0.5], [3.0, 4.0]
+    H2, H3 = np.eye(2).ravel().tolist(), np.eye(3).ravel().tolist()
+    pose = [[*here, *[0.0] * 9, 0.5, 0, 0], [*here, *H3, 0, 0, 0], [*here, *H3, 0.25, 0, 0]]
+    point = [[*there, *H2, 0, 0], [*there, *H2, 0, 0.25]]
+    pair = [*here, *there, 0.5, 0, 0, 0, 0.5, 0, *H2, 0, 0]
+    groups += [
+        Factors("linear_se2", np.full((2, 1), plane[0]), np.array(pose[:2]), np.array([three, -0.5 * three])),
+        Factors("linear_point2", np.full((2, 1), plane[1]), np.array(point), np.array([-two, 2.0 * two])),
+        Factors("linear_se2", np.full((1, 1), plane[0]), np.array(pose[2:]), np.array([three])),
+        Factors("linear_pair_se2_point2", np.array([plane]), np.array([pair]), two[None]),
+    ]
+    return Batch(factors=tuple(groups))
 
 
 def _sights() -> Batch:

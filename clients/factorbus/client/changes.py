@@ -68,9 +68,9 @@ class Changes:
     def marginalise(self, *keys: Key) -> "Changes":
         """These variables go; what their factors say of the others is kept, as linear factors.
 
-        Refused (too_connected) where what hangs together shares factors with more than 32 poses that stay, or with
-        landmarks that stay and anything else.  Before any loss, weigh or place of the same insert.  What is kept of
-        more than two poses is one factor in pieces: they stay or go together (else not_positive_definite).
+        Refused (too_connected) where what hangs together shares factors with more than 128 variables that stay.  Before
+        any loss, weigh or place of the same insert.  What is kept of more than two variables is one factor in pieces:
+        they stay or go together (else not_positive_definite).
         """
         return self._add(Change("marginalise", keys=_keys(keys)))
 
