@@ -12,7 +12,7 @@ from naive.random_sights import SIGHTS, measurement, random_sight, state_of
 
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import LOSSES
-from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.covariance.blocks import Blocks
@@ -389,6 +389,20 @@ def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
         made.with_points(points.keys)
     with pytest.raises(errors.UnknownVariable):
         solver.with_points(np.array([symbol("f", 99)]))
+
+
+def test_a_feature_with_a_linear_factor_stays_one() -> None:
+    """What a pose that went has left is of a feature's six numbers, and not of a point's three."""
+    solver = Solver(Options())
+    drive_past(solver)
+    before = solver.step(settle=True)
+    assert solver.ripe(1e9).size == 12
+    after, _, report, _ = solver.with_changes([Change("marginalise", keys=np.array([symbol("x", 0)]))], settle=True)
+    assert sum(len(g.keys) for g in after.graph()[1] if g.kind == "linear_idp") == 12
+    assert report.chi2 <= before.chi2
+    assert after.ripe(1e9).size == 0
+    with pytest.raises(errors.KindMismatch, match="linear factor"):
+        after.with_points(np.array([symbol("f", 3)]))
 
 
 def test_the_linearity_index_is_the_papers() -> None:

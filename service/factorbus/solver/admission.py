@@ -28,8 +28,8 @@ _NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIA
 def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
     """Append `batch` to `graph` and give values to the variables that come without.
 
-    whole: a linear factor of one pose may have a negative definite Ω where those that came together make a form that is
-    positive semidefinite (`joints`); else it may not.
+    whole: a linear factor of one variable may have a negative definite Ω where those that came together make a form
+    that is positive semidefinite (`joints`); else it may not.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
     BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialised; `graph` then

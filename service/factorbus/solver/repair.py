@@ -86,7 +86,7 @@ def repair(graph: Graph, factors: I64 | None = None, probability: float = 0.99) 
 def find_loops(graph: Graph) -> I64:
     """Rows of the factors between variables that factors before them, or being fixed, join already.
 
-    Pieces of what is known of many poses together join, and are no suspects.
+    Pieces of what is known of many variables together join, and are no suspects.
     """
     trusted = {f for joint in find_joints(graph) for f in joint.rows}
     count = int(graph.counts[at.VARIABLES])
@@ -121,7 +121,8 @@ def _rows(graph: Graph, ids: I64) -> I64:
     pieces = {f for joint in find_joints(graph) for f in joint.rows}
     if bad := [f for f in rows.tolist() if f in pieces]:
         named = int(graph.ids_of(np.array(bad[:1]))[0])
-        raise errors.BadOption("factors", f"{named}, a piece of what is known of many poses together", "other factors")
+        seen = f"{named}, a piece of what is known of many variables together"
+        raise errors.BadOption("factors", seen, "other factors")
     return rows
 
 
