@@ -94,17 +94,17 @@ def check_kept(graph: Graph, kept: np.ndarray, all_or_none: bool = False) -> Non
 
 def check_joints(graph: Graph, first: int = 0) -> None:
     """Every form that has a factor from row `first` on is one.  Raises Apart."""
-    negative = negative_rows(graph)
-    if not negative.size:
-        return
-    robust = (graph.fac[: graph.counts[at.FACTORS], at.F_FLAGS] >> at.LOSS_SHIFT) != at.NO_LOSS
-    for f in negative.tolist():
-        if robust[f]:
-            key = int(graph.keys[graph.fac[f, at.F_I]])
-            raise errors.Apart([key], graph.ids_of(np.array([f])).tolist(), "a loss on a piece of negative weight")
-    for joint in find_joints(graph):
-        if joint.rows[-1] < first:
-            continue
+    of, negative = _linear(graph, first)
+    if (bad := np.flatnonzero(negative & ~of)).size:
+        row = first + bad[:1]
+        key = int(graph.keys[graph.fac[row[0], at.F_I]])
+        raise errors.Apart([key], graph.ids_of(row).tolist(), "a loss on a piece of negative weight")
+    joints = list(_told_apart(graph, of, negative, first))
+    for joint in joints:
+        negative[np.array(joint.rows) - first] = False
+    if negative.any():  # what is told by what it hangs together with may hang together with what was there
+        joints = [joint for joint in find_joints(graph) if joint.rows[-1] >= first]
+    for joint in joints:
         keys = [int(graph.keys[v]) for v in joint.variables]
         ids = graph.ids_of(np.array(joint.rows)).tolist()
         if len(keys) > _MOST_TOGETHER or len(ids) > _MOST_PIECES:
@@ -126,34 +126,34 @@ def _is_semidefinite(share: F64) -> bool:
     return True
 
 
-def _linear(graph: Graph) -> tuple[np.ndarray, np.ndarray]:
-    """Which factors (m,) are linear ones without a loss, and which are of negative weight."""
-    fac = graph.fac[: graph.counts[at.FACTORS]]
+def _linear(graph: Graph, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Of the factors from row `first` on, which are linear ones without a loss, and which are of negative weight."""
+    fac = graph.fac[first : graph.counts[at.FACTORS]]
     negative = np.zeros(len(fac), bool)
-    negative[negative_rows(graph)] = True
+    negative[negative_rows(graph, first) - first] = True
     return (fac[:, at.F_KIND] >= at.LINEAR_SE2) & ((fac[:, at.F_FLAGS] >> at.LOSS_SHIFT) == at.NO_LOSS), negative
 
 
-def _told_apart(graph: Graph, of: np.ndarray, negative: np.ndarray) -> Iterator[Joint]:
-    """The forms that begin with a number, among the linear factors `of` (m,)."""
-    fac, count = graph.fac, of.size
+def _told_apart(graph: Graph, of: np.ndarray, negative: np.ndarray, first: int = 0) -> Iterator[Joint]:
+    """The forms that begin with a number, among the linear factors `of` (m,) from row `first` on."""
+    fac, count = graph.fac[first : first + of.size], of.size
     inside = np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
     inside[-1] = True  # of no variable
     before = np.flatnonzero(of[:-1] & ~negative[:-1] & negative[1:])
-    heads = [f for f in before.tolist() if _is_number(graph, f)]
+    heads = [f for f in before.tolist() if _is_number(graph, first + f)]
     ends = np.flatnonzero(~of)
     for f, next_head in pairwise([*heads, count]):
         outside = np.searchsorted(ends, f)
         end = min(next_head, int(ends[outside]) if outside < ends.size else count)
-        first = f + 1 + int(np.argmin(np.append(negative[f + 1 : end], False)))
-        variables = np.unique(fac[f + 1 : first, at.F_I])
-        if variables.size < first - f - 1:
+        begin = f + 1 + int(np.argmin(np.append(negative[f + 1 : end], False)))
+        variables = np.unique(fac[f + 1 : begin, at.F_I])
+        if variables.size < begin - f - 1:
             continue  # a variable has two
         inside[variables] = True
-        here = inside[fac[first:end, at.F_I : at.F_J + 1]].all(axis=1) & ~negative[first:end]
-        last = first + int(np.argmin(np.append(here, False)))
+        here = inside[fac[begin:end, at.F_I : at.F_J + 1]].all(axis=1) & ~negative[begin:end]
+        last = begin + int(np.argmin(np.append(here, False)))
         if inside[fac[f, at.F_I]]:
-            yield Joint(variables.tolist(), list(range(f, last)), True)
+            yield Joint(variables.tolist(), list(range(first + f, first + last)), True)
         inside[variables] = False
 
 
