@@ -238,7 +238,7 @@ def _linear_kinds() -> Batch:
     for name in names:
         kind = FACTOR_KINDS[name]
         keys = np.array([[of[end] + (e if kind.connects[0] == end else 0) for e, end in enumerate(kind.connects)]])
-        numbers = (np.arange(kind.size) % 8 - 3.0) / 4.0
+        numbers = np.array([(n % 8 - 3) / 4 for n in range(kind.size)])
         if kind.connects[0] == "se3":
             numbers[3:7] = 0.0, 0.0, 0.6, 0.8
         groups.append(Factors(name, keys, numbers[None], np.eye(kind.dim)[np.triu_indices(kind.dim)][None]))
