@@ -26,6 +26,8 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.simd import LANES, put
 from factorbus.solver.kernels.simd import at as load
 
+AHEAD = 3  # cliques: it takes that long for rows to come into the cache
+
 
 @kernel(
     "void(int64[::1], int64, int64[:,::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1],"
@@ -76,7 +78,7 @@ def whole_blocks(
             depth[c] = depth[parent] + 1
         start = starts[depth[c]]
         starts[depth[c] + 1] = start + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
-        fetch(clique[order[min(k + 1, order.size - 1)]], numbers)
+        fetch(clique[order[min(k + AHEAD, order.size - 1)]], numbers)
         if parent >= 0:
             gather(row, clique[parent], lists, dims, places, runs, a, starts[depth[c] - 1], start)
         solve_clique(row, numbers, a, start, row[tl.C_CHILD] >= 0)
