@@ -72,7 +72,8 @@ def test_any_variables_may_go(world: str, mode: str, seed: int) -> None:
     solver = solved(world, seed, mode)
     keys = sorted(values(solver))
     gone = [key for key in keys if rng.random() < rng.choice([0.15, 0.4, 0.7])][: len(keys) - 2]
-    settled = 1e-8 if world == "cameras" else 1e-9  # how far from the optimum a settled estimate may be
+    # How far from the optimum a settled estimate may be: with cameras its standard deviations are about 1.
+    settled = 1e-6 if world == "cameras" else 1e-9
     assert_same(solver, without(solver, gone), gone, settled)
     # One after the other it is the same, and what was known of many goes whole into what is known next.
     slowly = solver

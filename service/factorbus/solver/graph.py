@@ -63,13 +63,13 @@ class Graph(Arenas):
         self._rows.forget(mark[at.VARIABLES])
 
     def copied(self) -> "Graph":
-        """The same graph with arrays of its own, with room for half as many factors again."""
+        """The same graph with arrays of its own, as large as what is in use."""
         variables, factors, values, payload, columns, _ = self.counts.tolist()
         other = Graph()
         other.keys, other.var = self.keys[:variables].copy(), self.var[:variables].copy()
         other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
-        other.values = self.values[:values].copy()
-        other.payload, other.fac = _with_room(self.payload, payload), _with_room(self.fac, factors)
+        other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
+        other.fac = self.fac[:factors].copy()
         other.ids, other.id_shift = self.ids.copy(), self.id_shift
         return other
 
@@ -192,13 +192,6 @@ class Graph(Arenas):
         kind: FactorKind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
         ends = [int(self.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)]]
         return f"{kind} ({', '.join(printed(key) for key in ends)})"
-
-
-def _with_room(array: np.ndarray, used: int) -> np.ndarray:
-    """A copy of the first `used` rows; the room behind them is no memory before somebody writes there."""
-    copy = np.empty((used + used // 2, *array.shape[1:]), array.dtype)
-    copy[:used] = array[:used]
-    return copy
 
 
 def grown(array: np.ndarray, need: int) -> np.ndarray:
