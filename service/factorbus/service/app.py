@@ -4,6 +4,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
                            fold an insert in instead, and send what comes of it, when that is soon done
           solver <map>     folds and steps, and encodes what comes of it
           outbox           answers to inserts, and publications, in order
+          refusals         of what cannot be read, or is for no map
           desk             maps that come and go, jobs for workers
           answers 0..3     answers to questions, which can be large
           in-place <kind>  jobs when there is no worker
@@ -115,7 +116,7 @@ class Shell:
         self._senders: dict[str, tuple[str, str]] = {}  # keys of inserts taken apart before
         self._desk = Lane("desk")
         self._delivery = Delivery(self._about, self._find_optimum, self._fork)
-        lanes = {"outbox": self._delivery.outbox, "desk": self._desk}
+        lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
         self._worker_rows: list[dict[str, Any]] = []
@@ -178,15 +179,15 @@ class Shell:
         try:
             name, client = place or self._sender(key)
         except Problem as problem:
-            self._delivery.outbox.hand(refuse, query, problem)
+            self._delivery.refusals.hand(refuse, query, problem)
             return
         found = self.maps.get(name)
         if found is None:
-            self._delivery.outbox.hand(self._no_map, query, name)
+            self._delivery.refusals.hand(self._no_map, query, name)
             return
         read = read_insert(query, client, payload, self._decoding, time.monotonic())
         if isinstance(read, Refuse):
-            self._delivery.outbox.hand(refuse, query, read.problem)
+            self._delivery.refusals.hand(refuse, query, read.problem)
             return
         if (full := self.vitals.memory.no_room(read.size)) is not None:
             read = read._replace(content=full, message=b"")
@@ -205,7 +206,7 @@ class Shell:
         name, question = _chunks(query)
         found = self.maps.get(name)
         if found is None:
-            self._delivery.outbox.hand(self._no_map, query, name)
+            self._delivery.refusals.hand(self._no_map, query, name)
         else:
             found.host.ask(Asked(query, question, payload_of(query)))
 

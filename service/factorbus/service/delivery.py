@@ -2,7 +2,8 @@
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
-lanes a second, then Zenoh closes that client's transport.
+lanes a second, then Zenoh closes that client's transport.  Refusals of what cannot even be read have a lane of their
+own: of these a client can have filled its queue with tens of thousands before the first is taken.
 """
 
 import logging
@@ -26,7 +27,7 @@ _ANSWERERS = 4
 
 
 class Delivery:
-    """The outbox, the answering lanes, and what goes on which.
+    """The outbox, the answering lanes, that of refusals, and what goes on which.
 
     about: what this service adds to the stats of a map.  batch: finds batch optima; (asker, question, snapshot).
     copied: the same with a copy of a map, which is to be another one.
@@ -38,7 +39,7 @@ class Delivery:
         batch: Callable[[Asker, Question, Snapshot], None],
         copied: Callable[[Asker, Question, Snapshot], None],
     ) -> None:
-        self.outbox, self._answers = Lane("outbox"), Lanes("answers", _ANSWERERS)
+        self.outbox, self.refusals, self._answers = Lane("outbox"), Lane("refusals"), Lanes("answers", _ANSWERERS)
         self._about, self._batch, self._copied = about, batch, copied
 
     def of_map(self, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
@@ -60,6 +61,7 @@ class Delivery:
     def close(self) -> None:
         """Return when everything is sent."""
         self._answers.close()
+        self.refusals.close()
         self.outbox.close()
 
     # ---- on the answering lanes: who does not take an answer holds up one of them for a second ----------------------
