@@ -94,13 +94,18 @@ class Port:
             assert time.monotonic() < end, got
         return got[1]
 
-    def metrics(self) -> dict[tuple[str, ...], float]:
-        """Samples by name and values of labels, in their order."""
-        return {
-            (sample.name, *sorted(sample.labels.values())): sample.value
-            for family in text_string_to_metric_families(self.get("metrics")[1])
-            for sample in family.samples
-        }
+    def metrics(self, wanted: tuple[str, ...] | None = None) -> dict[tuple[str, ...], float]:
+        """Samples by name and values of labels, in their order; once `wanted` is one of them."""
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            samples = {
+                (sample.name, *sorted(sample.labels.values())): sample.value
+                for family in text_string_to_metric_families(self.get("metrics")[1])
+                for sample in family.samples
+            }
+            if wanted is None or wanted in samples:
+                return samples
+            assert time.monotonic() < end, sorted(samples)
 
 
 def point(name: str) -> Draft:
@@ -186,7 +191,7 @@ def test_the_metrics_are_what_happened(tmp_path: Path, spawn: Spawn) -> None:
             kitchen.insert(point(f"l{n}"))
         with pytest.raises(Exception, match="l3"):
             kitchen.insert(point("l3"))
-    samples = port.metrics()
+    samples = port.metrics(("factorbus_worker_slots", "w1"))
     of = ("kitchen",)
     assert samples[("factorbus_map_variables", *of)] == samples[("factorbus_steps_total", *of)] == 10
     assert samples[("factorbus_inserts_total", "accepted", *of)] == 10
