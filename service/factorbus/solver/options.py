@@ -35,13 +35,17 @@ class Options:
     settle_tolerance, settle_iterations   the same for a step that is to converge
     last_pose_last  constrain the ordering: the last pose last, the landmarks seen lately right before it
     recent_poses    "lately": from the last so many poses
-    bent            tree: a variable is relinearised when a factor of it is bent by more than this many of the residuals
-                    that factors of the map have on average (MATH §9.6); bent_now: and solved for again at once, in up
-                    to `rounds` rounds, when all that is bent adds more than this share to χ²; trust: where a factor is
-                    bent by more than so many, χ² is looked at, and a step that raised it is replaced
+    bent            tree: a variable with a factor that is bent by more than this many of the residuals that factors of
+                    the map have on average waits to be relinearised (MATH §9.6)
+    bent_soon, bent_most, patience   tree: all that wait are so in the next step when together they add more than this
+                    share to χ², when a factor is bent by more than so many, or when one has waited for so many steps
+    bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share
+    trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
+                    replaced
     look_every, look_moved   tree: it is looked for what is bent every so many steps, and when so much moved since that
                     this may add this share to χ²
-    ripple          tree: δ follows where it is off by more than this many, as above (MATH §9.7)
+    ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
+                    scalars were (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
     backend         "blocks": block multifrontal Cholesky; "cholmod": CHOLMOD on scalars, through scikit-sparse
@@ -62,13 +66,16 @@ class Options:
     settle_iterations: int = 500
     last_pose_last: bool = True
     recent_poses: int = 1
-    bent: float = 0.03
+    bent: float = 0.001
+    bent_soon: float = 5e-4
     bent_now: float = 1e-3
+    bent_most: float = 2.0
+    patience: int = 512
     trust: float = 3.0
     rounds: int = 3
-    look_every: int = 4
-    look_moved: float = 1.0
-    ripple: float = 0.05
+    look_every: int = 8
+    look_moved: float = 0.1
+    ripple: float = 0.1
     recent_steps: int = 3
     split_pivots: int = 24
     split_share: float = 0.5

@@ -36,6 +36,11 @@ class Tree(Arenas):
             options.look_moved,
             options.recent_steps,
         )
+        self.settings[[tl.P_SOON, tl.P_PATIENCE, tl.P_MOST]] = (
+            options.bent_soon,
+            options.patience,
+            options.bent_most,
+        )
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.node: I64 = np.empty((16, tl.N_WIDTH), np.int64)
@@ -48,6 +53,7 @@ class Tree(Arenas):
         self.scalars: F64 = np.zeros((3, 64))
         self.stiff: F64 = np.zeros((16, 4))
         self.lever: F64 = np.empty(16)
+        self.strain: F64 = np.empty(16)
         self.pending: I64 = np.empty(16, np.int64)
         self.changed: I64 = np.empty(16, np.int64)
         self.moved: I64 = np.empty(16, np.int64)
@@ -83,6 +89,7 @@ class Tree(Arenas):
         self.node[free, tl.N_FLAGS] = 1
         self.pending[: free.size] = free
         self.state[tl.S_PENDING] = free.size
+        self.state[tl.S_DUE] = 1
 
     def list_moved(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
@@ -106,7 +113,7 @@ class Tree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + 4) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
+        rows = variables * (tl.N_WIDTH + 5) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
@@ -128,8 +135,9 @@ class Tree(Arenas):
         counts = self._graph.mark()
         variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
         if variables > len(self.node):
-            self.node, self.lever, self.pending, self.changed, self.moved = (
-                grown(array, variables) for array in (self.node, self.lever, self.pending, self.changed, self.moved)
+            self.node, self.lever, self.strain, self.pending, self.changed, self.moved = (
+                grown(array, variables)
+                for array in (self.node, self.lever, self.strain, self.pending, self.changed, self.moved)
             )
         if factors > len(self.link):
             self.link, self.stiff = grown(self.link, factors), grown(self.stiff, factors)

@@ -22,22 +22,25 @@ The arenas of a tree are:
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearised
     lever   (n,) float64     the largest d √ω of what a variable sees
+    strain  (n,) float64     Σ bend² of its factors that are bent, while a variable waits to be relinearised
     pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
                              since they were looked at last
     marked  (c,) int64       scratch: cliques that an elimination touches
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (11,) float64   see P_RIPPLE and so on
+    settings (14,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (4,) float64     what a step found
 """
 
 # The arenas of a tree in its table (`places`).
 ARENAS = (
-    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "lever", "pending",
+    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "lever", "strain",
+    "pending",
     "changed", "moved", "marked", "saved", "state", "account",
 )  # fmt: skip
 (
-    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_LEVER, T_PENDING,
+    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_LEVER, T_STRAIN,
+    T_PENDING,
     T_CHANGED, T_MOVED, T_MARKED, T_SAVED, T_STATE, T_ACCOUNT,
 ) = range(len(ARENAS))  # fmt: skip
 
@@ -131,15 +134,17 @@ S_CHANGED_BEFORE = 31  # S_CHANGED of the step before, for when this one fails
 S_CYCLES = 32  # of the phases of the last step, PHASES of them
 S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
+S_WAITING = 42  # the step since when any variable waits to be relinearised
+S_DUE = 43  # 1: what waits is relinearised in the next step
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
 DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
 
 # Settings of a step.
-P_RIPPLE = 0  # in units of (9.6): how far a separator moves before its clique is solved again
-P_BENT = 1  # what is bent by more is relinearised in the next step
-P_BENT_NOW = 2  # or at once, where all that is bent adds more than this share to χ²
+P_RIPPLE = 0  # in units of (9.17): how far a separator moves before its clique is solved again
+P_BENT = 1  # what is bent by more waits to be relinearised
+P_BENT_NOW = 2  # it is so at once, where all that is bent adds more than this share to χ²
 P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
 P_EVERY = 5  # so many steps apart it is looked for what is bent
@@ -148,7 +153,10 @@ P_RECENT = 7  # variables with a factor in the last so many steps go last
 P_ROUNDS = 8  # eliminations in a step, at most
 P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
 P_LOOK = 10  # and where what moved since may have bent by this share of χ²
-P_SIZE = 11
+P_SOON = 11  # and in the next step where it adds more than this share,
+P_PATIENCE = 12  # has waited for so many steps,
+P_MOST = 13  # or something is bent by more than this
+P_SIZE = 14
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

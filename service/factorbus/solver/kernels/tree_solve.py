@@ -20,8 +20,6 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-FINE = 0.1
-
 
 @part
 def substitute(
@@ -150,38 +148,41 @@ def move_frontals(
 @part
 def find_bent(
     settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
-    scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
+    scalars: F64, values: F64, strain: F64, pending: I64, moved: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
-    """Add to `pending` what is to be relinearised, and empty `moved`; gives what `look` does.
-
-    Where that cannot wait, (9.16), all that is bent by FINE of the threshold goes along: what is relinearised alone
-    bends its neighbours, and each round would have to take in some more.
+    """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
+    what moved, and Σ bend² of all that waits.
     """
+    if state[tl.S_PENDING] == 0:
+        state[tl.S_WAITING] = state[tl.S_STEP]
     bent = settings[tl.P_BENT]
-    most, strain = look(
-        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, pending, moved, state
+    most = look(
+        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, strain, pending, moved, state
     )  # fmt: skip
-    if strain > settings[tl.P_BENT_NOW]:
-        look(FINE * bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, pending, moved, state)
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED] = 0
-    return most, strain
+    total, waited = 0.0, state[tl.S_STEP] - state[tl.S_WAITING]
+    for k in range(state[tl.S_PENDING]):
+        total += strain[pending[k]]
+    if total > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
+        state[tl.S_DUE] = 1
+    return most, total
 
 
 @part
 def look(
     bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
-    scalars: F64, values: F64, pending: I64, moved: I64, state: I64,
-) -> tuple[float, float]:  # fmt: skip
+    scalars: F64, values: F64, strain: F64, pending: I64, moved: I64, state: I64,
+) -> float:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
     more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.13), and both ends of
-    one for which that is computed, (9.11).  Gives the largest bend, and Σ bend² of those bent by more than `bent`.
+    one for which that is computed, (9.11).  strain: gets Σ bend² of each.  Gives the largest bend.
     """
-    most, strain, delta = 0.0, 0.0, scalars[0]
+    most, delta = 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
         v = moved[k]
-        phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
+        pull, phi = 0.0, turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
         if phi == 0.0 and state[tl.S_EXACT] == 0:
             continue
         planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
@@ -193,7 +194,7 @@ def look(
                 bend = exact_bend(f, var, fac, lin, values, payload, delta)
                 most = max(most, bend)
                 if bend > bent:
-                    strain += 0.5 * bend * bend  # half of it for each end
+                    pull += 0.5 * bend * bend  # half of it for each end
                     await_ends(f, fac, var, node, pending, state)
             elif slot % 2 == 0 and phi > 0.0 and y >= 0:
                 d, root, shift = stiff[f, 0], stiff[f, 1], shift_between(planar, x, y, values, lin)
@@ -203,13 +204,14 @@ def look(
                     slip = slip_between(kind, payload, fac[f, at.F_AT], x, y, root, d, shift, values, hessian, h)
                 most = max(most, bend + slip)
                 if bend + slip > bent:
-                    strain += (bend + slip) * (bend + slip)
+                    pull += (bend + slip) * (bend + slip)
                     await_move(v, node, pending, state)
                     both = kind == at.BEARING_RANGE_SE2 or slip > bend
                     if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
                         await_move(link[f, tl.L_SECOND], node, pending, state)
             slot = next_incidence(slot, link)
-    return most, strain
+        strain[v] = pull
+    return most
 
 
 @inline_kernel

@@ -56,7 +56,8 @@ def tree_step(graph: I64, tree: I64) -> int:
     node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
     lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
     lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
-    lever, pending, changed = floats(tree, tl.T_LEVER), ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
+    lever, strain = floats(tree, tl.T_LEVER), floats(tree, tl.T_STRAIN)
+    pending, changed = ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
     moved, marked, saved = ints(tree, tl.T_MOVED), ints(tree, tl.T_MARKED), float_rows(tree, tl.T_SAVED)
     state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
@@ -69,38 +70,35 @@ def tree_step(graph: I64, tree: I64) -> int:
         account[tl.A_BEND] = 0.0
     unit = residual_unit(f1, account)
     scaled = settings.copy()
-    scaled[tl.P_RIPPLE] *= unit
+    scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     scaled[tl.P_BENT] *= unit
+    scaled[tl.P_MOST] *= unit
     scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1)  # a share of χ²
+    scaled[tl.P_SOON] *= unit * unit * max(f1, 1)
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = old = state[tl.S_FIRST_NEW]
-    take_in_variables(v1, var, values, node, lin, scalars, lever, state)
+    take_in_variables(v1, var, values, node, lin, scalars, lever, strain, state)
     if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state):
         undo(v0, var, fac, node, link, scalars, lever, saved, state)
         return tl.INFINITE
-    wait = state[tl.S_WAIT] != 0
     while True:
-        if not wait and state[tl.S_PENDING] > 0:
-            some = pending[: state[tl.S_PENDING]]
-            relinearise(some, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, state)
+        moving = pending[: count_due(state)]
+        if moving.size > 0:
+            relinearise(moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, state)
         lap(began, tl.LINEARISE, state)
-        bow, strain, status = eliminate_again(
-            v0, v1, f1, wait, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, lever, pending, changed, moved, marked, state, account,
+        bow, pull, status = eliminate_again(
+            v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
+            scalars, stiff, lever, strain, pending, changed, moved, marked, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
         began = cycles()
         if status == tl.FAILED:
-            relinearised = False
-            if not wait:
-                some = pending[: state[tl.S_PENDING]]
-                relinearised = some.size > 0
-                go_back(some, var, fac, payload, node, link, hessian, lin, scalars, stiff, state)
+            if moving.size > 0:
+                go_back(moving, var, fac, payload, node, link, hessian, lin, scalars, stiff, state)
             if state[tl.S_ROUNDS] > 0:
                 break
-            if relinearised:
-                wait = True
+            if moving.size > 0:
                 state[tl.S_WAIT] = 1
                 continue
             undo(v0, var, fac, node, link, scalars, lever, saved, state)
@@ -109,7 +107,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        if wait or not strain > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
+        if state[tl.S_WAIT] != 0 or not pull > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
     state[tl.S_TOLD] = count_differing(old, v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
@@ -131,25 +129,31 @@ def residual_unit(factors: int, account: F64) -> float:
     return math.sqrt((max(account[tl.A_CHI2], 0.0) + LEAST_CHI2) / max(factors, 1))
 
 
+@inline_kernel
+def count_due(state: I64) -> int:
+    """How many of the variables that wait are relinearised now: all or none."""
+    due = state[tl.S_WAIT] == 0 and (state[tl.S_DUE] != 0 or state[tl.S_ROUNDS] > 0)
+    return state[tl.S_PENDING] if due else 0
+
+
 @part
 def eliminate_again(
-    v0: int, v1: int, f1: int, wait: bool, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
+    v0: int, v1: int, f1: int, moving: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
-    pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
+    strain: F64, pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Steps 3 to 8; gives the largest bend of what moved, Σ bend² of what is bent, and the status."""
+    """Steps 3 to 8; gives the largest bend of what moved, Σ bend² of what waits, and the status."""
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
     count = 0
     for f in range(state[tl.S_TAKEN], f1):
         count = touch_ends(f, fac, node, clique, state, marked, count)
-    if not wait:
-        for k in range(state[tl.S_PENDING]):
-            slot = node[pending[k], tl.N_ADJ]
-            while slot >= 0:
-                count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
-                slot = next_incidence(slot, link)
+    for k in range(moving.size):
+        slot = node[moving[k], tl.N_ADJ]
+        while slot >= 0:
+            count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
+            slot = next_incidence(slot, link)
     marked = marked[:count]
     room = v1 - v0
     hanging = 0
@@ -179,7 +183,7 @@ def eliminate_again(
         lowest = find_lowest(place, orphans, node, clique, lists, state)
     else:
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
-        drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and (wait or state[tl.S_PENDING] == 0)
+        drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0
         last = find_newest(v1, var) if drives_on else -1
         perm = order_affected(
             n, affected, factors, orphans, int(settings[tl.P_RECENT]), last, var, fac, node, clique, lists, state
@@ -216,27 +220,29 @@ def eliminate_again(
         var, fac, node, link, clique, lists, numbers, state, account,
     )  # fmt: skip
     add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
-    if not wait:
-        for k in range(state[tl.S_PENDING]):
-            node[pending[k], tl.N_FLAGS] = FREE
-            node[pending[k], tl.N_LINEARISED] = state[tl.S_STEP]
-        state[tl.S_PENDING] = 0
+    for k in range(moving.size):
+        v = moving[k]
+        node[v, tl.N_FLAGS], node[v, tl.N_LINEARISED] = FREE, state[tl.S_STEP]
+        strain[v] = 0.0
+    if moving.size > 0:
+        state[tl.S_PENDING] = state[tl.S_DUE] = 0
     now = lap(now, tl.COMMIT, state)
     # 8
     substitute(
         ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, lever, values, changed, moved,
         state, account,
     )  # fmt: skip
-    bow = strain = 0.0
+    bow = pull = 0.0
     # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
     if due or account[tl.A_ALARM] > settings[tl.P_LOOK]:
-        bow, strain = find_bent(
-            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, pending, moved, state
-        )
+        bow, pull = find_bent(
+            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, strain, pending, moved,
+            state,
+        )  # fmt: skip
         account[tl.A_ALARM] = 0.0
     lap(now, tl.SUBSTITUTE, state)
-    return bow, strain, tl.DONE
+    return bow, pull, tl.DONE
 
 
 @inline_kernel

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 
 @part
 def take_in_variables(
-    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, lever: F64, state: I64
+    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, lever: F64, strain: F64, state: I64
 ) -> None:
     """Variables up to v1 get a row each; they are linearised at their first values."""
     for v in range(state[tl.S_VARIABLES], v1):
@@ -29,7 +29,7 @@ def take_in_variables(
         if d >= 0:
             for a in range(dim_of_variable(var, v)):
                 scalars[0, d + a] = scalars[1, d + a] = 0.0
-        lever[v] = 0.0
+        lever[v] = strain[v] = 0.0
     state[tl.S_VARIABLES] = v1
 
 
