@@ -78,10 +78,9 @@ def keep_root(n: int, affected: I64, var: I64) -> tuple:
 @inline_kernel
 def row_layout(p: int, m: int) -> tuple:
     """(offset of the rows in their block, stride, offset of the used δ, size of the block)."""
-    lead = fr.padded(p) - p
+    ahead = fr.padded(p + m)
     stride = fr.row_stride(fr.padded(p) + m + 1)
-    used = p * stride + fr.LANES
-    return lead, stride, used, used + p + m
+    return ahead + fr.padded(p) - p, stride, 0, ahead + p * stride + fr.LANES
 
 
 @inline_kernel
