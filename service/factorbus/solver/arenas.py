@@ -16,21 +16,31 @@ class Arenas:
 
     ARENAS: ClassVar[tuple[str, ...]] = ()
     _places: I64 | None = None
+    _stale: tuple[str, ...] = ()  # assigned since the table was brought up to date
 
     def __setattr__(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
         if name in self.ARENAS:
-            object.__setattr__(self, "_places", None)
+            object.__setattr__(self, "_stale", (*self._stale, name))
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies: what has other arrays needs another table."""
-        return {name: value for name, value in vars(self).items() if name != "_places"}
+        return {name: value for name, value in vars(self).items() if name not in ("_places", "_stale")}
 
     def places(self) -> I64:
         """The table, as `kernels.places` reads it; it is of use until an array is assigned.  Raises TypeError."""
-        if self._places is None:
-            self._places = np.array([_placed(name, getattr(self, name)) for name in self.ARENAS], np.int64).ravel()
-        return self._places
+        table = self._places
+        return self._brought_up() if table is None or self._stale else table
+
+    def _brought_up(self) -> I64:
+        table, names = self._places, self._stale
+        if table is None:
+            table, names = np.empty(WIDTH * len(self.ARENAS), np.int64), self.ARENAS
+        for name in names:  # those that changed, and no others: a row takes 3 µs, and maps grow while they are small
+            first = WIDTH * self.ARENAS.index(name)
+            table[first : first + WIDTH] = _placed(name, getattr(self, name))
+        self._places, self._stale = table, ()
+        return table
 
 
 def _placed(name: str, array: np.ndarray) -> tuple[int, ...]:

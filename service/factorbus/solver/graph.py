@@ -21,27 +21,29 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.move import gather
-from factorbus.solver.rows import Rows, Span
+from factorbus.solver.rows import Rows
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 Mark: TypeAlias = tuple[int, ...]
+
+_FEW_PAGES = 1 << 16  # bytes
 
 
 class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = at.ARENAS
-    NOT_KEPT = ("_rows", "_places")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "_places", "_stale")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
-        self.keys: I64 = np.empty(16, np.int64)
-        self.var: I64 = np.empty((16, at.V_WIDTH), np.int64)
-        self.dims: I64 = np.empty(16, np.int64)
-        self.values: F64 = np.zeros(64)
-        self.fac: I64 = np.empty((16, at.F_WIDTH), np.int64)
-        self.payload: F64 = np.empty(256)
+        self.keys: I64 = np.empty(64, np.int64)
+        self.var: I64 = np.empty((64, at.V_WIDTH), np.int64)
+        self.dims: I64 = np.empty(64, np.int64)
+        self.values: F64 = np.zeros(256)
+        self.fac: I64 = np.empty((128, at.F_WIDTH), np.int64)
+        self.payload: F64 = np.empty(2048)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
-        self.table: I64 = np.zeros(64, np.int64)
+        self.table: I64 = np.zeros(256, np.int64)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
         self._rows = Rows()
@@ -135,19 +137,14 @@ class Graph(Arenas):
     def variables(self, picked: I64 | None = None) -> list[Group]:
         """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness."""
         if picked is None:
-            spans = self._rows.follow(self.var, int(self.counts[at.VARIABLES]))
+            spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
+            keys, values = self.keys, self.values
             return [
-                self._side_by_side(span) if span.together else self._gathered(span.label, span.rows()) for span in spans
+                span.group(keys, values) if span.together else self._gathered(span.label, span.rows()) for span in spans
             ]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
         return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
-
-    def _side_by_side(self, span: Span) -> Group:
-        """The group of all variables with one label, where no others are between them: their values neither."""
-        first, behind, size, start = span.first, span.behind, span.size, span.start
-        values = self.values[start : start + (behind - first) * size].copy().reshape(-1, size)
-        return Group(span.kind, self.keys[first:behind].copy(), values, span.fixed)
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
@@ -195,10 +192,18 @@ class Graph(Arenas):
 
 
 def grown(array: np.ndarray, need: int) -> np.ndarray:
-    """A copy with room for at least `need` rows, twice as many as before where that is more; the new room is zero."""
-    larger = np.zeros((max(need, 2 * len(array)), *array.shape[1:]), array.dtype)
+    """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
+    larger = np.zeros((roomy(need, len(array), array.nbytes), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
+
+
+def roomy(need: int, size: int, size_bytes: int) -> int:
+    """How long to make an array of `size` that is to have `need`: four times what it is, or twice if that is much.
+
+    To find that there is no room, and begin again, takes longer than to copy a few pages.
+    """
+    return max(need, (4 if size_bytes < _FEW_PAGES else 2) * size)
 
 
 def table_size(entries: int) -> int:

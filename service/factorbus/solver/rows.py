@@ -1,13 +1,19 @@
 """Which variables are of which kind, fixed or free: lists that follow a graph as it grows and forgets."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
+from factorbus.solver.groups import Group
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
+_NO_KEYS: I64 = np.empty(0, np.int64)
+_NO_VALUES: F64 = np.empty(0)
+_KIND, _COLUMN = at.V_KIND, at.V_COLUMN
+_new = tuple.__new__
 _FEW = 8  # for so many loops in NumPy cost more than in Python
 
 
@@ -18,25 +24,41 @@ class Span:
     behind the last.  start: where the value of the first begins.  kind, size, fixed: of all of them.
     """
 
-    __slots__ = ("_rows", "behind", "count", "first", "fixed", "kind", "label", "size", "start", "together")
+    __slots__ = (
+        "_keys", "_keys_seen", "_rows", "_values", "_values_seen",
+        "behind", "count", "first", "fixed", "kind", "label", "size", "start", "together",
+    )  # fmt: skip
 
     def __init__(self, label: int, first: int, start: int) -> None:
         kind, self.label = VARIABLE_KIND_OF_CODE[label // 2], label
         self.kind, self.size, self.fixed = kind.name, kind.size, bool(label % 2)
         self.first, self.behind, self.start, self.count, self.together = first, first, start, 0, True
         self._rows: I64 = np.empty(0, np.int64)  # not while together
+        self._keys, self._keys_seen = _NO_KEYS, _NO_KEYS
+        self._values, self._values_seen = _NO_VALUES, _NO_VALUES
+
+    def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        """For copies: their arenas are others."""
+        own = {name: getattr(self, name) for name in self.__slots__}
+        return None, own | {"_keys_seen": _NO_KEYS, "_values_seen": _NO_VALUES}
+
+    def group(self, keys: I64, values: F64) -> Group:
+        """Copies of their keys and values, while they are together: then no others are between them."""
+        if self._keys_seen is not keys or self._values_seen is not values:
+            self._look_at(keys, values)
+        count = self.count
+        # By no call that Python would have to bind the fields for: a robot asks for this after every step.
+        return _new(Group, (self.kind, self._keys[:count].copy(), self._values[:count].copy(), self.fixed))
+
+    def _look_at(self, keys: I64, values: F64) -> None:
+        """Remember these arenas from the first of them on: to shape them takes as long as to copy a hundred values."""
+        self._keys, self._keys_seen = keys[self.first :], keys
+        whole = (values.size - self.start) // self.size * self.size
+        self._values, self._values_seen = values[self.start : self.start + whole].reshape(-1, self.size), values
 
     def rows(self) -> I64:
         """The indices."""
         return np.arange(self.first, self.behind) if self.together else self._rows[: self.count]
-
-    def append(self, v: int) -> None:
-        """One more, behind all others."""
-        if self.together and v == self.behind:
-            self.behind = v + 1
-            self.count += 1
-        else:
-            self.extend(np.array([v]))
 
     def extend(self, found: I64) -> None:
         """More of them, ascending, behind all others; one at least."""
@@ -83,7 +105,13 @@ class Rows:
         else:
             for v in range(self._seen, variables):
                 row = var[v].tolist()
-                self._span(2 * row[at.V_KIND] + (row[at.V_COLUMN] < 0), row, v).append(v)
+                label = 2 * row[_KIND] + (row[_COLUMN] < 0)
+                span = self._spans.get(label) or self._span(label, row, v)
+                if span.together and v == span.behind:
+                    span.behind = v + 1
+                    span.count += 1
+                else:
+                    span.extend(np.array([v]))
         self._seen = variables
         return self._spans.values()
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from factorbus.solver import pages
 from factorbus.solver.arenas import Arenas
-from factorbus.solver.graph import Graph, grown
+from factorbus.solver.graph import Graph, grown, roomy
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
@@ -24,7 +24,7 @@ class Tree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = tl.ARENAS
-    NOT_KEPT = ("_graph", "settings", "marked", "_places")
+    NOT_KEPT = ("_graph", "settings", "marked", "_places", "_stale")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph = graph
@@ -43,21 +43,21 @@ class Tree(Arenas):
         )
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
-        self.node: I64 = np.empty((16, tl.N_WIDTH), np.int64)
-        self.link: I64 = np.empty((16, tl.L_WIDTH), np.int64)
-        self.clique: I64 = np.empty((16, tl.C_WIDTH), np.int64)
-        self.lists: I64 = np.empty(256, np.int64)
+        self.node: I64 = np.empty((64, tl.N_WIDTH), np.int64)
+        self.link: I64 = np.empty((128, tl.L_WIDTH), np.int64)
+        self.clique: I64 = np.empty((64, tl.C_WIDTH), np.int64)
+        self.lists: I64 = np.empty(1024, np.int64)
         self.numbers: F64 = pages.zeros(4096)
-        self.hessian: F64 = np.empty(1024)
-        self.lin: F64 = np.empty((3, 64))
-        self.scalars: F64 = np.zeros((3, 64))
-        self.stiff: F64 = np.zeros((16, 4))
-        self.lever: F64 = np.empty(16)
-        self.strain: F64 = np.empty(16)
-        self.pending: I64 = np.empty(16, np.int64)
-        self.changed: I64 = np.empty(16, np.int64)
-        self.moved: I64 = np.empty(16, np.int64)
-        self.marked: I64 = np.empty(16, np.int64)
+        self.hessian: F64 = np.empty(8192)
+        self.lin: F64 = np.empty((3, 256))
+        self.scalars: F64 = np.zeros((3, 256))
+        self.stiff: F64 = np.zeros((128, 4))
+        self.lever: F64 = np.empty(64)
+        self.strain: F64 = np.empty(64)
+        self.pending: I64 = np.empty(64, np.int64)
+        self.changed: I64 = np.empty(64, np.int64)
+        self.moved: I64 = np.empty(64, np.int64)
+        self.marked: I64 = np.empty(64, np.int64)
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.account: F64 = np.zeros(tl.A_SIZE)
@@ -127,7 +127,7 @@ class Tree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            pages.enlarge(self, "numbers", max(need, 2 * self.numbers.size))
+            pages.enlarge(self, "numbers", roomy(need, self.numbers.size, self.numbers.nbytes))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 
     def _make_room_for_graph(self) -> None:
@@ -153,7 +153,7 @@ class Tree(Arenas):
 
 
 def _widened(array: F64, need: int) -> F64:
-    """A copy with columns for at least `need`, twice as many as before where that is more."""
-    wider = np.zeros((len(array), max(need, 2 * array.shape[1])))
+    """A copy with columns for at least `need`, and more for the next ones."""
+    wider = np.zeros((len(array), roomy(need, array.shape[1], array.nbytes)))
     wider[:, : array.shape[1]] = array
     return wider

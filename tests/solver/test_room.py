@@ -1,0 +1,92 @@
+"""Arenas that have to grow at almost every step, in the midst of it too, lead to the same bits."""
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from naive.random_graphs import random_steps
+
+from factorbus.solver import Group, Solver, errors
+from factorbus.solver.graph import Graph, roomy
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.tree import Tree
+
+GRAPH = {"keys": 1, "var": 1, "dims": 1, "values": 7, "fac": 1, "payload": 28}
+TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "lever": 1, "pending": 1}
+TREE |= {"strain": 1, "changed": 1, "moved": 1, "marked": 1}
+
+
+def cramped() -> Solver:
+    """A solver that has room for one variable and one factor."""
+    solver = Solver()
+    assert solver._tree
+    for thing, sizes in ((solver._graph, GRAPH), (solver._tree.tree, TREE)):
+        for name, size in sizes.items():
+            setattr(thing, name, getattr(thing, name)[:size].copy())
+    for name in ("lin", "scalars"):
+        setattr(solver._tree.tree, name, getattr(solver._tree.tree, name)[:, :7].copy())
+    solver._graph.table = np.zeros(2, np.int64)
+    return solver
+
+
+def bits(groups: list[Group]) -> list[tuple[str, bytes, bytes, bool]]:
+    return [(g.kind, g.keys.tobytes(), g.values.tobytes(), g.fixed) for g in groups]
+
+
+def account(report: Any) -> dict[str, Any]:
+    told = report.as_dict()
+    return {name: told[name] for name in told.keys() - {"phases_ms", "step_ms", "compiled_ms"}}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("factorbus.solver.graph.roomy", lambda need, _size, _bytes: need)
+    monkeypatch.setattr("factorbus.solver.tree.roomy", lambda need, _size, _bytes: need)
+    grown, make_room = list[int](), Tree._make_room
+    monkeypatch.setattr(Tree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
+    tight, wide = cramped(), Solver()
+    for n, batch in enumerate(random_steps(seed, steps=60)):
+        assert tight.stage(batch) == wide.stage(batch)
+        assert account(tight.step()) == account(wide.step()), f"step {n}"
+        assert bits(tight.estimate()) == bits(wide.estimate())
+    assert len(grown) > 60
+
+
+def test_what_is_small_grows_by_more() -> None:
+    assert roomy(70, 64, 512) == 256
+    assert roomy(300, 64, 512) == 300
+    assert roomy(1 << 14, 1 << 13, 1 << 16) == 1 << 14
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda graph: pickle.loads(pickle.dumps(graph))])
+def test_a_copy_of_a_graph_gives_its_own_values(again: Any) -> None:
+    solver = Solver()
+    for batch in random_steps(1, steps=5):
+        solver.stage(batch)
+        solver.step()
+    solver.estimate()
+    other: Graph = again(solver._graph)
+    other.values += 1.0
+    told = np.concatenate([group.values.ravel() for group in other.variables()])
+    assert sorted(told) == sorted(other.values[: other.counts[at.VALUES]])
+
+
+def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None:
+    first, second, *_ = random_steps(2, steps=3)
+    solver = Solver()
+    solver.stage(first)
+    solver.step()
+    held = solver.estimate()
+    before = bits(held)
+    for group in held:
+        group.values[...] = np.nan
+        group.keys[...] = -7
+    assert bits(solver.estimate()) == before
+    solver.stage(second)
+    assert bits(solver.estimate()) != before
+    solver._graph.forget(solver._tree._mark)  # type: ignore[union-attr]
+    assert bits(solver.estimate()) == before
+    with pytest.raises(errors.DuplicateVariable):
+        solver.stage(first)
