@@ -7,7 +7,7 @@ Every factor is looked at no more than three times, in whatever order they come.
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.se2 import (
     compose_inverse_se2,
     compose_se2,
@@ -29,6 +29,22 @@ def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: 
     Variables before v0 are reached.  With `compose` the first factor that reaches a variable gives it its value.
     Gives the first variable that is not reached, or −1.
     """
+    f = f0
+    while f < f1 and follow(compose, f, v0, var, fac, values, payload, reached) != _WAITS:
+        f += 1
+    if f < f1:
+        reach_on(compose, v0, f, f1, var, fac, values, payload, reached)
+    for v in range(reached.size):
+        if reached[v] == 0:
+            return v0 + v
+    return -1
+
+
+@part
+def reach_on(
+    compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64
+) -> None:
+    """The same from the first factor that has to wait."""
     n = reached.size
     head, tail = np.full(n, -1), np.full(n, -1)  # per variable: the factors that wait for it
     after = np.full(2 * (f1 - f0), -1)  # 2 (f − f0) + end: the next in that list
@@ -58,10 +74,6 @@ def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: 
                     queue[todo] = new
                     todo += 1
                 slot = after[slot]
-    for v in range(n):
-        if reached[v] == 0:
-            return v0 + v
-    return -1
 
 
 @inline_kernel

@@ -25,32 +25,38 @@ def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: 
 
     Goes on while a step lowers the χ² of those factors, and by more than `least` and a thousandth of it.
     """
-    M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
     for v in range(v0, v1):
-        if var[v, at.V_COLUMN] < 0 or not is_seen_twice(v, f0, f1, fac):
-            continue
-        x, kind = var[v, at.V_AT], var[v, at.V_KIND]
-        dim, size = dim_of(kind), size_of(kind)
-        chi2 = gather_system(v, f0, f1, var, fac, values, payload, M, z)
-        for _ in range(_ITERATIONS):
-            if not chi2 > least or cholesky(dim, M, z) >= 0:
-                break
-            for i in range(dim - 1, -1, -1):
-                step[i] = z[i]
-                for j in range(i + 1, dim):
-                    step[i] -= M[i, j] * step[j]
-                step[i] /= M[i, i]
+        if var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, fac):
+            settle(v, f0, f1, least, var, fac, values, payload)
+
+
+@part
+def settle(v: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F64, payload: F64) -> None:
+    """The same for one variable."""
+    M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
+    r, H, W = np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6))
+    x, kind = var[v, at.V_AT], var[v, at.V_KIND]
+    dim, size = dim_of(kind), size_of(kind)
+    chi2 = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+    for _ in range(_ITERATIONS):
+        if not chi2 > least or cholesky(dim, M, z) >= 0:
+            break
+        for i in range(dim - 1, -1, -1):
+            step[i] = z[i]
+            for j in range(i + 1, dim):
+                step[i] -= M[i, j] * step[j]
+            step[i] /= M[i, i]
+        for c in range(size):
+            before[c] = values[x + c]
+        move_one(kind, values, x, step)
+        reached = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+        if not reached <= chi2:
             for c in range(size):
-                before[c] = values[x + c]
-            move_one(kind, values, x, step)
-            reached = gather_system(v, f0, f1, var, fac, values, payload, M, z)
-            if not reached <= chi2:
-                for c in range(size):
-                    values[x + c] = before[c]
-                break
-            gained, chi2 = chi2 - reached, reached
-            if gained <= least + 1e-3 * chi2:
-                break
+                values[x + c] = before[c]
+            break
+        gained, chi2 = chi2 - reached, reached
+        if gained <= least + 1e-3 * chi2:
+            break
 
 
 @inline_kernel
@@ -66,9 +72,13 @@ def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
 
 
 @part
-def gather_system(v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, M: F64, z: F64) -> float:
-    """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ²."""
-    r, H, W = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros((6, 6))
+def gather_system(
+    v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, H: F64, W: F64, M: F64, z: F64
+) -> float:
+    """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ².
+
+    scratch  r (7,), H (2, 6, 6), W (6, 6)
+    """
     width, chi2 = dim_of(var[v, at.V_KIND]), 0.0
     M[:, :], z[:] = 0.0, 0.0
     for f in range(f0, f1):
