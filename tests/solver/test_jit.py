@@ -138,6 +138,40 @@ def test_an_index_out_of_bounds_in_a_part_of_a_part_is_told(kernels):
         assert "IndexError" in checked.stderr
 
 
+INDICES = """
+import numba
+from kernels import _jit
+
+@_jit.inline_kernel
+def last(a):
+    return a[-1] + a[1:-1].sum()
+
+@_jit.kernel("float64(float64[::1], int64)")
+def entry(a, k):
+    return a[k] if k < a.size else last(a)
+
+@numba.njit
+def foreign(a, k):
+    return a[k]
+"""
+TAKE_INDICES = """
+import numpy as np
+from kernels import indices
+a = np.arange(8.0)
+print(indices.entry(a[1:], 2), indices.entry(a, 8), indices.foreign(a[1:], -1), indices.foreign(a, -2))
+print(indices.entry(a[1:], -1))
+"""
+
+
+def test_only_a_constant_counts_from_the_end_and_only_in_our_kernels(kernels):
+    (kernels / "indices.py").write_text(INDICES)
+    done = run(kernels, TAKE_INDICES)
+    assert (done.stdout, done.stderr) == ("3.0 28.0 7.0 6.0\n0.0\n", "")
+    checked = run(kernels, TAKE_INDICES, NUMBA_BOUNDSCHECK="1")
+    assert checked.stdout == "3.0 28.0 7.0 6.0\n"
+    assert "IndexError" in checked.stderr
+
+
 def test_a_kernel_shows_others_nothing_of_its_parts(kernels):
     (kernels / "parts.py").write_text(PARTS.format(last=2))
     done = run(kernels, LIST_SYMBOLS)

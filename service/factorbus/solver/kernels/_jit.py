@@ -14,6 +14,10 @@ stale kernel after a callee in another file was edited.  Hence the rule: a kerne
 and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
 rule for that one.
 
+An index is 0 or more, or a constant that is written where it is used, as in `a[-1]`; ends of slices may be anything.
+Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.
+With every index checked they are errors.
+
 FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).
 NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
 """
@@ -45,6 +49,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
 __all__ = [
@@ -85,14 +90,33 @@ _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 _NO_MATTER = {"NUMBA_NUM_THREADS", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"}
 _KEPT_FOLDERS = 6
 
+_from_the_end = arrayobj.fix_integer_index
 
-class _Borrowing(Lower):
-    """Arrays that a function is given belong to its caller, who keeps them until it returns: it counts no references.
+
+def _fix_integer_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """In our own code only constants count from the end."""
+    constant = isinstance(kind, types.IntegerLiteral) or isinstance(index, ir.Constant)
+    if constant or not getattr(builder.module, "factorbus", False):
+        return _from_the_end(context, builder, kind, index, size)
+    return context.cast(builder, index, kind, types.intp)
+
+
+arrayobj.fix_integer_index = _fix_integer_index
+
+
+class _OurLower(Lower):
+    """The code of our functions: it says that it is, and borrows arrays.
+
+    Arrays that a function is given belong to its caller, who keeps them until it returns: it counts no references.
 
     Numba counts one more and one less for each row or block of them that is looked at, by atomic operations: up to
     four fifths of the time of short kernels.  A function that gives back an array may give back one that it was given,
     so such a one does count.
     """
+
+    def pre_lower(self) -> None:
+        super().pre_lower()
+        self.module.factorbus = True
 
     def lower_assign(self, ty: Any, inst: Any) -> Any:
         given = inst.value
@@ -117,7 +141,7 @@ class _Lowering(NativeLowering):
 
     @property
     def lowering_class(self) -> type[Lower]:
-        return _Borrowing
+        return _OurLower
 
 
 class _PartLibrary(JITCodeLibrary):
@@ -141,11 +165,13 @@ class _KernelLibrary(JITCodeLibrary):
         _add_linked(self._linking_libraries, library)
 
     def _optimize_final_module(self) -> None:
-        """Then what the kernel calls is its own: nothing of another kernel is taken for it, whatever came first."""
-        super()._optimize_final_module()
+        """What the kernel calls is made its own first: nothing of another kernel is taken for it, whatever came before,
+        and LLVM passes no argument that nobody reads.  An array is nine words of them, of which two or three are read.
+        """
         for function in self._final_module.functions:
             if function.linkage == llvmlite.binding.Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = llvmlite.binding.Linkage.internal
+        super()._optimize_final_module()
 
     def _get_module_for_linking(self) -> Any:
         """What is kept on disk beside the machine code, to be linked by others: nobody does, so only the names."""
