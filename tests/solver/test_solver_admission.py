@@ -166,7 +166,7 @@ def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[b
     tree, scratch = tree_of(solver), (tl.N_STAMP, tl.N_LOCAL, tl.N_COLUMN)
     kept, links = np.delete(tree.node[:variables], scratch, axis=1), tree.link[:factors, [tl.L_OWN, tl.L_I, tl.L_AT]]
     scalars = tree.scalars[:2, : solver._graph.counts[at.SCALARS]]
-    return [a.tobytes() for a in (kept, links, tree.lin[0, :values], scalars, tree.lever[:variables])]
+    return [a.tobytes() for a in (kept, links, tree.lin[0, :values], scalars, tree.turns[:variables, tl.U_LEVER])]
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled

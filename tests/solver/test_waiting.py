@@ -38,7 +38,7 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         if due:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
             relinearised += 1
-        share = tree.strain[waiting(tree)].sum() / (tree.account[tl.A_CHI2] + 1e-3)
+        share = tree.turns[waiting(tree), tl.U_STRAIN].sum() / (tree.account[tl.A_CHI2] + 1e-3)
         assert share <= 1.5 * options.bent_soon or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             waited += waiting(tree).size > 0

@@ -70,7 +70,7 @@ class Options:
     bent_soon: float = 5e-4
     bent_now: float = 1e-3
     bent_most: float = 2.0
-    patience: int = 512
+    patience: int = 1000
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 8

@@ -52,8 +52,7 @@ class Tree(Arenas):
         self.lin: F64 = np.empty((3, 256))
         self.scalars: F64 = np.zeros((3, 256))
         self.stiff: F64 = np.zeros((128, 4))
-        self.lever: F64 = np.empty(64)
-        self.strain: F64 = np.empty(64)
+        self.turns: F64 = np.zeros((64, tl.U_WIDTH))
         self.pending: I64 = np.empty(64, np.int64)
         self.changed: I64 = np.empty(64, np.int64)
         self.moved: I64 = np.empty(64, np.int64)
@@ -113,7 +112,7 @@ class Tree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + 5) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
+        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
@@ -135,9 +134,8 @@ class Tree(Arenas):
         counts = self._graph.mark()
         variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
         if variables > len(self.node):
-            self.node, self.lever, self.strain, self.pending, self.changed, self.moved = (
-                grown(array, variables)
-                for array in (self.node, self.lever, self.strain, self.pending, self.changed, self.moved)
+            self.node, self.turns, self.pending, self.changed, self.moved = (
+                grown(array, variables) for array in (self.node, self.turns, self.pending, self.changed, self.moved)
             )
         if factors > len(self.link):
             self.link, self.stiff = grown(self.link, factors), grown(self.stiff, factors)

@@ -98,7 +98,12 @@ def bearing_range_se2(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B:
 @inline_kernel
 def move_se2(x: F64, i: int, step: F64, d: int, out: F64) -> None:
     """out = x ⊞ δ = (t + R δt, wrap(θ + δθ)), both at offset i; δ at offset d.  MATH (2.1)"""
-    c, s = math.cos(x[i + 2]), math.sin(x[i + 2])
+    turn_se2(x, i, math.cos(x[i + 2]), math.sin(x[i + 2]), step, d, out)
+
+
+@inline_kernel
+def turn_se2(x: F64, i: int, c: float, s: float, step: F64, d: int, out: F64) -> None:
+    """The same where c, s = cos θ, sin θ are known."""
     out[i] = x[i] + c * step[d] - s * step[d + 1]
     out[i + 1] = x[i + 1] + s * step[d] + c * step[d + 1]
     out[i + 2] = wrap(x[i + 2] + step[d + 2])

@@ -126,7 +126,7 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
 
 @part
 def weigh_factor(
-    f: int, var: I64, fac: I64, payload: F64, link: I64, hessian: F64, scalars: F64, stiff: F64, lever: F64, W: F64
+    f: int, var: I64, fac: I64, payload: F64, link: I64, hessian: F64, scalars: F64, stiff: F64, turns: F64, W: F64
 ) -> None:
     """Add a factor that was just linearised to what measures δ: the diagonal sums, and how it bends.
 
@@ -142,7 +142,7 @@ def weigh_factor(
             scalars[1, s + a] += hessian[h + a * di + a]
     distance = lever_of(kind, payload, fac[f, at.F_AT])
     root = root_weight(kind, W, distance)
-    lever[i] = max(lever[i], distance * root)
+    turns[i, tl.U_LEVER] = max(turns[i, tl.U_LEVER], distance * root)
     if j >= 0:
         s = var[j, at.V_SCALAR]
         if s >= 0:

@@ -21,8 +21,8 @@ The arenas of a tree are:
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearised
-    lever   (n,) float64     the largest d √ω of what a variable sees
-    strain  (n,) float64     Σ bend² of its factors that are bent, while a variable waits to be relinearised
+    turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; Σ bend² of its factors that are bent,
+                             while it waits to be relinearised; cosine and sine where a plane pose is linearised
     pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
                              since they were looked at last
     marked  (c,) int64       scratch: cliques that an elimination touches
@@ -34,12 +34,12 @@ The arenas of a tree are:
 
 # The arenas of a tree in its table (`places`).
 ARENAS = (
-    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "lever", "strain",
+    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "turns",
     "pending",
     "changed", "moved", "marked", "saved", "state", "account",
 )  # fmt: skip
 (
-    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_LEVER, T_STRAIN,
+    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_TURNS,
     T_PENDING,
     T_CHANGED, T_MOVED, T_MARKED, T_SAVED, T_STATE, T_ACCOUNT,
 ) = range(len(ARENAS))  # fmt: skip
@@ -58,6 +58,9 @@ N_LISTED = 9  # 1: it is in `moved`
 N_COLUMN = 10  # scratch: its column in the clique at hand
 N_LINEARISED = 11  # the last step that gave it a linearisation point
 N_WIDTH = 12
+
+# Columns of `turns`.
+U_LEVER, U_STRAIN, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 3, 4
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable

@@ -8,7 +8,7 @@ from factorbus.solver.kernels._jit import F64, I64, part
 from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import linearise_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
-from factorbus.solver.kernels.tree_take_in import next_incidence
+from factorbus.solver.kernels.tree_take_in import next_incidence, note_turn
 
 WAITS, MOVES = 1, 2
 
@@ -16,7 +16,7 @@ WAITS, MOVES = 1, 2
 @part
 def relinearise(
     pending: I64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64,
-    scalars: F64, stiff: F64, state: I64,
+    scalars: F64, stiff: F64, turns: F64, state: I64,
 ) -> None:  # fmt: skip
     """Move the pending variables to the estimate, and linearise their factors there."""
     for k in range(pending.size):
@@ -28,6 +28,7 @@ def relinearise(
             lin[1, x + a], lin[0, x + a] = lin[0, x + a], values[x + a]
         for a in range(dim_of_variable(var, v)):
             scalars[2, d + a], scalars[0, d + a] = scalars[0, d + a], 0.0
+        note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = MOVES
         state[tl.S_RELINEARISED] += 1
     linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
@@ -36,7 +37,7 @@ def relinearise(
 @part
 def go_back(
     pending: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
-    stiff: F64, state: I64,
+    stiff: F64, turns: F64, state: I64,
 ) -> None:  # fmt: skip
     """Undo `relinearise`: its variables wait again."""
     for k in range(pending.size):
@@ -46,6 +47,7 @@ def go_back(
             lin[0, x + a] = lin[1, x + a]
         for a in range(dim_of_variable(var, v)):
             scalars[0, d + a] = scalars[2, d + a]
+        note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = WAITS
         state[tl.S_RELINEARISED] -= 1
     linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)

@@ -8,7 +8,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.points import move_point2, move_point3
-from factorbus.solver.kernels.se2 import move_se2
+from factorbus.solver.kernels.se2 import turn_se2
 from factorbus.solver.kernels.se3 import move_se3
 from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
@@ -24,7 +24,7 @@ from factorbus.solver.kernels.tree_take_in import next_incidence
 @part
 def substitute(
     ids: I64, ripple: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, lin: F64, scalars: F64,
-    lever: F64, values: F64, changed: I64, moved: I64, state: I64, account: F64,
+    turns: F64, values: F64, changed: I64, moved: I64, state: I64, account: F64,
 ) -> None:  # fmt: skip
     """Solve the new cliques and whatever moves with them.
 
@@ -43,7 +43,7 @@ def substitute(
             row[tl.C_FIRST] = 0
             state[tl.S_SOLVED] += 1
             move_frontals(
-                row, var, node, lists, numbers, scalars, lin[0], lin[2], lever, values, changed, moved, state, account
+                row, var, node, lists, numbers, scalars, lin[0], lin[2], turns, values, changed, moved, state, account
             )
             c = next_clique(row[tl.C_CHILD], c, far, var, clique, lists, numbers, delta, weight)
 
@@ -112,7 +112,7 @@ def solve_rows(row: I64, numbers: F64) -> None:
 
 @inline_kernel
 def move_frontals(
-    row: I64, var: I64, node: I64, lists: I64, numbers: F64, scalars: F64, lin: F64, before: F64, lever: F64,
+    row: I64, var: I64, node: I64, lists: I64, numbers: F64, scalars: F64, lin: F64, before: F64, turns: F64,
     values: F64, changed: I64, moved: I64, state: I64, account: F64,
 ) -> None:  # fmt: skip
     """The estimate of the frontals whose δ is another one."""
@@ -125,7 +125,7 @@ def move_frontals(
         for a in range(dim_of_variable(var, v)):
             gap = load(numbers, solved) - load(delta, d + a)
             differs |= gap != 0.0
-            far += gap * gap * (load(weight, d + a) if a < shifts else lever[v] * lever[v])
+            far += gap * gap * (load(weight, d + a) if a < shifts else turns[v, tl.U_LEVER] * turns[v, tl.U_LEVER])
             put(delta, d + a, load(numbers, solved))
             solved += 1
         if differs:
@@ -140,7 +140,10 @@ def move_frontals(
                 node[v, tl.N_LISTED] = 1
                 moved[state[tl.S_MOVED]] = v
                 state[tl.S_MOVED] += 1
-            move_to(kind, lin, x, delta, d, values)
+            if kind == at.SE2:
+                turn_se2(lin, x, turns[v, tl.U_COS], turns[v, tl.U_SIN], delta, d, values)
+            else:
+                move_to(kind, lin, x, delta, d, values)
             phi = turn_of(kind, delta, d)
             account[tl.A_ALARM] += phi * phi * far  # (9.15)
 
@@ -148,7 +151,7 @@ def move_frontals(
 @part
 def find_bent(
     settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
-    scalars: F64, values: F64, strain: F64, pending: I64, moved: I64, state: I64,
+    scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
     what moved, and Σ bend² of all that waits.
@@ -157,14 +160,14 @@ def find_bent(
         state[tl.S_WAITING] = state[tl.S_STEP]
     bent = settings[tl.P_BENT]
     most = look(
-        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, strain, pending, moved, state
+        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, turns, pending, moved, state
     )  # fmt: skip
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED] = 0
     total, waited = 0.0, state[tl.S_STEP] - state[tl.S_WAITING]
     for k in range(state[tl.S_PENDING]):
-        total += strain[pending[k]]
+        total += turns[pending[k], tl.U_STRAIN]
     if total > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
         state[tl.S_DUE] = 1
     return most, total
@@ -173,11 +176,11 @@ def find_bent(
 @part
 def look(
     bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
-    scalars: F64, values: F64, strain: F64, pending: I64, moved: I64, state: I64,
+    scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
 ) -> float:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
     more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.13), and both ends of
-    one for which that is computed, (9.11).  strain: gets Σ bend² of each.  Gives the largest bend.
+    one for which that is computed, (9.11).  turns: gets Σ bend² of each.  Gives the largest bend.
     """
     most, delta = 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
@@ -210,7 +213,7 @@ def look(
                     if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
                         await_move(link[f, tl.L_SECOND], node, pending, state)
             slot = next_incidence(slot, link)
-        strain[v] = pull
+        turns[v, tl.U_STRAIN] = pull
     return most
 
 
@@ -234,10 +237,8 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 
 @inline_kernel
 def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
-    """out = lin ⊞ δ."""
-    if kind == at.SE2:
-        move_se2(lin, x, delta, d, out)
-    elif kind == at.SE3:
+    """out = lin ⊞ δ, of what is no plane pose."""
+    if kind == at.SE3:
         move_se3(lin, x, delta, d, out)
     elif kind == at.POINT2:
         move_point2(lin, x, delta, d, out)

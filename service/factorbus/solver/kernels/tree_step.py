@@ -56,8 +56,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
     lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
     lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
-    lever, strain = floats(tree, tl.T_LEVER), floats(tree, tl.T_STRAIN)
-    pending, changed = ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
+    turns, pending, changed = float_rows(tree, tl.T_TURNS), ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
     moved, marked, saved = ints(tree, tl.T_MOVED), ints(tree, tl.T_MARKED), float_rows(tree, tl.T_SAVED)
     state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
@@ -77,31 +76,31 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled[tl.P_SOON] *= unit * unit * max(f1, 1)
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = old = state[tl.S_FIRST_NEW]
-    take_in_variables(v1, var, values, node, lin, scalars, lever, strain, state)
-    if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, lever, saved, state):
-        undo(v0, var, fac, node, link, scalars, lever, saved, state)
+    take_in_variables(v1, var, values, node, lin, scalars, turns, state)
+    if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, turns, saved, state):
+        undo(v0, var, fac, node, link, scalars, turns, saved, state)
         return tl.INFINITE
     while True:
         moving = pending[: count_due(state)]
         if moving.size > 0:
-            relinearise(moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, state)
+            relinearise(moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, state)
         lap(began, tl.LINEARISE, state)
         bow, pull, status = eliminate_again(
             v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, lever, strain, pending, changed, moved, marked, state, account,
+            scalars, stiff, turns, pending, changed, moved, marked, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
         began = cycles()
         if status == tl.FAILED:
             if moving.size > 0:
-                go_back(moving, var, fac, payload, node, link, hessian, lin, scalars, stiff, state)
+                go_back(moving, var, fac, payload, node, link, hessian, lin, scalars, stiff, turns, state)
             if state[tl.S_ROUNDS] > 0:
                 break
             if moving.size > 0:
                 state[tl.S_WAIT] = 1
                 continue
-            undo(v0, var, fac, node, link, scalars, lever, saved, state)
+            undo(v0, var, fac, node, link, scalars, turns, saved, state)
             return tl.FAILED
         account[tl.A_BEND] = max(account[tl.A_BEND], bow / unit)
         v0 = v1
@@ -115,9 +114,9 @@ def tree_step(graph: I64, tree: I64) -> int:
 
 
 @part
-def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, lever: F64, saved: F64, state: I64) -> None:
+def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, saved: F64, state: I64) -> None:
     """The tree is as it was before the step."""
-    take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, lever, saved, state)
+    take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, turns, saved, state)
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
@@ -139,8 +138,8 @@ def count_due(state: I64) -> int:
 @part
 def eliminate_again(
     v0: int, v1: int, f1: int, moving: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
-    link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, lever: F64,
-    strain: F64, pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
+    link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
+    pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
 ) -> tuple[float, float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, Σ bend² of what waits, and the status."""
     # 3
@@ -223,13 +222,13 @@ def eliminate_again(
     for k in range(moving.size):
         v = moving[k]
         node[v, tl.N_FLAGS], node[v, tl.N_LINEARISED] = FREE, state[tl.S_STEP]
-        strain[v] = 0.0
+        turns[v, tl.U_STRAIN] = 0.0
     if moving.size > 0:
         state[tl.S_PENDING] = state[tl.S_DUE] = 0
     now = lap(now, tl.COMMIT, state)
     # 8
     substitute(
-        ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, lever, values, changed, moved,
+        ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, turns, values, changed, moved,
         state, account,
     )  # fmt: skip
     bow = pull = 0.0
@@ -237,7 +236,7 @@ def eliminate_again(
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
     if due or account[tl.A_ALARM] > settings[tl.P_LOOK]:
         bow, pull = find_bent(
-            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, strain, pending, moved,
+            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, turns, pending, moved,
             state,
         )  # fmt: skip
         account[tl.A_ALARM] = 0.0

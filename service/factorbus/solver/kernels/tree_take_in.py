@@ -14,7 +14,7 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 
 @part
 def take_in_variables(
-    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, lever: F64, strain: F64, state: I64
+    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, turns: F64, state: I64
 ) -> None:
     """Variables up to v1 get a row each; they are linearised at their first values."""
     for v in range(state[tl.S_VARIABLES], v1):
@@ -29,14 +29,23 @@ def take_in_variables(
         if d >= 0:
             for a in range(dim_of_variable(var, v)):
                 scalars[0, d + a] = scalars[1, d + a] = 0.0
-        lever[v] = strain[v] = 0.0
+        turns[v, tl.U_LEVER] = turns[v, tl.U_STRAIN] = 0.0
+        note_turn(v, var, lin, turns)
     state[tl.S_VARIABLES] = v1
+
+
+@inline_kernel
+def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
+    """Which way a plane pose looks where it is linearised."""
+    if var[v, at.V_KIND] == at.SE2:
+        angle = lin[0, var[v, at.V_AT] + 2]
+        turns[v, tl.U_COS], turns[v, tl.U_SIN] = math.cos(angle), math.sin(angle)
 
 
 @part
 def take_in_factors(
     f1: int, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64, stiff: F64,
-    lever: F64, saved: F64, state: I64,
+    turns: F64, saved: F64, state: I64,
 ) -> bool:  # fmt: skip
     """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
 
@@ -56,10 +65,10 @@ def take_in_factors(
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
         linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1])
-        _save(i, saved[2 * (f - f0)], var, node, scalars, lever)
+        _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
-            _save(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
-        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, lever, W)
+            _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
+        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
         link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
         node[i, tl.N_SEEN] = state[tl.S_STEP]
         if j >= 0:
@@ -71,7 +80,7 @@ def take_in_factors(
 
 @part
 def take_out(
-    v0: int, f0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, lever: F64, saved: F64, state: I64
+    v0: int, f0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, saved: F64, state: I64
 ) -> None:
     """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
     for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
@@ -81,30 +90,30 @@ def take_out(
             state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
         if j >= 0:
             node[j, tl.N_ADJ] = link[f, tl.L_J]
-            _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, lever)
+            _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
         node[i, tl.N_ADJ] = link[f, tl.L_I]
-        _restore(i, saved[2 * (f - f0)], var, node, scalars, lever)
+        _restore(i, saved[2 * (f - f0)], var, node, scalars, turns)
         state[tl.S_HESSIAN] = link[f, tl.L_AT]
     state[tl.S_VARIABLES], state[tl.S_FACTORS] = v0, f0
 
 
 @inline_kernel
-def _save(v: int, out: F64, var: I64, node: I64, scalars: F64, lever: F64) -> None:
+def _save(v: int, out: F64, var: I64, node: I64, scalars: F64, turns: F64) -> None:
     """What a factor is about to change of variable v."""
     d = var[v, at.V_SCALAR]
     if d >= 0:
         for a in range(dim_of_variable(var, v)):
             out[a] = scalars[1, d + a]
-    out[6], out[7] = lever[v], node[v, tl.N_SEEN]
+    out[6], out[7] = turns[v, tl.U_LEVER], node[v, tl.N_SEEN]
 
 
 @inline_kernel
-def _restore(v: int, kept: F64, var: I64, node: I64, scalars: F64, lever: F64) -> None:
+def _restore(v: int, kept: F64, var: I64, node: I64, scalars: F64, turns: F64) -> None:
     d = var[v, at.V_SCALAR]
     if d >= 0:
         for a in range(dim_of_variable(var, v)):
             scalars[1, d + a] = kept[a]
-    lever[v], node[v, tl.N_SEEN] = kept[6], int(kept[7])
+    turns[v, tl.U_LEVER], node[v, tl.N_SEEN] = kept[6], int(kept[7])
 
 
 @inline_kernel
