@@ -14,16 +14,13 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.tree import Tree
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "values": 7, "fac": 1, "payload": 28}
-TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "lever": 1, "pending": 1}
-TREE |= {"strain": 1, "changed": 1, "moved": 1, "marked": 1}
-
-# A step that finds no room in a later round takes its units, and what counts as new, from the round before.
-ONCE = Options(rounds=1)
+TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "turns": 1, "pending": 1}
+TREE |= {"changed": 1, "moved": 1, "marked": 1}
 
 
 def cramped() -> Solver:
     """A solver that has room for one variable and one factor."""
-    solver = Solver(ONCE)
+    solver = Solver(Options())
     assert solver._tree
     for thing, sizes in ((solver._graph, GRAPH), (solver._tree.tree, TREE)):
         for name, size in sizes.items():
@@ -45,11 +42,11 @@ def account(report: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorbus.solver.graph.roomy", lambda need, _size, _bytes: need)
-    monkeypatch.setattr("factorbus.solver.tree.roomy", lambda need, _size, _bytes: need)
+    monkeypatch.setattr("factorbus.solver.graph.roomy", lambda need, _size: need)
+    monkeypatch.setattr("factorbus.solver.tree.roomy", lambda need, _size: need)
     grown, make_room = list[int](), Tree._make_room
     monkeypatch.setattr(Tree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
-    tight, wide = cramped(), Solver(ONCE)
+    tight, wide = cramped(), Solver(Options())
     for n, batch in enumerate(random_steps(seed, steps=60)):
         assert tight.stage(batch) == wide.stage(batch)
         assert account(tight.step()) == account(wide.step()), f"step {n}"
@@ -58,9 +55,18 @@ def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_what_is_small_grows_by_more() -> None:
-    assert roomy(70, 64, 512) == 256
-    assert roomy(300, 64, 512) == 300
-    assert roomy(1 << 14, 1 << 13, 1 << 16) == 1 << 14
+    assert roomy(70, 64) == 256
+    assert roomy(300, 64) == 300
+    assert roomy(1 << 14, 1 << 13) == 1 << 14
+
+
+def test_what_has_a_row_for_each_of_the_same_things_grows_alike() -> None:
+    graph = Graph()
+    for _ in range(40):
+        graph.reserve_variables(1000, 3)
+        graph.counts[at.VARIABLES] += 1000
+        assert graph.keys.size == len(graph.var) == graph.dims.size >= graph.counts[at.VARIABLES]
+        graph.keys[graph.counts[at.VARIABLES] - 1000 : graph.counts[at.VARIABLES]] = -1 - graph.counts[at.VARIABLES]
 
 
 @pytest.mark.parametrize("again", [copy.deepcopy, lambda graph: pickle.loads(pickle.dumps(graph))])

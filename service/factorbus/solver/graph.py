@@ -26,7 +26,7 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 Mark: TypeAlias = tuple[int, ...]
 
-_FEW_PAGES = 1 << 16  # bytes
+_MUCH = 4096  # rows
 
 
 class Graph(Arenas):
@@ -193,17 +193,18 @@ class Graph(Arenas):
 
 def grown(array: np.ndarray, need: int) -> np.ndarray:
     """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
-    larger = np.zeros((roomy(need, len(array), array.nbytes), *array.shape[1:]), array.dtype)
+    larger = np.zeros((roomy(need, len(array)), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
 
 
-def roomy(need: int, size: int, size_bytes: int) -> int:
+def roomy(need: int, size: int) -> int:
     """How long to make an array of `size` that is to have `need`: four times what it is, or twice if that is much.
 
-    To find that there is no room, and begin again, takes longer than to copy a few pages.
+    To find that there is no room, and begin again, takes longer than to copy a few pages.  It does not look at how wide
+    rows are: arrays with a row for each of the same things, and as long, stay as long as each other.
     """
-    return max(need, (4 if size_bytes < _FEW_PAGES else 2) * size)
+    return max(need, (4 if size < _MUCH else 2) * size)
 
 
 def table_size(entries: int) -> int:

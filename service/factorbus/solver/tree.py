@@ -126,7 +126,7 @@ class Tree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            pages.enlarge(self, "numbers", roomy(need, self.numbers.size, self.numbers.nbytes))
+            pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 
     def _make_room_for_graph(self) -> None:
@@ -152,6 +152,6 @@ class Tree(Arenas):
 
 def _widened(array: F64, need: int) -> F64:
     """A copy with columns for at least `need`, and more for the next ones."""
-    wider = np.zeros((len(array), roomy(need, array.shape[1], array.nbytes)))
+    wider = np.zeros((len(array), roomy(need, array.shape[1])))
     wider[:, : array.shape[1]] = array
     return wider

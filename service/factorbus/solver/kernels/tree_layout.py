@@ -29,7 +29,7 @@ The arenas of a tree are:
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
     settings (14,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
-    account (4,) float64     what a step found
+    account (5,) float64     what a step found
 """
 
 # The arenas of a tree in its table (`places`).
@@ -139,6 +139,7 @@ S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_WAITING = 42  # the step since when any variable waits to be relinearised
 S_DUE = 43  # 1: what waits is relinearised in the next step
+S_OLD = 44  # variables before the step
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
@@ -170,4 +171,5 @@ A_CHI2 = 0  # χ² of the linear problem at its solution
 A_BEND = 1  # the largest bend of what moved, units of (9.6)
 A_CONSTANT = 2  # χ² of factors between fixed variables
 A_ALARM = 3  # what may have bent since it was looked last, σ² (9.15)
-A_SIZE = 4
+A_UNIT = 4  # (9.6), as it was before the step
+A_SIZE = 5

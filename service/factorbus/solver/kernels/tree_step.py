@@ -66,8 +66,9 @@ def tree_step(graph: I64, tree: I64) -> int:
         status = begin(counts, settings, var, fac, values, payload, node, link, hessian, lin, scalars, saved, state)
         if status != tl.DONE:
             return status
-        account[tl.A_BEND] = 0.0
-    unit = residual_unit(f1, account)
+        account[tl.A_BEND], account[tl.A_UNIT] = 0.0, residual_unit(f1, account)
+        state[tl.S_OLD] = state[tl.S_FIRST_NEW]
+    unit = account[tl.A_UNIT]
     scaled = settings.copy()
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     scaled[tl.P_BENT] *= unit
@@ -75,7 +76,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1)  # a share of χ²
     scaled[tl.P_SOON] *= unit * unit * max(f1, 1)
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
-    v0 = old = state[tl.S_FIRST_NEW]
+    v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
     if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, turns, saved, state):
         undo(v0, var, fac, node, link, scalars, turns, saved, state)
@@ -108,7 +109,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         state[tl.S_ROUNDS] += 1
         if state[tl.S_WAIT] != 0 or not pull > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
-    state[tl.S_TOLD] = count_differing(old, v1, changed[: state[tl.S_CHANGED]], var, lin, values)
+    state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
     return tl.DONE
 
