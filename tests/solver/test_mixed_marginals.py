@@ -1,6 +1,7 @@
 """Variables of any kinds marginalised, with poses, points and features in their border: the rest is what it was."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -186,7 +187,9 @@ class Window:
 @pytest.mark.parametrize("poses", [600, pytest.param(3000, marks=pytest.mark.data)])
 def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_has_it(poses: int) -> None:
     window = Window(keep=30, every=10)
-    for n, step in enumerate(city_trees(poses, seed=2, tree_share=0.6, sight_share=0.6)):
+    # What was linearised once and for all is off by the square of the noise, which no window can help.
+    calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sigma_sight_m=0.03)
+    for n, step in enumerate(calm(poses, seed=2, tree_share=0.6, sight_share=0.6)):
         window.take(n, step.batch)
     assert window.widest >= 8, "there are trees in the border"
     half = len(window.sizes) // 2
@@ -204,7 +207,7 @@ def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_ha
         for key, sure in zip(keys, sigma, strict=True):
             apart = here[key][1] - there[key][1]
             apart[2] = np.angle(np.exp(1j * apart[2]))
-            assert (np.abs(apart) < 0.2 * sure).all()
+            assert (np.abs(apart) < 0.1 * sure).all()
         a, b = covariance(window.solver, keys[-1:]), covariance(window.rest, keys[-1:])
         np.testing.assert_allclose(np.sqrt(np.diag(a)), np.sqrt(np.diag(b)), rtol=0.05)
 

@@ -67,8 +67,8 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 0.001
-    bent_soon: float = 5e-4
-    bent_now: float = 1e-3
+    bent_soon: float = 1e-3
+    bent_now: float = 2e-3
     bent_most: float = 2.0
     patience: int = 1000
     trust: float = 3.0
