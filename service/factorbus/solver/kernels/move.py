@@ -55,13 +55,19 @@ def differs(x: int, size: int, a: I64, b: I64) -> bool:
 
 @kernel("void(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,::1])")
 def gather(picked: I64, var: I64, keys: I64, values: F64, out_keys: I64, out_values: F64) -> None:
-    """Keys and values of the picked variables, which are of one kind."""
-    for n in range(picked.size):
-        v = picked[n]
-        out_keys[n] = keys[v]
+    """Keys and values of the picked variables, which are of one kind: those that follow each other, together."""
+    size, out = out_values.shape[1], out_values.reshape(-1)
+    n = 0
+    while n < picked.size:
+        v, run = picked[n], 1
+        while n + run < picked.size and picked[n + run] == v + run:
+            run += 1
         x = var[v, at.V_AT]
-        for c in range(out_values.shape[1]):
-            out_values[n, c] = values[x + c]
+        for k in range(run):
+            out_keys[n + k] = keys[v + k]
+        for c in range(run * size):
+            out[n * size + c] = values[x + c]
+        n += run
 
 
 @kernel("float64(float64[::1], float64[::1])")
