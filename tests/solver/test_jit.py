@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.solver.kernels import _jit
+from factorbus.solver.kernels import _jit, _lowering
 
-JIT = Path(_jit.__file__)
+MAKERS = Path(_jit.__file__), Path(_lowering.__file__)
 CALLER = """
 from kernels import _jit
 from kernels.callee import twice
@@ -40,7 +40,8 @@ def kernels(tmp_path: Path) -> Path:
     """A package with the real decorators and two small kernels."""
     folder = tmp_path / "kernels"
     folder.mkdir()
-    shutil.copy(JIT, folder)
+    for file in MAKERS:
+        shutil.copy(file, folder)
     write(folder)
     return folder
 

@@ -45,8 +45,9 @@ from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
-from factorbus.solver.kernels import _lowering
-from factorbus.solver.kernels._lowering import KernelCompiler, PartCompiler
+# From beside this file: a copy of both elsewhere is one by itself.
+from . import _lowering
+from ._lowering import KernelCompiler, PartCompiler
 
 __all__ = [
     "BOUNDSCHECK",
