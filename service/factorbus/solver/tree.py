@@ -42,6 +42,7 @@ class Tree(Arenas):
             options.bent_most,
         )
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
+        self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_WORTH]] = options.heavy, options.near, options.worth
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.node: I64 = np.empty((64, tl.N_WIDTH), np.int64)
         self.link: I64 = np.empty((128, tl.L_WIDTH), np.int64)

@@ -9,7 +9,7 @@ S, with a last column for the right-hand side and a corner for χ²,
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
 The arenas of a tree are:
-    node    (n, 12) int64     one row per variable, by its index in the graph
+    node    (n, 13) int64     one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 20) int64    records of cliques
     lists   int64            variables of cliques
@@ -27,7 +27,7 @@ The arenas of a tree are:
                              since they were looked at last
     marked  (c,) int64       scratch: cliques that an elimination touches
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (14,) float64   see P_RIPPLE and so on
+    settings (17,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (5,) float64     what a step found
 """
@@ -57,7 +57,8 @@ N_MOVED = 8  # the last step that changed its estimate
 N_LISTED = 9  # 1: it is in `moved`
 N_COLUMN = 10  # scratch: its column in the clique at hand
 N_LINEARISED = 11  # the last step that gave it a linearisation point
-N_WIDTH = 12
+N_NEAR = 12  # the last elimination that brought it near the root
+N_WIDTH = 13
 
 # Columns of `turns`.
 U_LEVER, U_STRAIN, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 3, 4
@@ -140,6 +141,8 @@ CLASSES = 256
 S_WAITING = 42  # the step since when any variable waits to be relinearised
 S_DUE = 43  # 1: what waits is relinearised in the next step
 S_OLD = 44  # variables before the step
+S_MOVING_ROOT = 45  # flops of the last elimination that brought variables near the root,
+S_SPENT = 46  # and of all others since
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
@@ -160,7 +163,10 @@ P_LOOK = 10  # and where what moved since may have bent by this share of χ²
 P_SOON = 11  # and in the next step where it adds more than this share,
 P_PATIENCE = 12  # has waited for so many steps,
 P_MOST = 13  # or something is bent by more than this
-P_SIZE = 14
+P_HEAVY = 14  # an elimination of more flops brings what is near to the root,
+P_WORTH = 15  # when with it this share has been spent of what that took the last time
+P_NEAR = 16  # scalars that are near
+P_SIZE = 17
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

@@ -20,18 +20,20 @@ def order_affected(
 ) -> I64:  # fmt: skip
     """perm (n,): affected[perm[k]] is eliminated k-th.
 
-    Variables with a factor in the last `recent` steps go last, and the variable `last` last of all; −1: none does.
+    Last go those that are near, then variables with a factor in the last `recent` steps, then the variable `last`; −1:
+    none does.
     """
     dims, group = np.empty(n, np.int64), np.zeros(n, np.int64)
-    since = state[tl.S_STEP] - recent
+    since, stamp, m = state[tl.S_STEP] - recent, state[tl.S_STAMP], orphans.size
     for k in range(n):
         v = affected[k]
         dims[k] = dim_of_variable(var, v)
         if v == last:
-            group[k] = 2
+            group[k] = 3
         elif node[v, tl.N_SEEN] > since:
+            group[k] = 2
+        elif node[v, tl.N_NEAR] == stamp:
             group[k] = 1
-    stamp, m = state[tl.S_STAMP], orphans.size
     length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
     for e in range(m):
         start = clique[orphans[e], tl.C_LIST]

@@ -2,7 +2,8 @@
 
 1  take in        new variables, at good places if they are few, and new factors, linearised
 2  relinearise    variables whose factors have bent since they were linearised
-3  touch, detach  the cliques that these and the new factors change; what hangs from them are orphans
+3  touch, detach  the cliques that these and the new factors change, and where that is much those around the robot;
+                  what hangs from them are orphans
 4  order          the affected variables, constrained approximate minimum degree
 5  fronts         elimination tree, amalgamation, memory
 6  eliminate      front by front; orphans lend their update matrices
@@ -31,6 +32,7 @@ from factorbus.solver.kernels.tree_fronts import (
 )
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
+from factorbus.solver.kernels.tree_near import account_for, is_root_to_move, touch_near
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
@@ -154,6 +156,9 @@ def eliminate_again(
         while slot >= 0:
             count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
             slot = next_incidence(slot, link)
+    moves_root = is_root_to_move(marked[:count], moving.size > 0, settings, clique, state)
+    if moves_root:
+        count = touch_near(f1, settings, var, fac, node, link, clique, state, marked, count)
     marked = marked[:count]
     room = v1 - v0
     hanging = 0
@@ -204,6 +209,7 @@ def eliminate_again(
         return 0.0, 0.0, tl.NO_ROOM
     now = lap(now, tl.SYMBOLIC, state)
     # 6
+    flops = state[tl.S_FLOPS]
     failed = eliminate_fronts(
         ids, records, order, affected, home, place, factors, orphans, lowest, update, var, fac, node, link, clique,
         lists, numbers, hessian, scalars, state,
@@ -213,6 +219,7 @@ def eliminate_again(
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
         return 0.0, 0.0, tl.FAILED
+    account_for(state[tl.S_FLOPS] - flops, moves_root, moving.size > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(

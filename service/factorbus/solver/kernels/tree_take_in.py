@@ -30,6 +30,7 @@ def take_in_variables(
             for a in range(dim_of_variable(var, v)):
                 scalars[0, d + a] = scalars[1, d + a] = 0.0
         turns[v, tl.U_LEVER] = turns[v, tl.U_STRAIN] = 0.0
+        node[v, tl.N_NEAR] = -1
         note_turn(v, var, lin, turns)
     state[tl.S_VARIABLES] = v1
 

@@ -1,0 +1,68 @@
+"""Bringing what surrounds the robot near the root.  MATH §9.4.
+
+A step changes all cliques from those that its factors touch up to the root.  Where the root is what surrounds the robot
+these are few and small, however large the map is.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.tree_mark import dim_of_variable, touch
+from factorbus.solver.kernels.tree_take_in import next_incidence
+
+
+@inline_kernel
+def is_root_to_move(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> bool:
+    """Whether the elimination of the marked cliques is to bring what is near to the root, too."""
+    flops = 0.0
+    for k in range(marked.size):
+        p, width = clique[marked[k], tl.C_PIVOTS], clique[marked[k], tl.C_PIVOTS] + clique[marked[k], tl.C_BORDER] + 1
+        flops += p * width * width
+    if flops <= settings[tl.P_HEAVY]:
+        return False
+    return relinearises or state[tl.S_SPENT] + flops > settings[tl.P_WORTH] * state[tl.S_MOVING_ROOT]
+
+
+@part
+def touch_near(
+    f1: int, settings: F64, var: I64, fac: I64, node: I64, link: I64, clique: I64, state: I64, marked: I64, count: int
+) -> int:  # fmt: skip
+    """Touch the variables that are nearest to those of the newest factors; gives the count of marked cliques.
+
+    Near is what few factors lie between.  They are P_NEAR scalars, and have N_NEAR set to the present elimination.
+    """
+    stamp, room = state[tl.S_STAMP], settings[tl.P_NEAR]
+    queue, put, taken = np.empty(int(room), np.int64), 0, 0
+    for f in range(min(state[tl.S_TAKEN], f1 - 1), f1):
+        put = _queue(fac[f, at.F_I], queue, put, var, node, stamp)
+        put = _queue(fac[f, at.F_J], queue, put, var, node, stamp)
+    while taken < put and room > 0:
+        v = queue[taken]
+        taken += 1
+        room -= dim_of_variable(var, v)
+        count = touch(v, node, clique, state, marked, count)
+        slot = node[v, tl.N_ADJ]
+        while slot >= 0:
+            put = _queue(fac[slot // 2, at.F_I + 1 - slot % 2], queue, put, var, node, stamp)
+            slot = next_incidence(slot, link)
+    return count
+
+
+@inline_kernel
+def _queue(v: int, queue: I64, put: int, var: I64, node: I64, stamp: int) -> int:
+    """Variable v is next, unless it is fixed or queued or there is no room for it; gives how many there are."""
+    if v >= 0 and put < queue.size and var[v, at.V_COLUMN] >= 0 and node[v, tl.N_NEAR] != stamp:
+        node[v, tl.N_NEAR], queue[put] = stamp, v
+        put += 1
+    return put
+
+
+@inline_kernel
+def account_for(flops: int, moved_root: bool, relinearises: bool, state: I64) -> None:
+    """What an elimination took counts: for the root's last move, or for what was spent since."""
+    if moved_root:
+        state[tl.S_MOVING_ROOT], state[tl.S_SPENT] = flops, 0
+    elif not relinearises:
+        state[tl.S_SPENT] += flops
