@@ -13,7 +13,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 
 NEAR = 60
-ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR}
+ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3}  # of more than 27 flops
 NEVER = {"heavy": math.inf}
 WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}
 
@@ -96,11 +96,6 @@ def test_it_saves_eliminations_where_they_are_heavy(world: str, poses: int, most
 
 def steps(world: str, poses: int) -> Iterator[Batch]:
     return (step.batch for step in WORLDS[world](poses, 1))
-
-
-def test_small_maps_have_nothing_to_gain_and_do_not_try() -> None:
-    solver = Solver(Options())
-    assert all(tree_of(solver).state[tl.S_MOVING_ROOT] == 0 for _ in drive(solver, steps("manhattan", 600)))
 
 
 def test_the_root_is_moved_less_often_the_more_must_be_spent_before() -> None:

@@ -28,7 +28,7 @@ WAYS = {
     "whole": {"split_pivots": 10**9, "split_share": 1.0},
     "default": {},
     "split": {"split_pivots": 0, "split_share": 1.0},
-    "near": {"heavy": 0.0, "near": 12, "worth": 0.0},
+    "near": {"heavy": 0.0, "worth": 0.0},
 }
 
 

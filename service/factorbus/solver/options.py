@@ -47,8 +47,9 @@ class Options:
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
                     scalars were (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
-    heavy, near, worth   tree: an elimination of more than so many flops brings so many scalars around the newest
-                    factors near the root, once this share of what that took last has been spent since (MATH §9.4)
+    heavy, near, worth   tree: an elimination of more than so many flops brings this times their cube root of scalars
+                    around the newest factors near the root, once this share of what that took last has been spent
+                    since (MATH §9.4)
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
     backend         "blocks": block multifrontal Cholesky; "cholmod": CHOLMOD on scalars, through scikit-sparse
     """
@@ -78,9 +79,9 @@ class Options:
     look_every: int = 8
     look_moved: float = 0.1
     ripple: float = 0.1
-    recent_steps: int = 3
-    heavy: float = 4e6
-    near: int = 600
+    recent_steps: int = 2
+    heavy: float = 1e5
+    near: float = 1.4
     worth: float = 0.5
     split_pivots: int = 24
     split_share: float = 0.5

@@ -165,7 +165,7 @@ P_PATIENCE = 12  # has waited for so many steps,
 P_MOST = 13  # or something is bent by more than this
 P_HEAVY = 14  # an elimination of more flops brings what is near to the root,
 P_WORTH = 15  # when with it this share has been spent of what that took the last time
-P_NEAR = 16  # scalars that are near
+P_NEAR = 16  # so many scalars, times the cube root of the flops
 P_SIZE = 17
 
 # The phases of a step, in the order of `tree_step`.

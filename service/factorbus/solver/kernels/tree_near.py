@@ -14,27 +14,28 @@ from factorbus.solver.kernels.tree_take_in import next_incidence
 
 
 @inline_kernel
-def is_root_to_move(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> bool:
-    """Whether the elimination of the marked cliques is to bring what is near to the root, too."""
+def count_near(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> int:
+    """How many scalars are to come near the root with the elimination of the marked cliques; 0: it stays as it is."""
     flops = 0.0
     for k in range(marked.size):
         p, width = clique[marked[k], tl.C_PIVOTS], clique[marked[k], tl.C_PIVOTS] + clique[marked[k], tl.C_BORDER] + 1
         flops += p * width * width
     if flops <= settings[tl.P_HEAVY]:
-        return False
-    return relinearises or state[tl.S_SPENT] + flops > settings[tl.P_WORTH] * state[tl.S_MOVING_ROOT]
+        return 0
+    if not relinearises and state[tl.S_SPENT] + flops <= settings[tl.P_WORTH] * state[tl.S_MOVING_ROOT]:
+        return 0
+    return int(settings[tl.P_NEAR] * flops ** (1.0 / 3.0))
 
 
 @part
 def touch_near(
-    f1: int, settings: F64, var: I64, fac: I64, node: I64, link: I64, clique: I64, state: I64, marked: I64, count: int
+    room: int, f1: int, var: I64, fac: I64, node: I64, link: I64, clique: I64, state: I64, marked: I64, count: int
 ) -> int:  # fmt: skip
-    """Touch the variables that are nearest to those of the newest factors; gives the count of marked cliques.
+    """Touch `room` scalars of the variables nearest to those of the newest factors; gives the count of marked cliques.
 
-    Near is what few factors lie between.  They are P_NEAR scalars, and have N_NEAR set to the present elimination.
+    Near is what few factors lie between.  N_NEAR of what is near becomes the present elimination.
     """
-    stamp, room = state[tl.S_STAMP], settings[tl.P_NEAR]
-    queue, put, taken = np.empty(int(room), np.int64), 0, 0
+    stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
     for f in range(min(state[tl.S_TAKEN], f1 - 1), f1):
         put = _queue(fac[f, at.F_I], queue, put, var, node, stamp)
         put = _queue(fac[f, at.F_J], queue, put, var, node, stamp)

@@ -32,7 +32,7 @@ from factorbus.solver.kernels.tree_fronts import (
 )
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
-from factorbus.solver.kernels.tree_near import account_for, is_root_to_move, touch_near
+from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
@@ -156,9 +156,9 @@ def eliminate_again(
         while slot >= 0:
             count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
             slot = next_incidence(slot, link)
-    moves_root = is_root_to_move(marked[:count], moving.size > 0, settings, clique, state)
-    if moves_root:
-        count = touch_near(f1, settings, var, fac, node, link, clique, state, marked, count)
+    near = count_near(marked[:count], moving.size > 0, settings, clique, state)
+    if near > 0:
+        count = touch_near(near, f1, var, fac, node, link, clique, state, marked, count)
     marked = marked[:count]
     room = v1 - v0
     hanging = 0
@@ -219,7 +219,7 @@ def eliminate_again(
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
         return 0.0, 0.0, tl.FAILED
-    account_for(state[tl.S_FLOPS] - flops, moves_root, moving.size > 0, state)
+    account_for(state[tl.S_FLOPS] - flops, near > 0, moving.size > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(
