@@ -7,7 +7,7 @@ import pytest
 from naive.tree_records import Clique, assert_is_a_tree, tree_of
 
 from factorbus.proto.messages import Batch
-from factorbus.simulate import city_trees, manhattan, sphere
+from factorbus.simulate import manhattan, sphere
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
@@ -15,7 +15,7 @@ from factorbus.solver.kernels import tree_layout as tl
 NEAR = 60
 ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3}  # of more than 27 flops
 NEVER = {"heavy": math.inf}
-WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}
+WORLDS = {"manhattan": manhattan, "sphere": sphere}
 
 
 def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[Batch]:
@@ -68,7 +68,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
             cliques = assert_is_a_tree(solver)
             close = nearest(solver, first, NEAR // dim)
             recent = {v for v in range(solver.variable_count) if tree.node[v, tl.N_SEEN] > n - options.recent_steps}
-            brought = {v for v in cliques_of(tree) if tree.node[v, tl.N_NEAR] == tree.state[tl.S_STAMP]}
+            brought = {v for v in range(solver.variable_count) if tree.node[v, tl.N_NEAR] == tree.state[tl.S_STAMP]}
             assert close <= brought
             # Small fronts are joined, so that a few others may come along.
             more = [len(above(v, solver, cliques) - brought - recent) for v in close]
@@ -78,11 +78,6 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
         first = solver.factor_count
     assert looked > 100
     assert alone > 0.9 * looked
-
-
-def cliques_of(tree) -> list[int]:
-    """The variables that are in the tree."""
-    return [v for v in range(int(tree.state[tl.S_VARIABLES])) if tree.node[v, tl.N_CLIQUE] >= 0]
 
 
 @pytest.mark.parametrize(("world", "poses", "most"), [("manhattan", 3000, 0.7), ("sphere", 900, 0.4)])
@@ -95,6 +90,7 @@ def test_it_saves_eliminations_where_they_are_heavy(world: str, poses: int, most
 
 
 def steps(world: str, poses: int) -> Iterator[Batch]:
+    """Of a world, what is inserted."""
     return (step.batch for step in WORLDS[world](poses, 1))
 
 
