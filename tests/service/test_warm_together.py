@@ -50,17 +50,19 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
     missing = [type("Kernel", (), {"__name__": f"k{n}"}) for n in range(9)]
     monkeypatch.setattr(together, "_list_missing", lambda: missing)
     monkeypatch.setattr(together, "iter_compile", pytest.fail)
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     asked: list[list[str]] = []
     popen = subprocess.Popen
 
     def compiling(command: list[str], **how: Any) -> subprocess.Popen:
         asked.append(command)
-        return popen([sys.executable, "-c", f"print('kernel {len(asked)}')"], **how)
+        telling = f"for n in range(20_000): warm._tell('kernel {len(asked)} ' + str(n))"
+        return popen([sys.executable, "-c", f"from factorbus.service import warm\n{telling}"], **how)
 
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
     monkeypatch.setattr(together, "_cores", lambda: 2)
     before, told = together.compiled_seconds(), []
     together.warm(told.append)
-    assert sorted(told) == ["kernel 1", "kernel 2"]
+    assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
     assert {tuple(command[:3]) for command in asked} == {(sys.executable, "-m", "factorbus.service.warm")}
     assert together.compiled_seconds() > before, "who waits for them says so"

@@ -82,6 +82,11 @@ def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
             pass
 
 
+def _tell(name: str) -> None:
+    """In one piece, whatever the buffering: others write to the same pipe."""
+    os.write(sys.stdout.fileno(), f"{name}\n".encode())
+
+
 def _list_missing() -> list:
     return list_missing() + list_missing(idp_kernels, kernels)
 
@@ -99,4 +104,4 @@ def _cores() -> int:
 
 if __name__ == "__main__":
     with suppress(FileNotFoundError, BrokenPipeError, KeyboardInterrupt):  # whoever started this has gone
-        _take_turns(Path(sys.argv[1]), lambda name: print(name, flush=True))
+        _take_turns(Path(sys.argv[1]), _tell)
