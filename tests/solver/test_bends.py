@@ -1,4 +1,4 @@
-"""What is not looked at could not have mattered: the bound of MATH (9.14) on the slip (9.13)."""
+"""Bounds on what is bent: what is not looked at could not have mattered, MATH (9.14), and when it is due, (9.19)."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,16 @@ from naive.dense_factors import boxplus
 from naive.random_graphs import random_value
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.tree_bend import LINKS, may_slip, slip_between
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_bend import LINKS, axes_of, may_slip, slip_between
+from factorbus.solver.kernels.tree_step import reluctance
 
-_KINDS = {"se2": (at.BETWEEN_SE2, 2, 3, 9 + 9 + 8), "se3": (at.BETWEEN_SE3, 3, 6, 36 + 36 + 35)}
+_KINDS = {"se2": (at.BETWEEN_SE2, 2, 3), "se3": (at.BETWEEN_SE3, 3, 6)}
 
 
 @pytest.mark.parametrize("space", ["se2", "se3"])
 def test_a_slip_that_is_not_computed_is_smaller_than_what_it_was_to_be(space: str) -> None:
-    kind, axes, dim, turn = _KINDS[space]
+    kind, axes, dim = _KINDS[space]
     rng, near = np.random.default_rng(7), 0
     for _ in range(3000):
         # 1. Two poses, what one measures of the other, and where both have moved since.
@@ -24,25 +26,39 @@ def test_a_slip_that_is_not_computed_is_smaller_than_what_it_was_to_be(space: st
         moves = rng.normal(size=(2, dim)) * 10.0 ** rng.uniform(-3, 0)
         values = np.stack([boxplus(space, x, move) for x, move in zip(lin, moves, strict=True)])
         # 2. The slip, and what it is held to be at most.
-        root, hessian = 10.0 ** rng.uniform(-1, 2), np.zeros(200)
-        hessian[turn] = 10.0 ** rng.uniform(-1, 4)
-        d = float(np.linalg.norm(z))
+        root, stiff_turn, d = 10.0 ** rng.uniform(-1, 2), 10.0 ** rng.uniform(-1, 4), float(np.linalg.norm(z))
+        stiff = np.zeros((1, tl.B_WIDTH))
+        stiff[0, [tl.B_LEVER, tl.B_ROOT, tl.B_TURN]] = d, root, stiff_turn
+        stiff[0, tl.B_MEASURED : tl.B_MEASURED + axes] = z
         shift = float(np.linalg.norm((values[1] - values[0] - lin[1] + lin[0])[:axes]))
         phi = float(np.linalg.norm(moves[0, axes:]))
         residual = float(np.linalg.norm(_seen(lin, axes) - z))
-        slip = slip_between(kind, z, 0, 0, size, root, d, shift, values.ravel(), hessian, 0)
+        planar, flat = space == "se2", values.ravel()
+        slip = slip_between(planar, axes_of(planar, 0, flat), 0, size, shift, flat, stiff, 0)
+        pull = root * np.linalg.norm(_seen(values, axes) - z)
+        assert slip == pytest.approx(LINKS * pull * shift / np.hypot(d, np.sqrt(stiff_turn) / root))
         room = slip * rng.uniform(0.2, 5.0)
         # 3. If it may not come to that, it does not.
-        if not may_slip(kind, root, d, phi, shift, residual, hessian[turn], room):
+        if not may_slip(kind, root, d, phi, shift, residual, stiff_turn, room):
             near += room < 2.0 * slip
             assert slip < room
-        assert may_slip(kind, root, d, phi, shift, residual, hessian[turn], 0.0)
+        assert may_slip(kind, root, d, phi, shift, residual, stiff_turn, 0.0)
     assert near, "no bound was ever close"
 
 
 def test_only_poses_slip_between_poses() -> None:
     assert not may_slip(at.LANDMARK_SE2, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1e-9)
     assert LINKS > 0.0
+
+
+def test_so_soon_after_a_relinearisation_more_has_to_be_bent() -> None:
+    settings, state = np.zeros(tl.P_SIZE), np.zeros(tl.S_SIZE, np.int64)
+    settings[tl.P_REST], settings[tl.P_RELUCTANCE], state[tl.S_RELINEARISED_AT] = 100, 8.0, 1000
+    after = {}
+    for step in (1001, 1035, 1050, 1100, 5000):
+        state[tl.S_STEP] = step
+        after[step - 1000] = reluctance(settings, state)
+    assert after == {1: 8.0, 35: 8.0, 50: 4.0, 100: 1.0, 4000: 1.0}
 
 
 def _seen(poses: np.ndarray, axes: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""When bent variables are relinearised: all that wait together, when it tells in χ², MATH (9.16)."""
+"""When bent variables are relinearised: all that wait together, when it tells in χ², MATH (9.16) and (9.19)."""
 
 from collections.abc import Iterator
 
@@ -39,7 +39,9 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
             relinearised += 1
         share = tree.turns[waiting(tree), tl.U_STRAIN].sum() / (tree.account[tl.A_CHI2] + 1e-3)
-        assert share <= 1.5 * options.bent_soon or tree.state[tl.S_DUE]
+        rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
+        most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
+        assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             waited += waiting(tree).size > 0
             largest = max(largest, share)

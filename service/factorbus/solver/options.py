@@ -39,6 +39,7 @@ class Options:
                     the map have on average waits to be relinearised (MATH §9.6)
     bent_soon, bent_most, patience   tree: all that wait are so in the next step when together they add more than this
                     share to χ², when a factor is bent by more than so many, or when one has waited for so many steps
+    rest, reluctance   tree: for so many steps after a relinearisation `bent_soon` is more, up to so many times
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share
     trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
                     replaced
@@ -70,14 +71,16 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 0.001
-    bent_soon: float = 1e-3
-    bent_now: float = 2e-3
+    bent_soon: float = 5e-4
+    bent_now: float = 4e-3
     bent_most: float = 2.0
     patience: int = 1000
+    rest: int = 64
+    reluctance: float = 8.0
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 8
-    look_moved: float = 0.1
+    look_moved: float = 0.05
     ripple: float = 0.1
     recent_steps: int = 2
     heavy: float = 1e5

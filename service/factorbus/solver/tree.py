@@ -41,6 +41,7 @@ class Tree(Arenas):
             options.patience,
             options.bent_most,
         )
+        self.settings[[tl.P_REST, tl.P_RELUCTANCE]] = options.rest, options.reluctance
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
         self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_WORTH]] = options.heavy, options.near, options.worth
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
@@ -52,7 +53,7 @@ class Tree(Arenas):
         self.hessian: F64 = np.empty(8192)
         self.lin: F64 = np.empty((3, 256))
         self.scalars: F64 = np.zeros((3, 256))
-        self.stiff: F64 = np.zeros((128, 4))
+        self.stiff: F64 = np.zeros((128, tl.B_WIDTH))
         self.turns: F64 = np.zeros((64, tl.U_WIDTH))
         self.pending: I64 = np.empty(64, np.int64)
         self.changed: I64 = np.empty(64, np.int64)
@@ -61,7 +62,7 @@ class Tree(Arenas):
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.account: F64 = np.zeros(tl.A_SIZE)
-        self.state[tl.S_FREE_CLIQUE] = -1
+        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARISED_AT] = -1, -options.rest
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
     def step(self, sure: bool = False) -> int:
@@ -113,7 +114,7 @@ class Tree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + 4) + cliques * tl.C_WIDTH
+        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.B_WIDTH) + cliques * tl.C_WIDTH
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 

@@ -37,6 +37,7 @@ and both ends move.
 import math
 
 from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, inline_kernel
 from factorbus.solver.kernels.se3 import rotation
 from factorbus.solver.kernels.simd import at as load
@@ -95,27 +96,26 @@ def may_slip(
 
 
 @inline_kernel
-def slip_between(
-    kind: int, p: F64, k: int, i: int, j: int, root: float, d: float, shift: float, values: F64, hessian: F64, h: int
-) -> float:
-    """(9.13) of the poses at offsets i and j, by the measurement at offset k of p.  0 of all else."""
-    if kind == at.BETWEEN_SE2:
-        c, s = math.cos(load(values, i + 2)), math.sin(load(values, i + 2))
-        dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
-        rx, ry, rz = c * dx + s * dy - load(p, k), c * dy - s * dx - load(p, k + 1), 0.0
-        stiff_turn = load(hessian, h + 9 + 9 + 8)
-    elif kind == at.BETWEEN_SE3:
-        a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(values, i + 3)
-        dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
-        dz = load(values, j + 2) - load(values, i + 2)
-        rx = a0 * dx + a3 * dy + a6 * dz - load(p, k)
-        ry = a1 * dx + a4 * dy + a7 * dz - load(p, k + 1)
-        rz = a2 * dx + a5 * dy + a8 * dz - load(p, k + 2)
-        stiff_turn = load(hessian, h + 36 + 36 + 35)
-    else:
-        return 0.0
+def axes_of(planar: bool, x: int, values: F64) -> tuple:
+    """R of the pose at offset x, row by row."""
+    if planar:
+        c, s = math.cos(load(values, x + 2)), math.sin(load(values, x + 2))
+        return c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0
+    return rotation(values, x + 3)
+
+
+@inline_kernel
+def slip_between(planar: bool, axes: tuple, i: int, j: int, shift: float, values: F64, stiff: F64, f: int) -> float:
+    """(9.13) of factor f between the poses at offsets i, which has these axes, and j."""
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = axes
+    dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
+    dz = 0.0 if planar else load(values, j + 2) - load(values, i + 2)
+    rx = a0 * dx + a3 * dy + a6 * dz - stiff[f, tl.B_MEASURED]
+    ry = a1 * dx + a4 * dy + a7 * dz - stiff[f, tl.B_MEASURED + 1]
+    rz = a2 * dx + a5 * dy + a8 * dz - stiff[f, tl.B_MEASURED + 2]
+    d, root = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT]
     pull = root * math.sqrt(rx * rx + ry * ry + rz * rz)
-    return LINKS * pull * shift / math.sqrt(d * d + stiff_turn / (root * root))
+    return LINKS * pull * shift / math.sqrt(d * d + stiff[f, tl.B_TURN] / (root * root))
 
 
 @inline_kernel

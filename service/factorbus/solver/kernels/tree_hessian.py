@@ -33,17 +33,18 @@ def linearise_factor(
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
         _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
-        stiff[f, 2], stiff[f, 3] = math.sqrt(r[0] * r[0] + r[1] * r[1]), hessian[h + 9 + 9 + 8]
+        stiff[f, tl.B_PULL] = math.sqrt(r[0] * r[0] + r[1] * r[1])
+        stiff[f, tl.B_TURN] = hessian[h + 9 + 9 + 8]
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
         _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
-        stiff[f, 2] = gradient_norm(2, h + 9 + 6 + 4, hessian)
+        stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
         _write(6, 6, 6, p, more, payload, r, H, W, h, hessian)
-        stiff[f, 2] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
-        stiff[f, 3] = hessian[h + 36 + 36 + 35]
+        stiff[f, tl.B_PULL] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
+        stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
         _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
-        stiff[f, 2] = gradient_norm(3, h + 36 + 18 + 9, hessian)
+        stiff[f, tl.B_PULL] = gradient_norm(3, h + 36 + 18 + 9, hessian)
     else:
         _write_other(kind, p, more, payload, r, H, W, h, hessian)
         if kind >= at.IDP_FIRST:
@@ -148,4 +149,7 @@ def weigh_factor(
         if s >= 0:
             for a in range(dj):
                 scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
-    stiff[f, 0], stiff[f, 1] = distance, root
+    stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
+    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        for a in range(3):
+            stiff[f, tl.B_MEASURED + a] = payload[fac[f, at.F_AT] + a] if a < 2 or kind == at.BETWEEN_SE3 else 0.0

@@ -15,8 +15,9 @@ The arenas of a tree are:
     lists   int64            variables of cliques
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
-    stiff   (m, 4) float64   of each factor d and √ω, (9.4); between poses |r| of the translation where it was
-                             linearised, and ω_θ, (9.14); of a landmark |Ω r| there, (9.12)
+    stiff   (m, 8) float64   of each factor d and √ω, (9.4); between poses |r| of the translation where it was
+                             linearised, ω_θ, (9.14), and what was measured of the translation; of a landmark
+                             |Ω r| there, (9.12)
     lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
@@ -27,7 +28,7 @@ The arenas of a tree are:
                              since they were looked at last
     marked  (c,) int64       scratch: cliques that an elimination touches
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (17,) float64   see P_RIPPLE and so on
+    settings (19,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (5,) float64     what a step found
 """
@@ -59,6 +60,9 @@ N_COLUMN = 10  # scratch: its column in the clique at hand
 N_LINEARISED = 11  # the last step that gave it a linearisation point
 N_NEAR = 12  # the last elimination that brought it near the root
 N_WIDTH = 13
+
+# Columns of `stiff`: d, √ω, |r| or |Ω r|, ω_θ, and what was measured of the translation.
+B_LEVER, B_ROOT, B_PULL, B_TURN, B_MEASURED, B_WIDTH = 0, 1, 2, 3, 4, 8
 
 # Columns of `turns`.
 U_LEVER, U_STRAIN, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 3, 4
@@ -136,6 +140,7 @@ S_TOLD = 21  # variables whose estimate has other bits than before the step, new
 S_CHECKED = 30  # 1: that everything is held has been made sure of otherwise
 S_CHANGED_BEFORE = 31  # S_CHANGED of the step before, for when this one fails
 S_CYCLES = 32  # of the phases of the last step, PHASES of them
+S_RELINEARISED_AT = 47  # the step that relinearised last
 S_FREE = 48  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_WAITING = 42  # the step since when any variable waits to be relinearised
@@ -166,7 +171,9 @@ P_MOST = 13  # or something is bent by more than this
 P_HEAVY = 14  # an elimination of more flops brings what is near to the root,
 P_WORTH = 15  # when with it this share has been spent of what that took the last time
 P_NEAR = 16  # so many scalars, times the cube root of the flops
-P_SIZE = 17
+P_REST = 17  # for so many steps after a relinearisation P_SOON is more,
+P_RELUCTANCE = 18  # up to so many times
+P_SIZE = 19
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
-from factorbus.solver.kernels.tree_bend import bend_of, may_slip, shift_between, slip_between, slip_of, turn_of
+from factorbus.solver.kernels.tree_bend import axes_of, bend_of, may_slip, shift_between, slip_between, slip_of, turn_of
 from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
@@ -150,7 +150,7 @@ def move_frontals(
 
 @part
 def find_bent(
-    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
+    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64,
     scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
@@ -160,7 +160,7 @@ def find_bent(
         state[tl.S_WAITING] = state[tl.S_STEP]
     bent = settings[tl.P_BENT]
     most = look(
-        bent, var, fac, payload, node, link, hessian, stiff, lin, scalars, values, turns, pending, moved, state
+        bent, var, fac, payload, node, link, stiff, lin, scalars, values, turns, pending, moved, state
     )  # fmt: skip
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
@@ -175,7 +175,7 @@ def find_bent(
 
 @part
 def look(
-    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, stiff: F64, lin: F64,
+    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64,
     scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
 ) -> float:  # fmt: skip
     """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
@@ -189,10 +189,11 @@ def look(
         if phi == 0.0 and state[tl.S_EXACT] == 0:
             continue
         planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
+        axes, turned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), False
         slot = node[v, tl.N_ADJ]
         while slot >= 0:
             f = slot // 2
-            kind, y, h = link[f, tl.L_KIND], link[f, tl.L_FAR], link[f, tl.L_AT]
+            kind, y = link[f, tl.L_KIND], link[f, tl.L_FAR]
             if kind >= tl.EXACT:
                 bend = exact_bend(f, var, fac, lin, values, payload, delta)
                 most = max(most, bend)
@@ -200,11 +201,14 @@ def look(
                     pull += 0.5 * bend * bend  # half of it for each end
                     await_ends(f, fac, var, node, pending, state)
             elif slot % 2 == 0 and phi > 0.0 and y >= 0:
-                d, root, shift = stiff[f, 0], stiff[f, 1], shift_between(planar, x, y, values, lin)
+                d, root, pulled = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], stiff[f, tl.B_PULL]
+                shift = shift_between(planar, x, y, values, lin)
                 bend = bend_of(kind, root, d, phi, shift)
-                slip = slip_of(kind, root, d, shift, stiff[f, 2])
-                if may_slip(kind, root, d, phi, shift, stiff[f, 2], stiff[f, 3], bent - bend):
-                    slip = slip_between(kind, payload, fac[f, at.F_AT], x, y, root, d, shift, values, hessian, h)
+                slip = slip_of(kind, root, d, shift, pulled)
+                if may_slip(kind, root, d, phi, shift, pulled, stiff[f, tl.B_TURN], bent - bend):
+                    if not turned:
+                        axes, turned = axes_of(planar, x, values), True
+                    slip = slip_between(planar, axes, x, y, shift, values, stiff, f)
                 most = max(most, bend + slip)
                 if bend + slip > bent:
                     pull += (bend + slip) * (bend + slip)

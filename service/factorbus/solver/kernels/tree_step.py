@@ -76,7 +76,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_MOST] *= unit
     scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1)  # a share of χ²
-    scaled[tl.P_SOON] *= unit * unit * max(f1, 1)
+    scaled[tl.P_SOON] *= unit * unit * max(f1, 1) * reluctance(settings, state)
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
@@ -129,6 +129,13 @@ def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns:
 def residual_unit(factors: int, account: F64) -> float:
     """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
     return math.sqrt((max(account[tl.A_CHI2], 0.0) + LEAST_CHI2) / max(factors, 1))
+
+
+@inline_kernel
+def reluctance(settings: F64, state: I64) -> float:
+    """How many times as much has to be bent, so soon after the last relinearisation.  (9.19)"""
+    rested = settings[tl.P_REST] / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
+    return min(max(rested * rested, 1.0), settings[tl.P_RELUCTANCE])
 
 
 @inline_kernel
@@ -233,6 +240,7 @@ def eliminate_again(
         turns[v, tl.U_STRAIN] = 0.0
     if moving.size > 0:
         state[tl.S_PENDING] = state[tl.S_DUE] = 0
+        state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
     now = lap(now, tl.COMMIT, state)
     # 8
     substitute(
@@ -244,7 +252,7 @@ def eliminate_again(
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
     if due or account[tl.A_ALARM] > settings[tl.P_LOOK]:
         bow, pull = find_bent(
-            settings, var, fac, payload, node, link, hessian, stiff, lin[0], scalars, values, turns, pending, moved,
+            settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved,
             state,
         )  # fmt: skip
         account[tl.A_ALARM] = 0.0
