@@ -20,7 +20,7 @@ from factorbus.solver.kernels import tree_layout as tl
 
 NEAR = 1.05
 PRICE = 1.05
-WELL_ORDERED = 1.1
+WELL_ORDERED = 1.15
 
 
 @pytest.mark.parametrize(("world", "poses"), [("manhattan", 1500), ("city_trees", 1500), ("sphere", 400)])

@@ -54,7 +54,7 @@ def test_a_replay_ends_at_the_reference_optimum(datasets: Path, name: str) -> No
     solver, before = replay(datasets / f"{name}.g2o")
     print(f"{name}: {time.thread_time() - start:.1f} s, χ² {before:.9g}, settled {solver.chi2():.12g}")
     assert solver.chi2() == pytest.approx(optimum, rel=relative, abs=absolute)
-    assert before == pytest.approx(optimum, rel=1e-4, abs=1e-6)
+    assert before == pytest.approx(optimum, rel=5e-4, abs=1e-6)
 
 
 @pytest.mark.parametrize(("mode", "relative"), [("all-batch", 1e-5), ("inc-l", 1e-4)])
