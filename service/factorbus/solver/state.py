@@ -4,6 +4,8 @@ Every attribute of the objects that a solver is made of belongs to its state, bu
 `NOT_KEPT`: what the constructor is given, and scratch memory that is made when it is needed.  So a new attribute is
 kept unless somebody says otherwise, and one that cannot be written is an error when the state is taken.
 
+Of an array with room behind what is in use, only that much is kept: the class tells of it in `in_use`.
+
 A state is a dict of arrays, numbers, text, None, lists, and dicts like it.
 """
 
@@ -23,7 +25,11 @@ _TYPE = "type"
 
 def dump(thing: Any) -> State:
     """The state of `thing`, a copy.  Raises TypeError for an attribute that no state can hold."""
-    return {name: _dumped(value, f"{type(thing).__name__}.{name}") for name, value in _kept(thing)}
+    used = thing.in_use() if hasattr(thing, "in_use") else {}
+    return {
+        name: _dumped(value[: used[name]] if name in used else value, f"{type(thing).__name__}.{name}")
+        for name, value in _kept(thing)
+    }
 
 
 def load(thing: Any, state: Mapping[str, Any], types: Mapping[str, type]) -> None:

@@ -118,6 +118,10 @@ class Tree(Arenas):
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
+    def in_use(self) -> dict[str, int]:
+        """Of the arenas that are by far the largest, how many entries a copy needs."""
+        return {"numbers": int(self.state[tl.S_NUMBERS]), "hessian": int(self.state[tl.S_HESSIAN])}
+
     def _make_room(self) -> None:
         self._make_room_for_graph()
         state = self.state
