@@ -33,6 +33,13 @@ def test_nothing_is_copied_where_pages_can_be_moved() -> None:
     assert owner.numbers.base.obj is base  # type: ignore[union-attr]
 
 
+def test_large_arrays_have_whole_huge_pages() -> None:
+    owner = Owner()
+    for size in (300_000, 1 << 20, 3_000_001):
+        pages.enlarge(owner, "numbers", size)
+        assert len(owner.numbers.base.obj) % (2 << 20) == 0  # type: ignore[union-attr]
+
+
 def test_a_view_that_somebody_has_stays_as_it_is() -> None:
     owner = Owner()
     owner.numbers[:] = 7.0

@@ -8,7 +8,7 @@ import numpy as np
 
 from factorbus.solver.kernels._jit import F64
 
-_DOUBLE, _LINE = 8, 64  # bytes
+_DOUBLE, _LINE, _HUGE_PAGE = 8, 64, 2 << 20  # bytes
 _PRIVATE = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS  # pages that are shared cannot grow
 _HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
 _NOTHING = np.empty(0)
@@ -16,7 +16,7 @@ _NOTHING = np.empty(0)
 
 def zeros(size: int) -> F64:
     """From the start of a cache line on, with a line behind them: tiles are read whole."""
-    return _seen(mmap.mmap(-1, _DOUBLE * size + _LINE, _PRIVATE), size)
+    return _seen(mmap.mmap(-1, _bytes(size), _PRIVATE), size)
 
 
 def enlarge(owner: object, name: str, size: int) -> None:
@@ -30,7 +30,7 @@ def enlarge(owner: object, name: str, size: int) -> None:
     if pages is not None:
         setattr(owner, name, _NOTHING)
         try:
-            pages.resize(_DOUBLE * size + _LINE)
+            pages.resize(_bytes(size))
             used = size
         except (BufferError, SystemError):
             pass  # it is copied
@@ -42,6 +42,16 @@ def enlarge(owner: object, name: str, size: int) -> None:
         larger = zeros(size)
         larger[:used] = getattr(owner, name)
         setattr(owner, name, larger)
+
+
+def _bytes(size: int) -> int:
+    """Of the pages for so many doubles: huge ones from the first size on that may have them.
+
+    Linux then puts them where huge pages can lie (from 6.7 on); with a line more they were moved to where they can't,
+    and fresh memory took five times as long: a third of the time of the longest steps of sphere2500.
+    """
+    size = _DOUBLE * size + _LINE
+    return size if size < _HUGE_PAGE else -(-size // _HUGE_PAGE) * _HUGE_PAGE
 
 
 def _pages_of(array: F64) -> mmap.mmap | None:
