@@ -9,7 +9,7 @@ from naive.elimination import partial_cholesky
 from factorbus.solver.kernels import _jit, simd_plain
 from factorbus.solver.kernels.dense import DEPTH, factor_front
 from factorbus.solver.kernels.fronts import SCRATCH
-from factorbus.solver.kernels.simd import LANES, add_run, solve_rows, tile, zero
+from factorbus.solver.kernels.simd import LANES, add_run, six, solve_rows, tile, zero
 
 
 @given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))
@@ -58,6 +58,17 @@ def test_solve_rows(rows, vectors):
     np.testing.assert_allclose(arena, expected, atol=1e-13)
 
 
+@pytest.mark.parametrize("depth", [3, 6])
+@pytest.mark.parametrize("stride", [1, 6])
+def test_six(depth, stride):
+    random = np.random.default_rng(depth)
+    x, y, out = random.normal(size=50), random.normal(size=60), random.normal(size=20)
+    expected = out.copy()
+    expected[9:15] = x[7 : 7 + depth * stride : stride] @ y[11 : 11 + 6 * depth].reshape(depth, 6)
+    _six(x, 7, stride, depth, y, 11, out, 9)
+    np.testing.assert_allclose(out, expected, atol=1e-13)
+
+
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 7, 8, 30])
 def test_runs(count):
     arena = np.arange(100.0)
@@ -104,6 +115,11 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
 @_jit.kernel
 def _tile(a, rows, vectors, c, ldc, x, y, ld, depth):
     tile(a, rows, vectors, c, ldc, x, y, ld, depth)
+
+
+@_jit.kernel
+def _six(x, i, stride, depth, y, j, out, to):
+    six(x, i, stride, depth, y, j, out, to)
 
 
 @_jit.kernel

@@ -10,13 +10,13 @@ behind range checks, NUMBA_BOUNDSCHECK=1) and `simd_plain` (NumPy, NUMBA_DISABLE
 from factorbus.solver.kernels._jit import BOUNDSCHECK, DISABLED, vector_lanes
 
 if DISABLED:
-    from factorbus.solver.kernels.simd_plain import add_run, at, put, solve_rows, tile, zero
+    from factorbus.solver.kernels.simd_plain import add_run, at, put, six, solve_rows, tile, zero
 elif BOUNDSCHECK:
-    from factorbus.solver.kernels.simd_checked import add_run, at, put, solve_rows, tile, zero
+    from factorbus.solver.kernels.simd_checked import add_run, at, put, six, solve_rows, tile, zero
 else:
-    from factorbus.solver.kernels.simd_llvm import add_run, at, put, solve_rows, tile, zero
+    from factorbus.solver.kernels.simd_llvm import add_run, at, put, six, solve_rows, tile, zero
 
-__all__ = ["LANES", "TILE_ROWS", "TILE_VECTORS", "add_run", "at", "put", "solve_rows", "tile", "zero"]
+__all__ = ["LANES", "TILE_ROWS", "TILE_VECTORS", "add_run", "at", "put", "six", "solve_rows", "tile", "zero"]
 
 LANES = vector_lanes()
 TILE_ROWS = 4

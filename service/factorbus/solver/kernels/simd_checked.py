@@ -7,7 +7,7 @@ from factorbus.solver.kernels._jit import F64, inline_kernel, vector_lanes
 
 _LANES = vector_lanes()
 _at, _put, _zero, _add_run = simd_llvm.at, simd_llvm.put, simd_llvm.zero, simd_llvm.add_run
-_tile, _solve_rows = simd_llvm.tile, simd_llvm.solve_rows
+_tile, _solve_rows, _six = simd_llvm.tile, simd_llvm.solve_rows, simd_llvm.six
 
 
 @inline_kernel
@@ -49,6 +49,14 @@ def solve_rows(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None
     _within(a, c, (rows - 1) * ld + vectors * _LANES)
     _within(a, t, 10)
     _solve_rows(a, rows, vectors, c, ld, t)
+
+
+@inline_kernel
+def six(x: F64, i: int, stride: int, depth: int, y: F64, j: int, out: F64, to: int) -> None:
+    _within(x, i, (depth - 1) * stride + 1)
+    _within(y, j, 6 * depth)
+    _within(out, to, 6)
+    _six(x, i, stride, depth, y, j, out, to)
 
 
 @inline_kernel

@@ -9,7 +9,7 @@ LANES = vector_lanes()
 _F64 = ir.DoubleType()
 _I64 = ir.IntType(64)
 _PTR = _F64.as_pointer()
-_VEC = ir.VectorType(_F64, LANES)
+_VEC, _SIX = ir.VectorType(_F64, LANES), ir.VectorType(_F64, 6)
 _INT = types.int64
 
 
@@ -89,6 +89,25 @@ def solve_rows(_typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ld: An
         return context.get_dummy_value()
 
     return types.void(a, *[_INT] * 5), emit
+
+
+@intrinsic
+def six(_typing: Any, x: Any, _i: Any, _stride: Any, _depth: Any, y: Any, _j: Any, out: Any, _to: Any) -> Any:
+    """A row of six sums: see `simd_plain.six`"""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        x, i, stride, depth, y, j, out, to = args
+        x = _address(context, builder, signature, x, i)
+        y = _address(context, builder, signature, y, j, 4)
+        out = _address(context, builder, signature, out, to, 6)
+        with _loop(builder, _I64(0), depth, 1, [ir.Constant(_SIX, [0.0] * 6)]) as (k, carried):
+            factor = _spread(builder, builder.load(builder.gep(x, [builder.mul(k, stride)])), _SIX)
+            row = _load(builder, builder.gep(y, [builder.mul(k, _I64(6))]), _SIX)
+            carried[0] = _multiply_add(builder, factor, row, carried[0])
+        _store(builder, carried.final[0], out)
+        return context.get_dummy_value()
+
+    return types.void(x, _INT, _INT, _INT, y, _INT, out, _INT), emit
 
 
 def _build_add_run(builder: Any, target: Any, source: Any, count: Any) -> None:
@@ -203,17 +222,17 @@ def _define(builder: Any, name: str, kinds: list[Any], build: Any) -> Any:
     return function
 
 
-def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(signature.args[0])(context, builder, array).data
+def _address(context: Any, builder: Any, signature: Any, array: Any, index: Any, which: int = 0) -> Any:
+    data = context.make_array(signature.args[which])(context, builder, array).data
     return builder.gep(data, [index])
 
 
-def _load(builder: Any, pointer: Any) -> Any:
-    return builder.load(builder.bitcast(pointer, _VEC.as_pointer()), align=8)
+def _load(builder: Any, pointer: Any, kind: Any = _VEC) -> Any:
+    return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=8)
 
 
 def _store(builder: Any, value: Any, pointer: Any) -> None:
-    builder.store(value, builder.bitcast(pointer, _VEC.as_pointer()), align=8)
+    builder.store(value, builder.bitcast(pointer, value.type.as_pointer()), align=8)
 
 
 def _load_one(builder: Any, pointer: Any) -> Any:
@@ -224,14 +243,15 @@ def _store_one(builder: Any, value: Any, pointer: Any) -> None:
     builder.store(value, pointer)
 
 
-def _spread(builder: Any, value: Any) -> Any:
+def _spread(builder: Any, value: Any, kind: Any = _VEC) -> Any:
     """The value in every lane."""
-    first = builder.insert_element(ir.Constant(_VEC, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+    lanes = ir.VectorType(ir.IntType(32), kind.count)
+    return builder.shuffle_vector(first, first, ir.Constant(lanes, [0] * kind.count))
 
 
 def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """a·b + c, fused where the processor can."""
-    kind = ir.FunctionType(_VEC, [_VEC] * 3)
-    fused = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{LANES}f64")
+    kind = ir.FunctionType(c.type, [c.type] * 3)
+    fused = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fmuladd.v{c.type.count}f64")
     return builder.call(fused, [a, b, c])

@@ -42,3 +42,8 @@ def solve_rows(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None
         for k in range(i):
             lines[i] -= a[t + TRIANGLE[k, i]] * lines[k]
         lines[i] *= a[t + i]
+
+
+def six(x: F64, i: int, stride: int, depth: int, y: F64, j: int, out: F64, to: int) -> None:
+    """out[to : to+6] = Σ x[i + k stride] y[j + 6 k : j + 6 k + 6], k from 0 to depth − 1"""
+    out[to : to + 6] = sum(x[i + k * stride] * y[j + 6 * k : j + 6 * k + 6] for k in range(depth))

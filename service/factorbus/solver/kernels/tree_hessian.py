@@ -6,7 +6,8 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.linearise import evaluate_apart, multiply
-from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.simd import put, six
 from factorbus.solver.kernels.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.kernels.tree_bend import lever_of, root_weight
 from factorbus.solver.lenses.layout import GOOD
@@ -39,7 +40,7 @@ def linearise_factor(
         _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
         stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
-        _write(6, 6, 6, p, more, payload, r, H, W, h, hessian)
+        _write_between_se3(p, more, payload, r, H, W, h, hessian)
         stiff[f, tl.B_PULL] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
@@ -73,6 +74,41 @@ def _write_other(kind: int, p: int, more: float, payload: F64, r: F64, H: F64, W
     """Of the kinds that are not worth straight code."""
     di, dj = end_dims(kind)
     _write(residual_dim(kind), di, dj, p, more, payload, r, H, W, h, out)
+
+
+@part
+def _write_between_se3(p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+    """`_write`, in half its products: the lower left quarter of both Jacobians and the upper right one of B are zero.
+
+    Of A, B, Ω A and Ω B side by side in J, six a row, all places are constants: so rows become vectors.
+    """
+    J, M = H.reshape(144), W.reshape(36)
+    for a in range(6):
+        for b in range(a, 6):
+            M[6 * a + b] = M[6 * b + a] = payload[p]
+            p += 1
+    chi2 = more
+    for a in range(6):
+        e = 0.0
+        for b in range(6):
+            e += load(M, 6 * a + b) * r[b]
+        chi2 += r[a] * e
+    for a in range(6):
+        six(M, 6 * a, 1, 6, J, 0, J, 72 + 6 * a)
+        six(M, 6 * a, 1, 6, J, 36, J, 108 + 6 * a)
+    for a in range(3):
+        six(J, a, 6, 3, J, 72, out, h + 6 * a)
+        six(J, a, 6, 3, J, 108, out, h + 36 + 6 * a)
+        six(J, 36 + a, 6, 3, J, 108, out, h + 72 + 6 * a)
+    for a in range(3, 6):
+        six(J, a, 6, 6, J, 72, out, h + 6 * a)
+        six(J, a, 6, 6, J, 108, out, h + 36 + 6 * a)
+        six(J, 54 + a, 6, 3, J, 126, out, h + 72 + 6 * a)
+    for a in range(6):
+        r[a] = -r[a]
+    six(r, 0, 1, 6, J, 72, out, h + 108)
+    six(r, 0, 1, 6, J, 108, out, h + 114)
+    put(out, h + 120, chi2)
 
 
 @inline_kernel

@@ -138,12 +138,26 @@ def add_hessian(
     f: int, row: I64, column: I64, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
 ) -> None:
     """Add the Hessian of factor f, its gradient and its χ² to a front."""
-    i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
-    last = row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
     di = dim_of_variable(var, i)
     dj = dim_of_variable(var, j) if j >= 0 else 0
     ci = column[node[i, tl.N_LOCAL]] if var[i, at.V_COLUMN] >= 0 else -1
     cj = column[node[j, tl.N_LOCAL]] if j >= 0 and var[j, at.V_COLUMN] >= 0 else -1
+    # Sizes as constants, so that each call becomes straight code.
+    if di == 3 and dj == 3:
+        _add_blocks(3, 3, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    elif di == 6 and dj == 6:
+        _add_blocks(6, 6, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    elif di == 3 and dj == 2:
+        _add_blocks(3, 2, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    else:
+        _add_blocks(di, dj, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+
+
+@inline_kernel
+def _add_blocks(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F64, numbers: F64) -> None:
+    """`add_hessian` of variables of di and dj scalars, at columns ci and cj; −1: there is none, or it is fixed."""
+    last = row[tl.C_PIVOTS] + row[tl.C_BORDER]
     g = h + di * di + di * dj + dj * dj
     if ci >= 0:
         _add_diagonal(di, ci, last, h, g, row, hessian, numbers)

@@ -1,0 +1,41 @@
+"""Moving linearisation points: whatever moves, its factors are linearised again, each once, and no others."""
+
+import numpy as np
+import pytest
+
+from factorbus.simulate import manhattan
+from factorbus.solver import Options, Solver
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_relinearise import SPARSE, linearise_around
+
+
+@pytest.fixture(scope="module")
+def driven() -> Solver:
+    solver = Solver(Options())
+    for step in manhattan(400, 1):
+        solver.stage(step.batch)
+        solver.step()
+    return solver
+
+
+@pytest.mark.parametrize("picked", [[3], [5, 390], list(range(40, 60)), list(range(1, 400))])
+def test_the_factors_of_some_variables_are_linearised(driven: Solver, picked: list[int]) -> None:
+    assert driven._tree
+    tree, graph = driven._tree.tree, driven._graph
+    count = int(tree.state[tl.S_FACTORS])
+    ends = graph.fac[:count, [at.F_I, at.F_J]]
+    around = np.flatnonzero(np.isin(ends, picked).any(axis=1))
+    if len(picked) == 2:
+        assert np.ptp(around) >= SPARSE * around.size, "far apart: found by walking"
+    right, wrong = tree.hessian.copy(), np.full(tree.hessian.size, np.nan)
+    linearise_around(
+        np.array(picked), graph.var, graph.fac, graph.payload, tree.node, tree.link, wrong, tree.lin, tree.stiff,
+        tree.state,
+    )  # fmt: skip
+    starts = np.append(tree.link[:count, tl.L_AT], tree.state[tl.S_HESSIAN])
+    done = [
+        f for f in range(count) if np.array_equal(wrong[starts[f] : starts[f + 1]], right[starts[f] : starts[f + 1]])
+    ]
+    assert done == around.tolist()
+    assert np.isnan(wrong).sum() == wrong.size - sum(int(starts[f + 1] - starts[f]) for f in done)
