@@ -71,11 +71,11 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 0.001
-    bent_soon: float = 5e-4
+    bent_soon: float = 3e-4
     bent_now: float = 4e-3
     bent_most: float = 2.0
     patience: int = 1000
-    rest: int = 64
+    rest: int = 128
     reluctance: float = 8.0
     trust: float = 3.0
     rounds: int = 3

@@ -14,7 +14,16 @@ from factorbus.solver.kernels.sights import move_idp
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
-from factorbus.solver.kernels.tree_bend import axes_of, bend_of, may_slip, shift_between, slip_between, slip_of, turn_of
+from factorbus.solver.kernels.tree_bend import (
+    SEEN,
+    axes_of,
+    bend_of,
+    may_slip,
+    shift_between,
+    slip_between,
+    slip_of,
+    turn_of,
+)
 from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
@@ -95,7 +104,10 @@ def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -
 
 @inline_kernel
 def solve_rows(row: I64, numbers: F64) -> None:
-    """δ_F = R_F⁻¹ (d − R_S δ_S), the product first: its rows do not wait for each other."""
+    """δ_F = R_F⁻¹ (d − R_S δ_S), the product first: its rows do not wait for each other.
+
+    Of a pivot only the product with the one that was solved just before waits for that.
+    """
     p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
     width = p + row[tl.C_BORDER]
     for i in range(p):
@@ -103,11 +115,15 @@ def solve_rows(row: I64, numbers: F64) -> None:
         for k in range(p, width):
             total += load(numbers, line + k) * load(numbers, used + k)
         put(numbers, used + i, load(numbers, line + width) - total)
+    before = 0.0
     for i in range(p - 1, -1, -1):
-        line, total = row[tl.C_ROWS] + i * ld, 0.0
-        for k in range(i + 1, p):
-            total += load(numbers, line + k) * load(numbers, used + k)
-        put(numbers, used + i, (load(numbers, used + i) - total) / load(numbers, line + i))
+        line, total = row[tl.C_ROWS] + i * ld, load(numbers, used + i)
+        share = 1.0 / load(numbers, line + i)
+        for k in range(i + 2, p):
+            total -= load(numbers, line + k) * load(numbers, used + k)
+        # Behind the last column there is d, and `before` is zero.
+        before = (total - load(numbers, line + i + 1) * before) * share
+        put(numbers, used + i, before)
 
 
 @inline_kernel
@@ -209,11 +225,14 @@ def look(
                     if not turned:
                         axes, turned = axes_of(planar, x, values), True
                     slip = slip_between(planar, axes, x, y, shift, values, stiff, f)
-                most = max(most, bend + slip)
-                if bend + slip > bent:
-                    pull += (bend + slip) * (bend + slip)
+                both = kind == at.BEARING_RANGE_SE2 or slip > bend
+                bend += slip
+                most = max(most, bend)
+                if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
+                    bend *= SEEN
+                if bend > bent:
+                    pull += bend * bend
                     await_move(v, node, pending, state)
-                    both = kind == at.BEARING_RANGE_SE2 or slip > bend
                     if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
                         await_move(link[f, tl.L_SECOND], node, pending, state)
             slot = next_incidence(slot, link)
