@@ -177,6 +177,7 @@ MESSAGES = {
         BATCHES,
         st.booleans(),
         NUMBERS,
+        points_below=DOUBLES.map(lambda below: below or 0.0),  # none is as good as 0, and neither is sent
         changes=st.lists(changes(), max_size=3).map(tuple),
     ),
     "accepted": st.builds(Accepted, NUMBERS, NUMBERS, NUMBERS, NUMBERS, NUMBERS, REPORTS),
