@@ -63,19 +63,25 @@ class RosNode:
         replies = self._bus.liveliness().get(f"@ros2_lv/{self._domain}/**", timeout=5)
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
-    def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> None:
-        """Until so many publishers and subscriptions are seen: a token comes after what it stands for."""
+    def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> list[str]:
+        """The tokens of nodes, publishers and subscriptions, once a node and so many others are seen.
+
+        A token comes after what it stands for; in what order they come is not said.
+        """
         seen: queue.SimpleQueue[str] = queue.SimpleQueue()
 
         def see(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr).split("/")[5] in ("MP", "MS"):
+            if sample.kind == zenoh.SampleKind.PUT:
                 seen.put(str(sample.key_expr))
 
         key = f"@ros2_lv/{self._domain}/**"
         watching = self._bus.liveliness().declare_subscriber(key, Callback(see, indirect=False), history=True)
-        for _ in range(count):
-            seen.get(timeout=timeout_s)
+        tokens, kinds = list[str](), list[str]()
+        while kinds.count("MP") + kinds.count("MS") < count or "NN" not in kinds:
+            tokens.append(seen.get(timeout=timeout_s))
+            kinds.append(tokens[-1].split("/")[5])
         watching.undeclare()
+        return tokens
 
     def wait_for(self, topic: str, timeout_s: float = 30.0) -> tuple[Any, Any]:
         """The next message on a topic; others are passed over."""

@@ -31,11 +31,10 @@ def main() -> None:
             say("quiet")
             continue
         endpoint, given = rest[0], json.loads(rest[1])
-        pid = os.fork()
-        if pid == 0:
+        if os.fork() == 0:
             os.close(0)
+            say("born", os.getpid())  # before anything else it says, which a parent's word of it might come after
             run(checked(Config(**{"listen": (endpoint,), "warm": False, "create": ("m",), **given})))
-        say("born", pid)
 
 
 def run(config: Config) -> None:
