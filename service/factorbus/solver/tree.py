@@ -41,6 +41,7 @@ class Tree(Arenas):
             options.patience,
             options.bent_most,
         )
+        self.settings[tl.P_MANY] = options.many
         self.settings[[tl.P_REST, tl.P_RELUCTANCE]] = options.rest, options.reluctance
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
         self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_WORTH]] = options.heavy, options.near, options.worth

@@ -11,7 +11,7 @@ p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; colu
 The arenas of a tree are:
     node    (n, 13) int64     one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
-    clique  (c, 20) int64    records of cliques
+    clique  (c, 21) int64    records of cliques
     lists   int64            variables of cliques
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
@@ -28,7 +28,7 @@ The arenas of a tree are:
                              since they were looked at last
     marked  (c,) int64       scratch: cliques that an elimination touches
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (19,) float64   see P_RIPPLE and so on
+    settings (20,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (5,) float64     what a step found
 """
@@ -97,12 +97,13 @@ C_NEXT = 11  # next child of the same parent; next free record
 C_ABOVE = 12  # place in the parent's list of the first separator variable to be eliminated
 C_MARK = 13  # the last elimination that touched it
 C_FIRST = 14  # the first place touched then
-C_USED = 15  # where the separator's δ is that the frontals were solved with last, m doubles
-C_BLOCK = 16  # the block that holds rows and used δ, and its size
+C_USED = 15  # where δ_F and δ_S are as the frontals were solved last, p + m doubles, and the motion since, (9.20)
+C_BLOCK = 16  # the block that holds all of that and the rows, and its size
 C_BLOCK_SIZE = 17
 C_UPDATE_BLOCK_SIZE = 18
 C_LIST_SIZE = 19
-C_WIDTH = 20
+C_ANCHORED = 20  # 1: a factor in it or below tells where in the world its variables are
+C_WIDTH = 21
 
 # Entries of `state`.
 S_STAMP = 0  # of the present elimination
@@ -176,7 +177,8 @@ P_WORTH = 15  # when with it this share has been spent of what that took the las
 P_NEAR = 16  # so many scalars, times the cube root of the flops
 P_REST = 17  # for so many steps after a relinearisation P_SOON is more,
 P_RELUCTANCE = 18  # up to so many times
-P_SIZE = 19
+P_MANY = 19  # P_SOON and P_BENT_NOW are for so many variables that wait, (9.22)
+P_SIZE = 20
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

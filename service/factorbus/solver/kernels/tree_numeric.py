@@ -16,6 +16,7 @@ from factorbus.solver.kernels.simd import TILE_ROWS, add_run, put, zero
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.tree_fronts import update_layout
 from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
+from factorbus.solver.kernels.tree_rigid import is_relative
 from factorbus.solver.kernels.tree_store import give_numbers, size_class, take_numbers
 
 
@@ -60,7 +61,9 @@ def eliminate_fronts(
                     floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
             width += dim
         clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
+        anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
+            anchored |= int(not is_relative(factor_of[q], var, fac))
             add_hessian(factor_of[q], row, column, var, fac, node, link, hessian, numbers)
         child = records[f, fr.CHILD]
         while child >= 0:
@@ -68,6 +71,7 @@ def eliminate_fronts(
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
             k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_LDU], runs, k, row)
+            anchored |= other[tl.C_ANCHORED]
             child = records[child, fr.SIBLING]
         e = orphan_of[f]
         while e >= 0:
@@ -75,7 +79,9 @@ def eliminate_fronts(
             first, end = separators_of(orphans[e], stamp, clique)
             k = list_runs(start + first, start + end, column, p, m, var, node, lists, runs)
             extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
+            anchored |= clique[orphans[e], tl.C_ANCHORED]
             e = after[e]
+        row[tl.C_ANCHORED] = anchored
         failed = factor_front(
             numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU], floors, 0
         )

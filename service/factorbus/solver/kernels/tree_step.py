@@ -30,17 +30,19 @@ from factorbus.solver.kernels.tree_fronts import (
     keep_root,
     place_fronts,
 )
+from factorbus.solver.kernels.tree_look import burden, find_bent
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
-from factorbus.solver.kernels.tree_solve import find_bent, substitute
+from factorbus.solver.kernels.tree_solve import substitute
 from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
 
 FREE = 0
-LEAST_CHI2 = 1e-3
+LEAST_CHI2 = 1e-2
+QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
 
 
 @kernel("int64(int64[::1], int64[::1])")
@@ -109,7 +111,8 @@ def tree_step(graph: I64, tree: I64) -> int:
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        if state[tl.S_WAIT] != 0 or not pull > scaled[tl.P_BENT_NOW] or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
+        again = pull > scaled[tl.P_BENT_NOW] * burden(settings, state)
+        if state[tl.S_WAIT] != 0 or not again or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
@@ -244,8 +247,8 @@ def eliminate_again(
     now = lap(now, tl.COMMIT, state)
     # 8
     substitute(
-        ids, settings[tl.P_RIPPLE], var, node, clique, lists, numbers, lin, scalars, turns, values, changed, moved,
-        state, account,
+        ids, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers, lin, scalars,
+        turns, values, changed, moved, state, account,
     )  # fmt: skip
     bow = pull = 0.0
     # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.

@@ -1,0 +1,121 @@
+"""What is bent of what moved, and whether that is due to be relinearised.  MATH §9.6."""
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.tree_bend import (
+    SEEN,
+    axes_of,
+    bend_of,
+    may_slip,
+    shift_between,
+    slip_between,
+    slip_of,
+    turn_of,
+)
+from factorbus.solver.kernels.tree_exact import exact_bend
+from factorbus.solver.kernels.tree_relinearise import WAITS
+from factorbus.solver.kernels.tree_take_in import next_incidence
+
+LEAST_BURDEN, MOST_BURDEN = 0.1, 2.0
+
+
+@part
+def find_bent(
+    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64,
+    scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
+) -> tuple[float, float]:  # fmt: skip
+    """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
+    what moved, and Σ bend² of all that waits.
+    """
+    if state[tl.S_PENDING] == 0:
+        state[tl.S_WAITING] = state[tl.S_STEP]
+    bent = settings[tl.P_BENT]
+    most = look(
+        bent, var, fac, payload, node, link, stiff, lin, scalars, values, turns, pending, moved, state
+    )  # fmt: skip
+    for k in range(state[tl.S_MOVED]):
+        node[moved[k], tl.N_LISTED] = 0
+    state[tl.S_MOVED] = 0
+    total, waited = 0.0, state[tl.S_STEP] - state[tl.S_WAITING]
+    for k in range(state[tl.S_PENDING]):
+        total += turns[pending[k], tl.U_STRAIN]
+    worth = total > settings[tl.P_SOON] * burden(settings, state)
+    if worth or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
+        state[tl.S_DUE] = 1
+    return most, total
+
+
+@part
+def look(
+    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64,
+    scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
+) -> float:  # fmt: skip
+    """Add to `pending` what is to be relinearised of the `moved` variables: the poses with a factor that is bent by
+    more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.13), and both ends of
+    one for which that is computed, (9.11).  turns: gets Σ bend² of each.  Gives the largest bend.
+    """
+    most, delta = 0.0, scalars[0]
+    for k in range(state[tl.S_MOVED]):
+        v = moved[k]
+        pull, phi = 0.0, turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
+        if phi == 0.0 and state[tl.S_EXACT] == 0:
+            continue
+        planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
+        axes, turned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), False
+        slot = node[v, tl.N_ADJ]
+        while slot >= 0:
+            f = slot // 2
+            kind, y = link[f, tl.L_KIND], link[f, tl.L_FAR]
+            if kind >= tl.EXACT:
+                bend = exact_bend(f, var, fac, lin, values, payload, delta)
+                most = max(most, bend)
+                if bend > bent:
+                    pull += 0.5 * bend * bend  # half of it for each end
+                    await_ends(f, fac, var, node, pending, state)
+            elif slot % 2 == 0 and phi > 0.0 and y >= 0:
+                d, root, pulled = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], stiff[f, tl.B_PULL]
+                shift = shift_between(planar, x, y, values, lin)
+                bend = bend_of(kind, root, d, phi, shift)
+                slip = slip_of(kind, root, d, shift, pulled)
+                if may_slip(kind, root, d, phi, shift, pulled, stiff[f, tl.B_TURN], bent - bend):
+                    if not turned:
+                        axes, turned = axes_of(planar, x, values), True
+                    slip = slip_between(planar, axes, x, y, shift, values, stiff, f)
+                both = kind == at.BEARING_RANGE_SE2 or slip > bend
+                bend += slip
+                most = max(most, bend)
+                if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
+                    bend *= SEEN
+                if bend > bent:
+                    pull += bend * bend
+                    await_move(v, node, pending, state)
+                    if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
+                        await_move(link[f, tl.L_SECOND], node, pending, state)
+            slot = next_incidence(slot, link)
+        turns[v, tl.U_STRAIN] = pull
+    return most
+
+
+@inline_kernel
+def await_ends(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
+    """The variables of factor f that are free are to be relinearised."""
+    for end in range(2):
+        v = fac[f, at.F_I + end]
+        if v >= 0 and var[v, at.V_COLUMN] >= 0:
+            await_move(v, node, pending, state)
+
+
+@inline_kernel
+def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
+    """Variable v is to be relinearised."""
+    if node[v, tl.N_FLAGS] == 0:
+        node[v, tl.N_FLAGS] = WAITS
+        pending[state[tl.S_PENDING]] = v
+        state[tl.S_PENDING] += 1
+
+
+@inline_kernel
+def burden(settings: F64, state: I64) -> float:
+    """By how much more than `many` variables what waits has to be worth to be relinearised.  (9.22)"""
+    return min(max(state[tl.S_PENDING] / settings[tl.P_MANY], LEAST_BURDEN), MOST_BURDEN)

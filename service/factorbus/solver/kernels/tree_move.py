@@ -1,0 +1,52 @@
+"""The estimate of variables of which δ is another one."""
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel
+from factorbus.solver.kernels.points import move_point2, move_point3
+from factorbus.solver.kernels.se2 import turn_se2
+from factorbus.solver.kernels.se3 import move_se3
+from factorbus.solver.kernels.sights import move_idp
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.sizes import size_of
+
+
+@inline_kernel
+def move_variable(
+    v: int, var: I64, node: I64, delta: F64, lin: F64, before: F64, turns: F64, values: F64, changed: I64, state: I64
+) -> None:
+    """The estimate of variable v, of which δ is another one."""
+    kind, x = var[v, at.V_KIND], var[v, at.V_AT]
+    if node[v, tl.N_MOVED] != state[tl.S_STEP]:
+        node[v, tl.N_MOVED] = state[tl.S_STEP]
+        changed[state[tl.S_CHANGED]] = v
+        state[tl.S_CHANGED] += 1
+        for a in range(size_of(kind)):
+            put(before, x + a, load(values, x + a))
+    if kind == at.SE2:
+        turn_se2(lin, x, turns[v, tl.U_COS], turns[v, tl.U_SIN], delta, var[v, at.V_SCALAR], values)
+    else:
+        move_to(kind, lin, x, delta, var[v, at.V_SCALAR], values)
+
+
+@inline_kernel
+def list_moved(v: int, node: I64, moved: I64, state: I64) -> None:
+    """It is looked for what is bent of variable v."""
+    if node[v, tl.N_LISTED] == 0:
+        node[v, tl.N_LISTED] = 1
+        moved[state[tl.S_MOVED]] = v
+        state[tl.S_MOVED] += 1
+
+
+@inline_kernel
+def move_to(kind: int, lin: F64, x: int, delta: F64, d: int, out: F64) -> None:
+    """out = lin ⊞ δ, of what is no plane pose."""
+    if kind == at.SE3:
+        move_se3(lin, x, delta, d, out)
+    elif kind == at.POINT2:
+        move_point2(lin, x, delta, d, out)
+    elif kind == at.IDP:
+        move_idp(lin, x, delta, d, out)
+    else:
+        move_point3(lin, x, delta, d, out)

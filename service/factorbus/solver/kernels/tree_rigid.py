@@ -1,0 +1,248 @@
+"""Subtrees that move as a whole.  MATH §9.7.
+
+Relative measurements do not change when all that they join moves together, so neither do the rows of R made of them:
+with the motion of the map as a rigid body, ξ = (t, ω), and J the displacement by it in the tangent space of each
+variable at its linearisation point,
+
+    R_F J_F + R_S J_S = 0                                                                    (9.20)
+
+Where the separator moved by J_S ξ, all that was eliminated below it moves by J ξ, and none of it has to be solved.
+"""
+
+import math
+
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.se3 import rotation
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.tree_bend import turn_of
+from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_move import list_moved, move_variable
+
+MOTION = 6  # numbers of a motion: t, ω
+# Scratch of this: ξ since a clique was solved, what of it is new, and the displacement of the variable at hand.
+WHOLE, FRESH, LOCAL, SIZE = 0, 6, 12, 18
+SINGULAR = 1e-12
+
+
+@inline_kernel
+def is_relative(f: int, var: I64, fac: I64) -> bool:
+    """Whether factor f tells nothing of where in the world its variables are."""
+    kind, j = fac[f, at.F_KIND], fac[f, at.F_J]
+    if j < 0 or var[j, at.V_COLUMN] < 0 or var[fac[f, at.F_I], at.V_COLUMN] < 0:
+        return False
+    return (
+        at.BETWEEN_SE2 <= kind <= at.BEARING_RANGE_SE2
+        or kind == at.POINT_SEEN
+        or at.RANGE_SE2 <= kind <= at.BEARING_SE3
+    )
+
+
+@part
+def fit_motion(
+    row: I64, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64, motion: F64
+) -> bool:
+    """Whether the separator moved as a rigid body since the frontals were solved with it, no scalar being off by more
+    than √far σ; motion gets ξ.
+    """
+    first = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    last, used = first + row[tl.C_SEPARATORS], row[tl.C_USED] + row[tl.C_PIVOTS]
+    kind = var[lists[first], at.V_KIND]
+    if kind == at.SE2 or kind == at.POINT2:
+        fit_plane(first, last, used, var, lists, numbers, delta, weight, lin, turns, motion)
+    elif not fit_space(first, last, used, var, lists, numbers, delta, weight, lin, motion):
+        return False
+    for s in range(first, last):
+        v = lists[s]
+        d = var[v, at.V_SCALAR]
+        displace(v, var, lin, turns, motion, WHOLE, motion)
+        for a in range(dim_of_variable(var, v)):
+            gap = load(delta, d + a) - load(numbers, used) - load(motion, LOCAL + a)
+            if not gap * gap * load(weight, d + a) <= far:
+                return False
+            used += 1
+    for a in range(MOTION):
+        motion[FRESH + a] = motion[WHOLE + a] - load(numbers, used + a)
+    return True
+
+
+@inline_kernel
+def fit_plane(
+    first: int, last: int, used: int, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64,
+    turns: F64, motion: F64,
+) -> None:  # fmt: skip
+    """ξ nearest to how the variables moved, by the weights of their first scalars."""
+    x0, y0 = load(lin, var[lists[first], at.V_AT]), load(lin, var[lists[first], at.V_AT] + 1)
+    mass = px = py = ux = uy = inertia = pull = 0.0
+    for s in range(first, last):
+        v = lists[s]
+        d, x = var[v, at.V_SCALAR], var[v, at.V_AT]
+        w, dx, dy = load(weight, d), load(lin, x) - x0, load(lin, x + 1) - y0
+        gx, gy = load(delta, d) - load(numbers, used), load(delta, d + 1) - load(numbers, used + 1)
+        used += 2
+        if var[v, at.V_KIND] == at.SE2:
+            c, z, stiff = turns[v, tl.U_COS], turns[v, tl.U_SIN], load(weight, d + 2)
+            gx, gy = c * gx - z * gy, z * gx + c * gy
+            inertia += stiff
+            pull += stiff * (load(delta, d + 2) - load(numbers, used))
+            used += 1
+        mass += w
+        px += w * dx
+        py += w * dy
+        ux += w * gx
+        uy += w * gy
+        inertia += w * (dx * dx + dy * dy)
+        pull += w * (dx * gy - dy * gx)
+    inertia -= (px * px + py * py) / mass
+    pull -= (px * uy - py * ux) / mass
+    turn = pull / inertia if inertia > 0.0 else 0.0
+    px, py = px / mass + x0, py / mass + y0
+    motion[WHOLE], motion[WHOLE + 1], motion[WHOLE + 2] = ux / mass + turn * py, uy / mass - turn * px, 0.0
+    motion[WHOLE + 3], motion[WHOLE + 4], motion[WHOLE + 5] = 0.0, 0.0, turn
+
+
+@inline_kernel
+def moved_in_space(d: int, place: int, x: int, kind: int, numbers: F64, delta: F64, lin: F64) -> tuple:
+    """How a variable moved and turned, in the map's frame."""
+    gx, gy = load(delta, d) - load(numbers, place), load(delta, d + 1) - load(numbers, place + 1)
+    gz = load(delta, d + 2) - load(numbers, place + 2)
+    if kind != at.SE3:
+        return gx, gy, gz, 0.0, 0.0, 0.0
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(lin, x + 3)
+    hx, hy = load(delta, d + 3) - load(numbers, place + 3), load(delta, d + 4) - load(numbers, place + 4)
+    hz = load(delta, d + 5) - load(numbers, place + 5)
+    return (
+        a0 * gx + a1 * gy + a2 * gz,
+        a3 * gx + a4 * gy + a5 * gz,
+        a6 * gx + a7 * gy + a8 * gz,
+        a0 * hx + a1 * hy + a2 * hz,
+        a3 * hx + a4 * hy + a5 * hz,
+        a6 * hx + a7 * hy + a8 * hz,
+    )
+
+
+@inline_kernel
+def fit_space(
+    first: int, last: int, used: int, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, motion: F64
+) -> bool:
+    """The same of poses and points in space; False: any turn about some axis would do."""
+    origin = var[lists[first], at.V_AT]
+    x0, y0, z0 = load(lin, origin), load(lin, origin + 1), load(lin, origin + 2)
+    mass = px = py = pz = ux = uy = uz = 0.0
+    xx = xy = xz = yy = yz = zz = bx = by = bz = 0.0
+    for s in range(first, last):
+        v = lists[s]
+        d, x, w = var[v, at.V_SCALAR], var[v, at.V_AT], load(weight, var[v, at.V_SCALAR])
+        gx, gy, gz, hx, hy, hz = moved_in_space(d, used, x, var[v, at.V_KIND], numbers, delta, lin)
+        stiff = load(weight, d + 3) if var[v, at.V_KIND] == at.SE3 else 0.0
+        used += dim_of_variable(var, v)
+        qx, qy, qz = load(lin, x) - x0, load(lin, x + 1) - y0, load(lin, x + 2) - z0
+        mass += w
+        px += w * qx
+        py += w * qy
+        pz += w * qz
+        ux += w * gx
+        uy += w * gy
+        uz += w * gz
+        xx += w * (qy * qy + qz * qz) + stiff
+        yy += w * (qx * qx + qz * qz) + stiff
+        zz += w * (qx * qx + qy * qy) + stiff
+        xy -= w * qx * qy
+        xz -= w * qx * qz
+        yz -= w * qy * qz
+        bx += w * (qy * gz - qz * gy) + stiff * hx
+        by += w * (qz * gx - qx * gz) + stiff * hy
+        bz += w * (qx * gy - qy * gx) + stiff * hz
+    # About the centre.
+    xx, yy, zz = xx - (py * py + pz * pz) / mass, yy - (px * px + pz * pz) / mass, zz - (px * px + py * py) / mass
+    xy, xz, yz = xy + px * py / mass, xz + px * pz / mass, yz + py * pz / mass
+    bx, by, bz = bx - (py * uz - pz * uy) / mass, by - (pz * ux - px * uz) / mass, bz - (px * uy - py * ux) / mass
+    px, py, pz = px / mass + x0, py / mass + y0, pz / mass + z0
+    ux, uy, uz = ux / mass, uy / mass, uz / mass
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    cyy, cyz, czz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    det = xx * cxx + xy * cxy + xz * cxz
+    trace = xx + yy + zz
+    if not det > SINGULAR * trace * trace * trace:
+        return False
+    ox, oy = (cxx * bx + cxy * by + cxz * bz) / det, (cxy * bx + cyy * by + cyz * bz) / det
+    oz = (cxz * bx + cyz * by + czz * bz) / det
+    motion[WHOLE], motion[WHOLE + 1] = ux - (oy * pz - oz * py), uy - (oz * px - ox * pz)
+    motion[WHOLE + 2] = uz - (ox * py - oy * px)
+    motion[WHOLE + 3], motion[WHOLE + 4], motion[WHOLE + 5] = ox, oy, oz
+    return True
+
+
+@inline_kernel
+def displace(v: int, var: I64, lin: F64, turns: F64, numbers: F64, xi: int, motion: F64) -> None:
+    """motion[LOCAL :] = J ξ of variable v, ξ at offset xi of `numbers`."""
+    kind, x = var[v, at.V_KIND], var[v, at.V_AT]
+    if kind == at.SE2 or kind == at.POINT2:
+        turn = load(numbers, xi + 5)
+        gx, gy = load(numbers, xi) - turn * load(lin, x + 1), load(numbers, xi + 1) + turn * load(lin, x)
+        if kind == at.SE2:
+            c, z = turns[v, tl.U_COS], turns[v, tl.U_SIN]
+            gx, gy = c * gx + z * gy, c * gy - z * gx
+        motion[LOCAL], motion[LOCAL + 1], motion[LOCAL + 2] = gx, gy, turn
+        return
+    ox, oy, oz = load(numbers, xi + 3), load(numbers, xi + 4), load(numbers, xi + 5)
+    px, py, pz = load(lin, x), load(lin, x + 1), load(lin, x + 2)
+    gx, gy = load(numbers, xi) + oy * pz - oz * py, load(numbers, xi + 1) + oz * px - ox * pz
+    gz = load(numbers, xi + 2) + ox * py - oy * px
+    if kind == at.SE3:
+        a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(lin, x + 3)
+        gx, gy, gz = a0 * gx + a3 * gy + a6 * gz, a1 * gx + a4 * gy + a7 * gz, a2 * gx + a5 * gy + a8 * gz
+        motion[LOCAL + 3] = a0 * ox + a3 * oy + a6 * oz
+        motion[LOCAL + 4] = a1 * ox + a4 * oy + a7 * oz
+        motion[LOCAL + 5] = a2 * ox + a5 * oy + a8 * oz
+    motion[LOCAL], motion[LOCAL + 1], motion[LOCAL + 2] = gx, gy, gz
+
+
+@inline_kernel
+def has_motion(row: I64, numbers: F64) -> bool:
+    """Whether a clique moved as a rigid body since it was solved."""
+    k, most = row[tl.C_USED] + row[tl.C_PIVOTS] + row[tl.C_BORDER], 0.0
+    for a in range(MOTION):
+        most = max(most, abs(load(numbers, k + a)))
+    return most > 0.0
+
+
+@part
+def move_subtree(
+    top: int, quiet: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, delta: F64, lin: F64,
+    before: F64, turns: F64, values: F64, changed: I64, moved: I64, motion: F64, state: I64, account: F64,
+) -> None:  # fmt: skip
+    """All that was eliminated in clique `top` and below it moves by the new part of `motion`.
+
+    Of what bends by its turns since it was solved, (9.21), no more than `quiet`, it is not looked for what is bent.
+    """
+    c = top
+    while True:
+        row = clique[c]
+        own = row[tl.C_USED] + row[tl.C_PIVOTS] + row[tl.C_BORDER]
+        for a in range(MOTION):
+            put(numbers, own + a, load(numbers, own + a) + motion[FRESH + a])
+        wx, wy, wz = load(numbers, own + 3), load(numbers, own + 4), load(numbers, own + 5)
+        turn = math.sqrt(wx * wx + wy * wy + wz * wz)
+        start = row[tl.C_LIST]
+        for s in range(start, start + row[tl.C_FRONTALS]):
+            v = lists[s]
+            displace(v, var, lin, turns, motion, FRESH, motion)
+            kind, d = var[v, at.V_KIND], var[v, at.V_SCALAR]
+            for a in range(dim_of_variable(var, v)):
+                put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
+            move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
+            bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * turn
+            account[tl.A_ALARM] += bend * bend
+            if bend > quiet:
+                list_moved(v, node, moved, state)
+        if row[tl.C_CHILD] >= 0:
+            c = row[tl.C_CHILD]
+            continue
+        while c != top and clique[c, tl.C_NEXT] < 0:
+            c = clique[c, tl.C_PARENT]
+        if c == top:
+            return
+        c = clique[c, tl.C_NEXT]
