@@ -38,12 +38,12 @@ class Options:
     bent            tree: a variable with a factor that is bent by more than this many of the residuals that factors of
                     the map have on average waits to be relinearised (MATH §9.6)
     bent_soon, bent_most, patience   tree: all that wait are so in the next step when together they add more than this
-                    share to χ², for every `many` of them, when a factor is bent by more than so many, or when one has
+                    share to χ², if they are `many`, when a factor is bent by more than so many, or when one has
                     waited for so many steps
-    rest, reluctance   tree: for so many steps after a relinearisation `bent_soon` is more, up to so many times
+    rest, reluctance   tree: for so many steps after a relinearisation both shares are more, up to so many times
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
-                    for every `many` of them
-    many            tree: so many variables; for few of them less is worth it, and for more than twice as many no more
+                    if they are `many`
+    many            tree: so many variables; for fewer of them much less is worth it, and for more up to twice as much
     trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
                     replaced
     look_every, look_moved   tree: it is looked for what is bent every so many steps, and when so much moved since that
@@ -74,12 +74,12 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 5e-4
-    bent_soon: float = 1.2e-4
-    bent_now: float = 3e-3
+    bent_soon: float = 6e-5
+    bent_now: float = 1e-3
     many: int = 1000
     bent_most: float = 2.0
     patience: int = 1000
-    rest: int = 128
+    rest: int = 96
     reluctance: float = 8.0
     trust: float = 3.0
     rounds: int = 3

@@ -17,7 +17,8 @@ from factorbus.solver.kernels.tree_exact import exact_bend
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-LEAST_BURDEN, MOST_BURDEN = 0.1, 2.0
+LEAST_BURDEN, MOST_BURDEN = 0.01, 2.0
+LEAST_LOOK = 0.02
 
 
 @part
@@ -118,4 +119,12 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 @inline_kernel
 def burden(settings: F64, state: I64) -> float:
     """By how much more than `many` variables what waits has to be worth to be relinearised.  (9.22)"""
-    return min(max(state[tl.S_PENDING] / settings[tl.P_MANY], LEAST_BURDEN), MOST_BURDEN)
+    share = state[tl.S_PENDING] / settings[tl.P_MANY]
+    return min(max(share * share, LEAST_BURDEN), MOST_BURDEN)
+
+
+@inline_kernel
+def is_alarming(settings: F64, state: I64, account: F64) -> bool:
+    """Whether what moved since it was looked last may have bent by so much that it is looked at once.  (9.15)"""
+    share = min(max(state[tl.S_MOVED] / settings[tl.P_MANY], LEAST_LOOK), 1.0)
+    return account[tl.A_ALARM] > settings[tl.P_LOOK] * share

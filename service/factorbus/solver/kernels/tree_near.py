@@ -14,12 +14,20 @@ from factorbus.solver.kernels.tree_take_in import next_incidence
 
 
 @inline_kernel
+def flops_of(cliques: I64, clique: I64) -> float:
+    """What it takes to eliminate these again."""
+    flops = 0.0
+    for k in range(cliques.size):
+        row = clique[cliques[k]]
+        width = row[tl.C_PIVOTS] + row[tl.C_BORDER] + 1
+        flops += row[tl.C_PIVOTS] * width * width
+    return flops
+
+
+@inline_kernel
 def count_near(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> int:
     """How many scalars are to come near the root with the elimination of the marked cliques; 0: it stays as it is."""
-    flops = 0.0
-    for k in range(marked.size):
-        p, width = clique[marked[k], tl.C_PIVOTS], clique[marked[k], tl.C_PIVOTS] + clique[marked[k], tl.C_BORDER] + 1
-        flops += p * width * width
+    flops = flops_of(marked, clique)
     if flops <= settings[tl.P_HEAVY]:
         return 0
     if not relinearises and state[tl.S_SPENT] + flops <= settings[tl.P_WORTH] * state[tl.S_MOVING_ROOT]:
@@ -61,9 +69,9 @@ def _queue(v: int, queue: I64, put: int, var: I64, node: I64, stamp: int) -> int
 
 
 @inline_kernel
-def account_for(flops: int, moved_root: bool, relinearises: bool, state: I64) -> None:
+def account_for(flops: int, moved_root: bool, state: I64) -> None:
     """What an elimination took counts: for the root's last move, or for what was spent since."""
     if moved_root:
         state[tl.S_MOVING_ROOT], state[tl.S_SPENT] = flops, 0
-    elif not relinearises:
+    else:
         state[tl.S_SPENT] += flops

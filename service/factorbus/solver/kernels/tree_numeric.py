@@ -86,7 +86,7 @@ def eliminate_fronts(
             numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU], floors, 0
         )
         if failed >= 0:
-            return _variable_at(failed, row, var, lists)
+            return variable_at(failed, row, var, lists)
         flops += p * (p + m + 1) * (p + m + 1)
     state[tl.S_FLOPS] += flops
     return -1
@@ -120,7 +120,7 @@ def first_end(f: int, place: I64, var: I64, fac: I64, node: I64) -> int:
 
 
 @inline_kernel
-def _variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
+def variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
     """The frontal variable of a clique that has this pivot scalar."""
     s = row[tl.C_LIST]
     scalar -= dim_of_variable(var, lists[s])

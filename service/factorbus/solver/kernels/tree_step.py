@@ -2,12 +2,13 @@
 
 1  take in        new variables, at good places if they are few, and new factors, linearised
 2  relinearise    variables whose factors have bent since they were linearised
-3  touch, detach  the cliques that these and the new factors change, and where that is much those around the robot;
+3  touch, detach  the cliques that new factors change, and where that is much those around the robot;
                   what hangs from them are orphans
+   renew          what is below these and only has relinearised factors is eliminated again as it is
 4  order          the affected variables, constrained approximate minimum degree
 5  fronts         elimination tree, amalgamation, memory
 6  eliminate      front by front; orphans lend their update matrices
-7  commit         new cliques take the place of the old ones
+7  commit         new cliques and numbers take the place of the old ones
 8  substitute     back down from the new roots, as far as anything changes
 9  again from 2   while something has bent so far that it cannot wait
 """
@@ -30,13 +31,22 @@ from factorbus.solver.kernels.tree_fronts import (
     keep_root,
     place_fronts,
 )
-from factorbus.solver.kernels.tree_look import burden, find_bent
+from factorbus.solver.kernels.tree_look import burden, find_bent, is_alarming
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
 from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
+from factorbus.solver.kernels.tree_renew import (
+    OLD,
+    commit_renewed,
+    give_back_renewed,
+    is_worth_ordering,
+    mark_renewed,
+    renew,
+    still_renewed,
+)
 from factorbus.solver.kernels.tree_solve import substitute
 from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
 
@@ -77,7 +87,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_MOST] *= unit
-    scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1)  # a share of χ²
+    scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1) * reluctance(settings, state)  # a share of χ²
     scaled[tl.P_SOON] *= unit * unit * max(f1, 1) * reluctance(settings, state)
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = state[tl.S_FIRST_NEW]
@@ -161,14 +171,15 @@ def eliminate_again(
     count = 0
     for f in range(state[tl.S_TAKEN], f1):
         count = touch_ends(f, fac, node, clique, state, marked, count)
-    for k in range(moving.size):
-        slot = node[moving[k], tl.N_ADJ]
-        while slot >= 0:
-            count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
-            slot = next_incidence(slot, link)
-    near = count_near(marked[:count], moving.size > 0, settings, clique, state)
+    renewed = mark_renewed(moving, fac, node, link, clique, state, marked)
+    reorders = is_worth_ordering(renewed, clique)
+    if reorders:
+        renewed = renewed[:0]
+        count = touch_around(moving, fac, node, link, clique, state, marked, count)
+    near = count_near(marked[:count], reorders, settings, clique, state)
     if near > 0:
         count = touch_near(near, f1, var, fac, node, link, clique, state, marked, count)
+        renewed = still_renewed(renewed, clique, state)
     marked = marked[:count]
     room = v1 - v0
     hanging = 0
@@ -187,9 +198,17 @@ def eliminate_again(
             affected[n] = v
             n += 1
     orphans = orphans[:hanging]
-    if n == 0:
+    if n == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
         return 0.0, 0.0, tl.DONE
+    now = lap(now, tl.MARK, state)
+    old = np.empty((renewed.size, OLD), np.int64)
+    if renewed.size > 0:
+        # Before the others, who take in their update matrices.
+        status = renew(renewed, n, old, var, fac, node, link, clique, lists, numbers, hessian, scalars, state)
+        if status != tl.DONE:
+            return 0.0, 0.0, status
+    now = lap(now, tl.ELIMINATE, state)
     factors = gather_factors(n, affected, state[tl.S_TAKEN], f1, node, link, fac, var)
     now = lap(now, tl.MARK, state)
     # 4, 5
@@ -212,9 +231,11 @@ def eliminate_again(
         order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
     update = np.empty((orphans.size, 3), np.int64)
     if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
+        give_back_renewed(renewed, old, clique, numbers, state)
         return 0.0, 0.0, tl.NO_ROOM
     ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
     if not placed:
+        give_back_renewed(renewed, old, clique, numbers, state)
         give_back_updates(update, numbers, state)
         return 0.0, 0.0, tl.NO_ROOM
     now = lap(now, tl.SYMBOLIC, state)
@@ -228,14 +249,16 @@ def eliminate_again(
         state[tl.S_FAILED] = failed
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
+        give_back_renewed(renewed, old, clique, numbers, state)
         return 0.0, 0.0, tl.FAILED
-    account_for(state[tl.S_FLOPS] - flops, near > 0, moving.size > 0, state)
+    account_for(state[tl.S_FLOPS] - flops, near > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(
         marked, orphans, update, lowest, ids, records, order, place, home, border_at, border_of, affected, factors,
         var, fac, node, link, clique, lists, numbers, state, account,
     )  # fmt: skip
+    tops = commit_renewed(renewed, old, clique, numbers, state, account)
     add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
     for k in range(moving.size):
         v = moving[k]
@@ -247,13 +270,13 @@ def eliminate_again(
     now = lap(now, tl.COMMIT, state)
     # 8
     substitute(
-        ids, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers, lin, scalars,
-        turns, values, changed, moved, state, account,
+        np.append(tops, ids), settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
+        lin, scalars, turns, values, changed, moved, state, account,
     )  # fmt: skip
     bow = pull = 0.0
     # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
     due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
-    if due or account[tl.A_ALARM] > settings[tl.P_LOOK]:
+    if due or is_alarming(settings, state, account):
         bow, pull = find_bent(
             settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved,
             state,
@@ -269,6 +292,19 @@ def lap(since: int, phase: int, state: I64) -> int:
     now = cycles()
     state[tl.S_CYCLES + phase] += now - since
     return now
+
+
+@part
+def touch_around(
+    moving: I64, fac: I64, node: I64, link: I64, clique: I64, state: I64, marked: I64, count: int
+) -> int:  # fmt: skip
+    """Touch the variables of all factors of `moving`."""
+    for k in range(moving.size):
+        slot = node[moving[k], tl.N_ADJ]
+        while slot >= 0:
+            count = touch_ends(slot // 2, fac, node, clique, state, marked, count)
+            slot = next_incidence(slot, link)
+    return count
 
 
 @inline_kernel
