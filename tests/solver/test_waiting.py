@@ -9,6 +9,7 @@ from naive.tree_records import tree_of
 from factorbus.proto.messages import Batch
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver
+from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.tree import Tree
 
@@ -41,7 +42,8 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         share = tree.turns[waiting(tree), tl.U_STRAIN].sum() / (tree.account[tl.A_CHI2] + 1e-2)
         rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
         most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
-        most *= min(max((waiting(tree).size / options.many) ** 2, 0.01), 2.0)
+        scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
+        most *= min(max((scalars / options.many) ** 2, 0.01), 2.0)
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             waited += waiting(tree).size > 0

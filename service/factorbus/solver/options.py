@@ -38,12 +38,12 @@ class Options:
     bent            tree: a variable with a factor that is bent by more than this many of the residuals that factors of
                     the map have on average waits to be relinearised (MATH §9.6)
     bent_soon, bent_most, patience   tree: all that wait are so in the next step when together they add more than this
-                    share to χ², if they are `many`, when a factor is bent by more than so many, or when one has
-                    waited for so many steps
+                    share to χ², if they have `many` scalars, when a factor is bent by more than so many, or when one
+                    has waited for so many steps
     rest, reluctance   tree: for so many steps after a relinearisation both shares are more, up to so many times
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
-                    if they are `many`
-    many            tree: so many variables; for fewer of them much less is worth it, and for more up to twice as much
+                    if what waits has `many` scalars
+    many            tree: for fewer scalars much less is worth it, and for more up to twice as much
     trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
                     replaced
     look_every, look_moved   tree: it is looked for what is bent every so many steps, and when so much moved since that
@@ -75,8 +75,8 @@ class Options:
     recent_poses: int = 1
     bent: float = 5e-4
     bent_soon: float = 6e-5
-    bent_now: float = 1e-3
-    many: int = 1000
+    bent_now: float = 4e-4
+    many: int = 3000
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96

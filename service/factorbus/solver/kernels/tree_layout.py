@@ -177,7 +177,7 @@ P_WORTH = 15  # when with it this share has been spent of what that took the las
 P_NEAR = 16  # so many scalars, times the cube root of the flops
 P_REST = 17  # for so many steps after a relinearisation P_SOON and P_BENT_NOW are more,
 P_RELUCTANCE = 18  # up to so many times
-P_MANY = 19  # P_SOON and P_BENT_NOW are for so many variables that wait, (9.22)
+P_MANY = 19  # P_SOON and P_BENT_NOW are for so many scalars that wait, (9.22)
 P_SIZE = 20
 
 # The phases of a step, in the order of `tree_step`.

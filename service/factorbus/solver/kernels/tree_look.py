@@ -14,11 +14,12 @@ from factorbus.solver.kernels.tree_bend import (
     turn_of,
 )
 from factorbus.solver.kernels.tree_exact import exact_bend
+from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
 LEAST_BURDEN, MOST_BURDEN = 0.01, 2.0
-LEAST_LOOK = 0.02
+LEAST_LOOK, MANY_LOOKS = 0.02, 1000
 
 
 @part
@@ -27,7 +28,7 @@ def find_bent(
     scalars: F64, values: F64, turns: F64, pending: I64, moved: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
-    what moved, and Σ bend² of all that waits.
+    what moved, and Σ bend² of all that waits, as a multiple of (9.22).
     """
     if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
@@ -38,11 +39,12 @@ def find_bent(
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED] = 0
-    total, waited = 0.0, state[tl.S_STEP] - state[tl.S_WAITING]
+    total, scalars_waiting, waited = 0.0, 0, state[tl.S_STEP] - state[tl.S_WAITING]
     for k in range(state[tl.S_PENDING]):
         total += turns[pending[k], tl.U_STRAIN]
-    worth = total > settings[tl.P_SOON] * burden(settings, state)
-    if worth or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
+        scalars_waiting += dim_of_variable(var, pending[k])
+    total /= burden(scalars_waiting, settings)
+    if total > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
         state[tl.S_DUE] = 1
     return most, total
 
@@ -117,14 +119,14 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 
 
 @inline_kernel
-def burden(settings: F64, state: I64) -> float:
-    """By how much more than `many` variables what waits has to be worth to be relinearised.  (9.22)"""
-    share = state[tl.S_PENDING] / settings[tl.P_MANY]
+def burden(count: int, settings: F64) -> float:
+    """By how much more than `many` of them so many scalars have to be worth to be relinearised.  (9.22)"""
+    share = count / settings[tl.P_MANY]
     return min(max(share * share, LEAST_BURDEN), MOST_BURDEN)
 
 
 @inline_kernel
 def is_alarming(settings: F64, state: I64, account: F64) -> bool:
     """Whether what moved since it was looked last may have bent by so much that it is looked at once.  (9.15)"""
-    share = min(max(state[tl.S_MOVED] / settings[tl.P_MANY], LEAST_LOOK), 1.0)
+    share = min(max(state[tl.S_MOVED] / MANY_LOOKS, LEAST_LOOK), 1.0)
     return account[tl.A_ALARM] > settings[tl.P_LOOK] * share

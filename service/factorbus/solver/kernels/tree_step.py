@@ -31,7 +31,7 @@ from factorbus.solver.kernels.tree_fronts import (
     keep_root,
     place_fronts,
 )
-from factorbus.solver.kernels.tree_look import burden, find_bent, is_alarming
+from factorbus.solver.kernels.tree_look import find_bent, is_alarming
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
@@ -121,7 +121,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        again = pull > scaled[tl.P_BENT_NOW] * burden(settings, state)
+        again = pull > scaled[tl.P_BENT_NOW]
         if state[tl.S_WAIT] != 0 or not again or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
             break
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
@@ -164,7 +164,7 @@ def eliminate_again(
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
     pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Steps 3 to 8; gives the largest bend of what moved, Σ bend² of what waits, and the status."""
+    """Steps 3 to 8; gives the largest bend of what moved, what waits, as `find_bent` has them, and the status."""
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
