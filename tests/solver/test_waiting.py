@@ -43,7 +43,7 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
         most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
         scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
-        most *= min(max((scalars / options.many) ** 2, 0.01), 2.0)
+        most *= min(max((scalars / options.many) ** 3, 0.01), 2.0)
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             waited += waiting(tree).size > 0

@@ -76,7 +76,7 @@ class Options:
     bent: float = 5e-4
     bent_soon: float = 6e-5
     bent_now: float = 4e-4
-    many: int = 3000
+    many: int = 2000
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96

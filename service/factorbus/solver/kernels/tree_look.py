@@ -122,7 +122,7 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 def burden(count: int, settings: F64) -> float:
     """By how much more than `many` of them so many scalars have to be worth to be relinearised.  (9.22)"""
     share = count / settings[tl.P_MANY]
-    return min(max(share * share, LEAST_BURDEN), MOST_BURDEN)
+    return min(max(share * share * share, LEAST_BURDEN), MOST_BURDEN)
 
 
 @inline_kernel
