@@ -50,16 +50,7 @@ def eliminate_fronts(
     for f in range(count):
         row = clique[ids[f]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-        width, start = 0, row[tl.C_LIST]
-        for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
-            v = lists[s]
-            column[node[v, tl.N_LOCAL]] = width
-            dim = dim_of_variable(var, v)
-            if width < p:
-                d = var[v, at.V_SCALAR]
-                for a in range(dim):
-                    floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
-            width += dim
+        number_columns(row, var, node, lists, scalars, column, floors)
         clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
@@ -90,6 +81,21 @@ def eliminate_fronts(
         flops += p * (p + m + 1) * (p + m + 1)
     state[tl.S_FLOPS] += flops
     return -1
+
+
+@inline_kernel
+def number_columns(row: I64, var: I64, node: I64, lists: I64, scalars: F64, column: I64, floors: F64) -> None:
+    """The first column of each variable of a clique, by its local number, and what each pivot has to exceed."""
+    width, start = 0, row[tl.C_LIST]
+    for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        column[node[v, tl.N_LOCAL]] = width
+        dim = dim_of_variable(var, v)
+        if width < row[tl.C_PIVOTS]:
+            d = var[v, at.V_SCALAR]
+            for a in range(dim):
+                floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
+        width += dim
 
 
 @part

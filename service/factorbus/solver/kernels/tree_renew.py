@@ -11,12 +11,11 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.dense import PIVOT_TOLERANCE, factor_front
+from factorbus.solver.kernels.dense import factor_front
 from factorbus.solver.kernels.multifrontal import clear_front
 from factorbus.solver.kernels.tree_fronts import row_layout, update_layout
-from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_near import flops_of
-from factorbus.solver.kernels.tree_numeric import add_hessian, extend_add, list_runs, variable_at
+from factorbus.solver.kernels.tree_numeric import add_hessian, extend_add, list_runs, number_columns, variable_at
 from factorbus.solver.kernels.tree_store import give_numbers, size_class, take_numbers
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
@@ -114,18 +113,9 @@ def renew(
     for k in range(renewed.size):
         row = clique[renewed[k]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-        width, start = 0, row[tl.C_LIST]
-        for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
-            v = lists[s]
-            column[node[v, tl.N_LOCAL]] = width
-            dim = dim_of_variable(var, v)
-            if width < p:
-                d = var[v, at.V_SCALAR]
-                for a in range(dim):
-                    floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
-            width += dim
+        number_columns(row, var, node, lists, scalars, column, floors)
         clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
-        for s in range(start, start + row[tl.C_FRONTALS]):
+        for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
             while f >= 0:
                 add_hessian(f, row, column, var, fac, node, link, hessian, numbers)
