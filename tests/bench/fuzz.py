@@ -37,7 +37,7 @@ from factorbus.proto.problems import Problem, Refused
 from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore
-from factorbus.service.events import Answer, Arrived, Folded, Judged, Refuse, Run, Stepped, Waiting
+from factorbus.service.events import Answer, Arrived, Folded, Judged, Refuse, Run, Stepped
 from factorbus.service.fold import Folder
 from factorbus.service.questions import Question
 from factorbus.solver import Options, Solver
@@ -94,7 +94,7 @@ class _Map:
     def __init__(self) -> None:
         self.core = MapCore("fuzzed", "auto", EPOCH, LIMITS, 0.0)
         self.folder = _folder()
-        self.accepted: list[list[Waiting]] = []  # by step
+        self.accepted: list[list[Arrived]] = []  # by step
         self.answers: dict[int, list[str]] = {}
         self.next: Counter[str] = Counter()
         self.bits = _bits(self.folder)

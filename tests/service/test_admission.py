@@ -19,7 +19,7 @@ EPOCH = 77
 def arrived(client: str, sequence: int, asker: Any = None, **changed: Any) -> Arrived:
     fields: dict[str, Any] = {"epoch": EPOCH, "size": 100, "digest": sequence, "now": 0.0} | changed
     content = Insert(sequence, Batch())
-    return Arrived(asker or f"{client}{sequence}", client, sequence, content=content, **fields)
+    return Arrived([asker or f"{client}{sequence}"], client, sequence, content=content, **fields)
 
 
 def codes(effects: list[Effect]) -> list[str]:
@@ -215,7 +215,7 @@ def test_whatever_comes_everybody_is_answered_once_and_order_holds(operations: l
             client, sequence, digest, size, epoch = arguments
             asked.append(len(asked))
             event = arrived(client, sequence, asker=None, digest=digest, size=size, epoch=epoch, now=now)
-            effects = admission.admit(event._replace(asker=asked[-1]))
+            effects = admission.admit(event._replace(askers=[asked[-1]]))
             note(effects)
             for effect in effects:
                 if isinstance(effect, Answer):

@@ -32,7 +32,7 @@ def core() -> MapCore:
 
 
 def insert(client: str, sequence: int) -> Arrived:
-    return Arrived(f"{client}{sequence}", client, sequence, 0, 10, sequence, Insert(sequence, Batch()), 1.0)
+    return Arrived([f"{client}{sequence}"], client, sequence, 0, 10, sequence, Insert(sequence, Batch()), 1.0)
 
 
 def run_of(effects: list[Effect]) -> Run:
@@ -63,7 +63,7 @@ def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: Ma
 def brought(core: MapCore, sequence: int, at: float, size: int = 10, settle: bool = False) -> Run:
     """The Run for one more insert, which arrives `at`."""
     message = Insert(sequence, Batch(), settle)
-    return run_of(core.insert(Arrived(f"a{sequence}", "a", sequence, 0, size, sequence, message, at)))
+    return run_of(core.insert(Arrived([f"a{sequence}"], "a", sequence, 0, size, sequence, message, at)))
 
 
 def finish(core: MapCore, run: Run, at: float) -> list[Effect]:

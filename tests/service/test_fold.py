@@ -16,7 +16,7 @@ from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import parse_symbol
 from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped, Waiting
+from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
 from factorbus.service.fold import Folder
 from factorbus.service.questions import Question
 from factorbus.solver import Options, Solver
@@ -41,9 +41,9 @@ def pose(name: str, after: str, x: float = 1.0) -> Batch:
     return Batch((Variables("se2", keys_of(name)),), (edge(after, name, x),))
 
 
-def waiting(content: Batch | Problem, client: str = "a", sequence: int = 1, settle: bool = False) -> Waiting:
+def waiting(content: Batch | Problem, client: str = "a", sequence: int = 1, settle: bool = False) -> Arrived:
     insert = content if isinstance(content, Problem) else Insert(sequence, content, settle)
-    return Waiting(client, sequence, 100, 0, insert)
+    return Arrived([], client, sequence, 0, 100, 0, insert, 0.0)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Result:
     factors: int
 
 
-def fold(folder: Folder, *inserts: Waiting) -> Result:
+def fold(folder: Folder, *inserts: Arrived) -> Result:
     *events, end = folder.fold(inserts)
     assert isinstance(end, Folded)
     outcomes = tuple(o for e in events if isinstance(e, Judged) for o in e.outcomes)
@@ -266,15 +266,15 @@ def test_what_cannot_be_brought_back_is_said_for_good() -> None:
 # ---- one insert, read where it lies -------------------------------------------------------------------------------
 
 
-def located(batch: Batch, sequence: int = 1, settle: bool = False) -> Waiting:
+def located(batch: Batch, sequence: int = 1, settle: bool = False) -> Arrived:
     message = codec.encode_insert(Insert(sequence, batch, settle))
     arrived = read_insert(None, "a", message, REQUEST_LIMITS, 0.0)
     assert isinstance(arrived, Arrived)
     assert isinstance(arrived.content, Located)
-    return Waiting("a", sequence, len(message), arrived.digest, arrived.content, [], message)
+    return arrived._replace(askers=[])
 
 
-def fold_alone(folder: Folder, insert: Waiting) -> tuple[Result, bool]:
+def fold_alone(folder: Folder, insert: Arrived) -> tuple[Result, bool]:
     """What came of it, and whether it was had in one piece."""
     events = folder.fold_alone(insert)
     if isinstance(events, Alone):

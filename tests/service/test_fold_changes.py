@@ -9,7 +9,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.service.arrival import read_again, read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Arrived, Judged, Outcome, Stepped, Waiting
+from factorbus.service.events import Arrived, Judged, Outcome, Stepped
 from factorbus.service.fold import Folder
 from factorbus.service.questions import Question
 from factorbus.solver import Options, Solver
@@ -27,12 +27,12 @@ def pose(n: int, x: float = 1.0) -> Batch:
     )
 
 
-def waiting(content: Batch | tuple[Change, ...], sequence: int, client: str = "a") -> Waiting:
+def waiting(content: Batch | tuple[Change, ...], sequence: int, client: str = "a") -> Arrived:
     batch, changes = (content, ()) if isinstance(content, Batch) else (Batch(), content)
     message = codec.encode_insert(Insert(sequence, batch, changes=changes))
     arrived = read_insert(None, client, message, REQUEST_LIMITS, 0.0)
     assert isinstance(arrived, Arrived)
-    return Waiting(client, sequence, len(message), arrived.digest, arrived.content, [], message)
+    return arrived._replace(askers=[])
 
 
 def gone(*names: int) -> tuple[Change, ...]:
@@ -53,7 +53,7 @@ def make(folder: Folder | None = None, solver: type[Solver] = Solver) -> Folder:
     return folder
 
 
-def came(folder: Folder, *inserts: Waiting) -> tuple[list[Judged], list[Stepped]]:
+def came(folder: Folder, *inserts: Arrived) -> tuple[list[Judged], list[Stepped]]:
     events, _ = folder.fold_whole(inserts)
     return [e for e in events if isinstance(e, Judged)], [e for e in events if isinstance(e, Stepped)]
 
@@ -121,7 +121,7 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
         again = []
         for insert in inserts:
             digest, content = read_again(insert.message)
-            again.append(Waiting(insert.client, insert.sequence, insert.size, digest, content, [], insert.message))
+            again.append(insert._replace(digest=digest, content=content))
         events = list(second.fold_again(again, rebuilt=False))
         deltas = [codec.decode_delta(e.delta) for e in events if isinstance(e, Stepped)]
         for one, other in zip([codec.decode_delta(step.delta) for step in steps], deltas, strict=True):

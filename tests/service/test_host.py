@@ -89,7 +89,7 @@ class Setup:
     def arrived(self, content: Batch, settle: bool = False, client: str = "a", size: int = 100) -> Arrived:
         self.sequence += 1
         insert = Insert(self.sequence, content, settle)
-        return Arrived(str(self.sequence), client, self.sequence, 0, size, 0, insert, self.now())
+        return Arrived([str(self.sequence)], client, self.sequence, 0, size, 0, insert, self.now())
 
     def now(self) -> float:
         """Later than a round trip after whatever was before, as if the client had waited for its answer."""

@@ -28,7 +28,7 @@ from itertools import count
 
 from factorbus.proto.problems import BadSequence, Busy, Problem, ShuttingDown, TooLarge, WrongEpoch
 from factorbus.service.config import Limits
-from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse, Waiting
+from factorbus.service.events import Answer, Arrived, Asker, Effect, Refuse
 
 # How many may wait for one and the same answer.
 _ASKERS = 8
@@ -48,9 +48,9 @@ class _Client:
     served: float = 0.0  # where its inserts on the time line of fairness end
     heard: float = 0.0  # when it last sent what it has to send next
     seen: float = 0.0  # when it last sent anything
-    ready: deque[Waiting] = field(default_factory=deque)
-    open: dict[int, Waiting] = field(default_factory=dict)  # admitted or parked, not answered
-    parked: dict[int, Waiting] = field(default_factory=dict)
+    ready: deque[Arrived] = field(default_factory=deque)
+    open: dict[int, Arrived] = field(default_factory=dict)  # admitted or parked, not answered
+    parked: dict[int, Arrived] = field(default_factory=dict)
     answered: OrderedDict[int, tuple[int, object]] = field(default_factory=OrderedDict)
 
 
@@ -87,10 +87,10 @@ class Admission:
         try:
             return self._judge(arrived)
         except Problem as problem:
-            return [Refuse(arrived.asker, problem)]
+            return [Refuse(arrived.askers[0], problem)]
 
-    def take_alone(self, arrived: Arrived) -> Waiting | None:
-        """The insert as taken, if it is next, and nothing else waits here or is parked; None: `admit` it."""
+    def take_alone(self, arrived: Arrived) -> bool:
+        """Take the insert, if it is next, and nothing else waits here or is parked; if not, `admit` it."""
         client = self._clients.get(arrived.client)
         if (
             client is None
@@ -101,19 +101,18 @@ class Admission:
             or self._closing is not None
             or self._blocked is not None
         ):
-            return None
-        insert = _waiting(arrived)
+            return False
         client.seen = client.heard = arrived.now
-        client.open[arrived.sequence] = insert
+        client.open[arrived.sequence] = arrived
         client.next += 1
         self._bytes += arrived.size
         self._clock = begin = max(self._clock, client.served)
         client.served = begin + arrived.size + _INSERT_COST
-        return insert
+        return True
 
-    def take(self, most: int) -> tuple[Waiting, ...]:
+    def take(self, most: int) -> tuple[Arrived, ...]:
         """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first."""
-        taken: list[Waiting] = []
+        taken: list[Arrived] = []
         room = self._limits.fold_bytes
         while self._turns and len(taken) < most:
             begin, _, name = self._turns[0]
@@ -131,7 +130,7 @@ class Admission:
         self._ready -= len(taken)
         return tuple(taken)
 
-    def answer(self, insert: Waiting, answer: object, answered: Asker = None) -> list[Effect]:
+    def answer(self, insert: Arrived, answer: object, answered: Asker = None) -> list[Effect]:
         """`insert` has its answer: give it to all who wait for it, but who is `answered` already, and remember it."""
         client = self._clients[insert.client]
         del client.open[insert.sequence]
@@ -143,7 +142,7 @@ class Admission:
             return []
         return [_reply(asker, answer) for asker in insert.askers if asker is not answered]
 
-    def is_open(self, insert: Waiting) -> bool:
+    def is_open(self, insert: Arrived) -> bool:
         """Has `insert` no answer yet?"""
         return self._clients[insert.client].open.get(insert.sequence) is insert
 
@@ -211,7 +210,7 @@ class Admission:
         if arrived.sequence in client.open:
             return self._ask_again(client.open[arrived.sequence], arrived, client.next)
         if arrived.sequence < client.next:
-            return [_reply(arrived.asker, _remembered(client, arrived))]
+            return [_reply(arrived.askers[0], _remembered(client, arrived))]
         if self._closing is not None:
             raise self._closing
         if self._blocked is not None:
@@ -249,11 +248,11 @@ class Admission:
             raise TooLarge(f"{sender} in this map", len(own) + 1, share, "clients")
         del self._clients[name]
 
-    def _ask_again(self, insert: Waiting, arrived: Arrived, following: int) -> list[Effect]:
+    def _ask_again(self, insert: Arrived, arrived: Arrived, following: int) -> list[Effect]:
         """One more waits for the answer; of too many, the first is told to come back: it has most likely given up."""
         if insert.digest != arrived.digest:
             raise BadSequence(arrived.client, arrived.sequence, "a number not used for another insert", following)
-        insert.askers.append(arrived.asker)
+        insert.askers.append(arrived.askers[0])
         return [Refuse(insert.askers.pop(0), self._busy())] if len(insert.askers) > _ASKERS else []
 
     def _admit_next(self, client: _Client, arrived: Arrived) -> None:
@@ -266,12 +265,12 @@ class Admission:
         if full and (client.ready or arrived.size > limits.waiting_bytes // limits.clients):
             raise self._busy()
         self._bytes += arrived.size
-        self._make_ready(client, _waiting(arrived))
+        self._make_ready(client, arrived)
         while client.next in client.parked:
             self._parked -= 1
             self._make_ready(client, client.parked.pop(client.next))
 
-    def _make_ready(self, client: _Client, insert: Waiting) -> None:
+    def _make_ready(self, client: _Client, insert: Arrived) -> None:
         if not client.ready:
             heappush(self._turns, (max(self._clock, client.served), next(self._order), insert.client))
         client.ready.append(insert)
@@ -289,7 +288,7 @@ class Admission:
             client.heard = arrived.now
         self._bytes += arrived.size
         self._parked += 1
-        client.parked[arrived.sequence] = client.open[arrived.sequence] = _waiting(arrived)
+        client.parked[arrived.sequence] = client.open[arrived.sequence] = arrived
 
     def _unpark(self, client: _Client, problem: Problem | None) -> list[Effect]:
         """Refuse what `client` has parked; its numbers are not used up."""
@@ -316,19 +315,6 @@ def _remembered(client: _Client, arrived: Arrived) -> object:
         what = "a number not used for another insert" if digest is not None else "one not older than those remembered"
         raise BadSequence(arrived.client, arrived.sequence, f"{what}: {client.next} is next", client.next)
     return answer
-
-
-def _waiting(arrived: Arrived) -> Waiting:
-    return Waiting(
-        arrived.client,
-        arrived.sequence,
-        arrived.size,
-        arrived.digest,
-        arrived.content,
-        [arrived.asker],
-        arrived.message,
-        arrived.now,
-    )
 
 
 def _sender(client: str) -> str:

@@ -26,15 +26,15 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
     size = len(payload)
     if size <= _SHORT_BYTES and (located := try_locate(payload, limits)):
         sequence, epoch, digest, content = located
-        return Arrived(asker, client, sequence, epoch, size, digest, content, now, payload)
+        return Arrived([asker], client, sequence, epoch, size, digest, content, now, payload)
     try:
         insert = codec.decode_insert(payload, limits)
     except Problem as problem:
         place = _place(payload)
         if place is None:
             return Refuse(asker, problem)
-        return Arrived(asker, client, *place, len(payload), digest_of(payload), problem, now, payload)
-    return Arrived(asker, client, insert.sequence, insert.epoch, len(payload), digest_of(payload), insert, now, payload)
+        return Arrived([asker], client, *place, size, digest_of(payload), problem, now, payload)
+    return Arrived([asker], client, insert.sequence, insert.epoch, size, digest_of(payload), insert, now, payload)
 
 
 def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:

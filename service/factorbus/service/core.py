@@ -8,13 +8,14 @@ At most one Run is out at a time, so what the solver does next is decided when i
 """
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
+from factorbus.service.account import Account, Done
 from factorbus.service.admin import MovedOn
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
@@ -34,9 +35,7 @@ from factorbus.service.events import (
     Run,
     Stepped,
     Tell,
-    Waiting,
 )
-from factorbus.service.histogram import Histogram
 from factorbus.service.questions import Question, parse
 
 _KEYFRAME = Read(Question("keyframe"))
@@ -45,7 +44,6 @@ _KEYFRAME = Read(Question("keyframe"))
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
-_COUNTED: tuple[str, ...] = ("accepted", "refused", "busy", "received_bytes", "answered_bytes", "published_bytes")
 
 
 class Restored(NamedTuple):
@@ -74,11 +72,8 @@ class MapCore:
         self._closing: Problem | None = None
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
-        self._strategies: dict[str, int] = {}
-        self._counts: dict[str, int] = dict.fromkeys(_COUNTED, 0)
-        self._chi2 = self._solver_ms = self._solver_cpu_s = 0.0
-        self._refusals: Counter[str] = Counter()
-        self._step_s, self._insert_s = Histogram(), Histogram()
+        self._solver_cpu_s = 0.0
+        self._account = Account()
 
     def row(self) -> dict[str, Any]:
         """What admin/maps says of this map."""
@@ -99,14 +94,14 @@ class MapCore:
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
         if isinstance(arrived.content, Located) and (run := self._try_alone(arrived, arrived.content.settle)):
-            self._counts["received_bytes"] += arrived.size
+            self._account.received(arrived.size)
             return [run]
         effects = self._admission.expire(arrived.now)
         judged = self._admission.admit(arrived)
-        self._counts["received_bytes"] += arrived.size
+        self._account.received(arrived.size)
         for effect in judged:
             if isinstance(effect, Refuse):
-                self._refused(effect.problem)
+                self._account.refused(effect.problem)
         return self._go_on(effects + judged, arrived.now)
 
     def ask(self, asked: Asked, now: float) -> list[Effect]:
@@ -138,22 +133,21 @@ class MapCore:
             self._unjudged_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
             if isinstance(outcome.answer, bytes):
-                self._counts["accepted"] += 1
-                self._counts["answered_bytes"] += len(outcome.answer)
+                self._account.accepted(outcome.answer)
             else:
-                self._refused(outcome.answer)
+                self._account.refused(outcome.answer)
         return effects
 
     def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
         """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
-        counts, insert = self._counts, alone.insert
+        insert, size = alone.insert, len(alone.delta)
         others = self._admission.answer(insert, alone.answer, answered)
         self._unjudged -= 1
         self._unjudged_bytes -= insert.size
-        counts["accepted"] += 1
-        counts["answered_bytes"] += len(alone.answer)
-        self._count(alone)
-        self._free(alone, (insert,))
+        seconds = alone.now - insert.now
+        self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
+        self._moved_on(alone.revision, size)
+        self._free(alone, 1)
         return self._go_on(others, alone.now)
 
     def kept(self, events: Sequence[Judged | Stepped], now: float) -> list[Effect]:
@@ -188,22 +182,19 @@ class MapCore:
         """The map was here before: what its clients have sent, and how it is."""
         for name, following, answered in senders:
             self._admission.restore(name, following, answered, self._created)
-        self.revision, self.variables, self.factors, self._chi2 = restored
+        self.revision, self.variables, self.factors, self._account.chi2 = restored
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
-        self._count(stepped)
+        self._account.count()
+        self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, stepped.delta)
+        self._moved_on(stepped.revision, len(stepped.delta))
         return [Publish("delta", stepped.delta)]
 
-    def _count(self, stepped: Stepped | Alone) -> None:
-        self.revision = stepped.revision
-        self._chi2 = stepped.chi2
-        self._solver_ms += stepped.solver_ms
-        self._strategies[stepped.strategy] = self._strategies.get(stepped.strategy, 0) + 1
-        self._step_s.add(stepped.solver_ms / 1e3)
-        self._counts["published_bytes"] += len(stepped.delta)
+    def _moved_on(self, revision: int, delta_bytes: int) -> None:
+        self.revision = revision
         self._since_keyframe[0] += 1
-        self._since_keyframe[1] += len(stepped.delta)
+        self._since_keyframe[1] += delta_bytes
         steps, size = self._since_keyframe
         if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
             self._since_keyframe = [0, 0]
@@ -211,16 +202,17 @@ class MapCore:
 
     def folded(self, folded: Folded) -> list[Effect]:
         """The solver is free again."""
-        self._free(folded, self._running.inserts if self._running else ())
+        taken = self._running.inserts if self._running else ()
+        for insert in taken:
+            self._account.took(folded.now - insert.now)
+        self._free(folded, len(taken))
         return self._go_on([], folded.now)
 
-    def _free(self, folded: Folded | Alone, taken: tuple[Waiting, ...]) -> None:
+    def _free(self, folded: Folded | Alone, taken: int) -> None:
         self._running = None
         self._ended = folded.now
         seconds = self._ended - self._started
-        self._admission.took(len(taken), seconds)
-        for insert in taken:
-            self._insert_s.add(folded.now - insert.since)
+        self._admission.took(taken, seconds)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
         self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
 
@@ -237,6 +229,7 @@ class MapCore:
 
     def tick(self, now: float) -> list[Effect]:
         """Time went by."""
+        self._account.count()
         return self._admission.expire(now)
 
     def stop(self, now: float) -> list[Effect]:
@@ -260,41 +253,27 @@ class MapCore:
     def stats(self, now: float) -> dict[str, Any]:
         """What ask/stats says of this map."""
         return self.row() | {
-            "chi2": self._chi2,
             "uptime_s": now - self._created,
             "waiting": self._admission.ready,
             "parked": self._admission.parked,
             "unwritten": self._unjudged - (len(self._running.inserts) if self._running else 0),
             "in_solver": len(self._running.inserts) if self._running else 0,
             "clients": self._admission.next_sequences,
-            "inserts": {name: self._counts[name] for name in ("accepted", "refused", "busy")},
             "steps": self.revision,
-            "strategies": dict(self._strategies),
-            "solver_ms": self._solver_ms,
             "solver_cpu_s": self._solver_cpu_s,
+            **self._account.stats(),
         }
 
     def account(self, now: float) -> dict[str, Any]:
         """What admin/stats says of this map: `stats`, with what only an operator asks for."""
         return self.stats(now) | {
             "clients": len(self._admission.next_sequences),
-            "refusals": dict(self._refusals),
-            "step_s": self._step_s.as_dict(),
-            "insert_s": self._insert_s.as_dict(),
-            "bytes": {
-                "received": self._counts["received_bytes"],
-                "answered": self._counts["answered_bytes"],
-                "published": self._counts["published_bytes"],
-            },
+            **self._account.for_operators(),
         }
 
     def running_s(self, now: float) -> float:
         """For how long the solver has been at what it has; 0 when it is free."""
         return now - self._started if self._running is not None else 0.0
-
-    def _refused(self, problem: Any) -> None:
-        self._counts["busy" if problem.code == "busy" else "refused"] += 1
-        self._refusals[problem.code] += 1
 
     def _go_on(self, effects: list[Effect], now: float) -> list[Effect]:
         """Give the solver what waits, if it is free."""
@@ -326,16 +305,15 @@ class MapCore:
             return None
         if self._must_reload or not self._has_room():
             return None
-        insert = self._admission.take_alone(arrived)
-        if insert is None:
+        if not self._admission.take_alone(arrived):
             return None
         self._started = arrived.now
         self._unjudged += 1
-        self._unjudged_bytes += insert.size
-        self._running = run = Run((), (insert,), True)
+        self._unjudged_bytes += arrived.size
+        self._running = run = Run((), (arrived,), True)
         return run
 
-    def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Waiting, ...], now: float) -> bool:
+    def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Arrived, ...], now: float) -> bool:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
@@ -349,7 +327,7 @@ class MapCore:
     def _count_refused(self, effects: list[Effect]) -> list[Effect]:
         for effect in effects:
             if isinstance(effect, Refuse):
-                self._refused(effect.problem)
+                self._account.refused(effect.problem)
         return effects
 
     def _event(self, what: str) -> Publish:

@@ -7,7 +7,7 @@ Those on the path of every insert are named tuples: a frozen dataclass takes thr
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from factorbus.proto.arrays import I64
@@ -30,14 +30,14 @@ class Located(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """An insert came in.
+    """An insert came in, and waits for its answer.
 
-    content: the message, or the problem with it when only its sequence number could be read; such an insert takes
-    its place in the sequence and is refused there.  digest tells a repetition from another message of that number.
-    message: the bytes as they came, for the journal.
+    askers: everybody who waits with it (a client may ask again).  content: the message, or the problem with it when
+    only its sequence number could be read; such an insert takes its place in the sequence and is refused there.
+    digest tells a repetition from another message of that number.  message: the bytes as they came, for the journal.
     """
 
-    asker: Asker
+    askers: list[Asker]
     client: str
     sequence: int
     epoch: int
@@ -63,7 +63,7 @@ class Outcome(NamedTuple):
     first_factor: the id of its first factor; −1 where it was refused.
     """
 
-    insert: "Waiting"
+    insert: Arrived
     answer: bytes | Any
     first_factor: int = -1
 
@@ -105,7 +105,7 @@ class Folded(NamedTuple):
 class Alone(NamedTuple):
     """One insert was taken in by a step of its own: what Judged, Stepped and Folded say of it, in one."""
 
-    insert: "Waiting"
+    insert: Arrived
     answer: bytes
     delta: bytes
     first_factor: int
@@ -120,20 +120,6 @@ class Alone(NamedTuple):
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------
-
-
-@dataclass(slots=True, eq=False)
-class Waiting:
-    """An insert in its place, with everybody who waits for its answer (a client may ask again)."""
-
-    client: str
-    sequence: int
-    size: int
-    digest: int
-    content: Insert | Located | Problem
-    askers: list[Asker] = field(default_factory=list)
-    message: bytes = b""
-    since: float = 0.0  # when it arrived
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +171,7 @@ class Run(NamedTuple):
     """
 
     reads: tuple[Read, ...]
-    inserts: tuple[Waiting, ...]
+    inserts: tuple[Arrived, ...]
     short: bool = False
     reload: bool = False
 

@@ -1,4 +1,4 @@
-"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's Run.
+"""Arrived inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's Run.
 
     1  stage every insert; the solver refuses a bad one whole, the others go on
     2  one step for all of them
@@ -27,7 +27,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Accepted, Batch, Delta, Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
-from factorbus.service.events import Alone, Folded, Judged, Located, Outcome, Stepped, Waiting
+from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
 from factorbus.service.questions import Copied, Question, Snapshot, snapshot
@@ -56,7 +56,7 @@ class Broken(Problem):
 
 
 class _Staged(NamedTuple):
-    insert: Waiting
+    insert: Arrived
     first_factor: int
     settle: bool
     points_below: float = 0.0
@@ -137,7 +137,7 @@ class Folder:
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 
-    def fold_again(self, inserts: Sequence[Waiting], rebuilt: bool) -> Iterator[Judged | Stepped]:
+    def fold_again(self, inserts: Sequence[Arrived], rebuilt: bool) -> Iterator[Judged | Stepped]:
         """Fold in what was folded in together before: no limit that has been set since refuses it.
 
         rebuilt: the solver was replaced meanwhile.
@@ -150,7 +150,7 @@ class Folder:
         finally:
             self._limits = limits
 
-    def fold_whole(self, inserts: Sequence[Waiting]) -> tuple[list[Judged | Stepped], Folded]:
+    def fold_whole(self, inserts: Sequence[Arrived]) -> tuple[list[Judged | Stepped], Folded]:
         """All that comes of a fold, at its end.  Of the same inserts in the same groups always the same, to the bit."""
         came = self.fold_alone(inserts[0]) if len(inserts) == 1 else self.fold(inserts)
         if isinstance(came, Alone):
@@ -166,7 +166,7 @@ class Folder:
                 events.append(event)
         return events, folded
 
-    def fold(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped | Folded]:
+    def fold(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
 
         Yields, for every step, Judged (the answers, which stand whatever becomes of the delta) and Stepped; Folded at
@@ -181,7 +181,7 @@ class Folder:
                 yield from self._add(list(group))
         yield self._folded(cpu_s)
 
-    def _add(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
+    def _add(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
         """Inserts that only add: in one step, or one at a time where that fails."""
         try:
             yield from self._together(inserts)
@@ -189,7 +189,7 @@ class Folder:
             for insert in inserts:
                 yield from self._together([insert])
 
-    def _change(self, insert: Waiting) -> Iterator[Judged | Stepped]:
+    def _change(self, insert: Arrived) -> Iterator[Judged | Stepped]:
         """One that changes what the map has: in a new solver, so that the map is as it was wherever that fails."""
         content, started = cast(Insert, insert.content), time.perf_counter()
         try:
@@ -213,7 +213,7 @@ class Folder:
         if content.points_below:
             yield from self._ripen(content.points_below)
 
-    def fold_alone(self, insert: Waiting) -> Alone | Iterator[Judged | Stepped | Folded]:
+    def fold_alone(self, insert: Arrived) -> Alone | Iterator[Judged | Stepped | Folded]:
         """What `fold` comes to for one insert: in one piece where all goes as usual, in a third of the time.
 
         That time is mostly one of code that is not in the caches: so it is written in few calls.
@@ -269,7 +269,7 @@ class Folder:
         self._cpu_s += time.thread_time() - cpu_s
         return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
 
-    def _together(self, inserts: Sequence[Waiting]) -> Iterator[Judged | Stepped]:
+    def _together(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
         started = time.perf_counter()
         staged: list[_Staged] = []
@@ -303,7 +303,7 @@ class Folder:
             if below := max((s.points_below for s in staged), default=0.0):
                 yield from self._ripen(below)
 
-    def _stage(self, insert: Waiting) -> _Staged:
+    def _stage(self, insert: Arrived) -> _Staged:
         """Hand one insert to the solver.  Raises Problem, SolverError: then nothing changed."""
         content = insert.content
         if self._broken:
@@ -439,5 +439,5 @@ class Folder:
         return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
 
 
-def _is_change(insert: Waiting) -> bool:
+def _is_change(insert: Arrived) -> bool:
     return isinstance(insert.content, Insert) and bool(insert.content.changes)

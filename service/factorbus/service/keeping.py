@@ -23,7 +23,7 @@ from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnr
 from factorbus.journal.records import Fold
 from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import Last, Saved, Store, open_store
-from factorbus.service.events import Judged, Stepped, Waiting
+from factorbus.service.events import Arrived, Judged, Stepped
 from factorbus.service.fold import Folder
 from factorbus.service.writing import written
 
@@ -60,7 +60,7 @@ class Listener(Protocol):
 @dataclass(frozen=True, slots=True)
 class _Folded:
     number: int
-    inserts: Sequence[Waiting]
+    inserts: Sequence[Arrived]
     events: Events
 
 
@@ -140,7 +140,7 @@ class Keeper:
         self._thread.start()
         return problem
 
-    def hand(self, inserts: Sequence[Waiting], events: Events) -> None:
+    def hand(self, inserts: Sequence[Arrived], events: Events) -> None:
         """Write down that `inserts` were folded, and what came of it."""
         if inserts:
             self._number += 1

@@ -16,7 +16,7 @@ from factorbus.journal.store import Last, Store
 from factorbus.proto import codec
 from factorbus.proto.messages import Accepted
 from factorbus.service.arrival import read_again
-from factorbus.service.events import Judged, Stepped, Waiting
+from factorbus.service.events import Arrived, Judged, Stepped
 from factorbus.service.fold import Folder
 
 log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ def again(
     store: Store, folder: Folder, fold: Fold, present: bytes, told: Callable[[Stepped], None] | None = None
 ) -> bytes:
     """Fold `fold` in again; gives the chain of digests after it.  told: gets every step.  Raises JournalDiffers."""
-    inserts = [_waiting(entry) for entry in fold.entries if entry.outcome != UNTRIED]
+    inserts = [_arrived(entry) for entry in fold.entries if entry.outcome != UNTRIED]
     outcomes: dict[tuple[str, int], int] = {}
     for event in folder.fold_again(inserts, fold.rebuilt):
         if isinstance(event, Judged):
@@ -117,6 +117,6 @@ def _from_snapshot(store: Store, folder: Folder, fingerprint: str) -> Last:
     return Last(0, 0, chain.START)
 
 
-def _waiting(entry: Entry) -> Waiting:
+def _arrived(entry: Entry) -> Arrived:
     digest, content = read_again(entry.message)
-    return Waiting(entry.client, entry.sequence, len(entry.message), digest, content, [], entry.message)
+    return Arrived([], entry.client, entry.sequence, 0, len(entry.message), digest, content, 0.0, entry.message)

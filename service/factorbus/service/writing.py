@@ -7,11 +7,11 @@ from factorbus.journal.digest import sealed
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
 from factorbus.journal.store import Last
 from factorbus.proto import codec
-from factorbus.service.events import Judged, Outcome, Stepped, Waiting
+from factorbus.service.events import Arrived, Judged, Outcome, Stepped
 from factorbus.solver.errors import SolverError
 
 
-def written(number: int, inserts: Sequence[Waiting], events: Sequence[Judged | Stepped], last: Last) -> Fold:
+def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last) -> Fold:
     """What is written down of a Run."""
     present, revision, rebuilt = last.chain, last.revision, False
     outcomes: dict[int, tuple[Outcome, Judged]] = {}
@@ -26,7 +26,7 @@ def written(number: int, inserts: Sequence[Waiting], events: Sequence[Judged | S
     return Fold(number, revision, rebuilt, present, entries)
 
 
-def _entry(insert: Waiting, outcome: Outcome, judged: Judged) -> Entry:
+def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:
     if isinstance(outcome.answer, bytes):
         answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, b""
     else:
