@@ -1,0 +1,33 @@
+"""What a map has done: what is noted is counted when somebody asks, and is in no answer twice."""
+
+from factorbus.service.account import Account, Done
+
+
+def done(chi2: float) -> Done:
+    return Done("tree", chi2, 2.0, 0.004, 100, 200)
+
+
+def test_what_was_noted_is_in_every_answer_once() -> None:
+    account = Account()
+    account.received(50)
+    account.stepped("batch", 1.0, 3.0, b"delta")
+    account.note(done(7.0))
+    for _ in range(2):
+        stats, more = account.stats(), account.for_operators()
+        assert stats == {
+            "chi2": 7.0,
+            "inserts": {"accepted": 1, "refused": 0, "busy": 0},
+            "strategies": {"batch": 1, "tree": 1},
+            "solver_ms": 5.0,
+        }
+        assert more["bytes"] == {"received": 50, "answered": 100, "published": 205}
+        assert sum(more["step_s"]["counts"]) == 2
+        assert sum(more["insert_s"]["counts"]) == 1
+
+
+def test_nothing_is_lost_however_much_is_noted() -> None:
+    account = Account()
+    for n in range(5000):
+        account.note(done(float(n)))
+    stats = account.stats()
+    assert (stats["inserts"]["accepted"], stats["chi2"], stats["solver_ms"]) == (5000, 4999.0, 10_000.0)
