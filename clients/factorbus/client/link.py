@@ -16,7 +16,6 @@ from zenoh.handlers import Callback
 
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet
-from factorbus.proto.kept_state import keep_state
 from factorbus.proto.problems import BadEndpoint, BadSetting, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
@@ -46,7 +45,6 @@ class Link:
                 done(reply)
 
         def on_reply(reply: zenoh.Reply) -> None:
-            keep_state()
             finish(_read(reply))
 
         handler = Callback(on_reply, drop=lambda: finish(Silence()), indirect=False)
@@ -90,7 +88,6 @@ class Link:
         """While inside, every publication on `key` goes to `hear`."""
 
         def on_sample(sample: zenoh.Sample) -> None:
-            keep_state()
             hear(sample.payload.to_bytes())
 
         subscriber = self._session.declare_subscriber(key, Callback(on_sample, indirect=False))
