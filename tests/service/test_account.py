@@ -10,8 +10,8 @@ def done(chi2: float) -> Done:
 def test_what_was_noted_is_in_every_answer_once() -> None:
     account = Account()
     account.received(50)
-    account.stepped("batch", 1.0, 3.0, b"delta")
-    account.note(done(7.0))
+    account.note(done(1.0))
+    account.stepped("batch", 7.0, 3.0, 5)
     for _ in range(2):
         stats, more = account.stats(), account.for_operators()
         assert stats == {

@@ -14,7 +14,7 @@ _NOTED = 1024
 
 
 class Done(NamedTuple):
-    """An insert that was folded in by a step of its own: solver_ms for the step, seconds from arrival to answer."""
+    """An insert that was folded in by a step of its own; seconds are those since it arrived."""
 
     strategy: str
     chi2: float
@@ -40,22 +40,19 @@ class Account:
         """An insert of so many bytes came in."""
         self._received += size
 
-    def accepted(self, answer: bytes) -> None:
-        """An insert was."""
+    def accepted(self, answered_bytes: int) -> None:
+        """An insert was; its answer has so many bytes."""
         self._accepted += 1
-        self._answered += len(answer)
+        self._answered += answered_bytes
 
     def refused(self, problem: Any) -> None:
         """An insert was: a problem with a code."""
         self._refusals[problem.code] += 1
 
-    def stepped(self, strategy: str, chi2: float, solver_ms: float, delta: bytes) -> None:
-        """The solver made a step."""
-        self.chi2 = chi2
-        self._solver_ms += solver_ms
-        self._strategies[strategy] += 1
-        self._step_s.add(solver_ms / 1e3)
-        self._published += len(delta)
+    def stepped(self, strategy: str, chi2: float, solver_ms: float, published_bytes: int) -> None:
+        """The solver made a step; its delta has so many bytes."""
+        self.count()  # what was noted came before
+        self._step(strategy, chi2, solver_ms, published_bytes)
 
     def took(self, seconds: float) -> None:
         """From the arrival of an insert until the solver was done with it."""
@@ -71,14 +68,9 @@ class Account:
         """What was noted."""
         noted, self._noted = self._noted, []
         for done in noted:
-            self._accepted += 1
-            self._answered += done.answered_bytes
-            self._published += done.published_bytes
-            self.chi2 = done.chi2
-            self._solver_ms += done.solver_ms
-            self._strategies[done.strategy] += 1
-            self._step_s.add(done.solver_ms / 1e3)
-            self._insert_s.add(done.seconds)
+            self.accepted(done.answered_bytes)
+            self._step(done.strategy, done.chi2, done.solver_ms, done.published_bytes)
+            self.took(done.seconds)
 
     def stats(self) -> dict[str, Any]:
         """What anybody may ask of it."""
@@ -104,3 +96,10 @@ class Account:
             "insert_s": self._insert_s.as_dict(),
             "bytes": {"received": self._received, "answered": self._answered, "published": self._published},
         }
+
+    def _step(self, strategy: str, chi2: float, solver_ms: float, published_bytes: int) -> None:
+        self.chi2 = chi2
+        self._solver_ms += solver_ms
+        self._strategies[strategy] += 1
+        self._step_s.add(solver_ms / 1e3)
+        self._published += published_bytes

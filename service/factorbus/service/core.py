@@ -133,7 +133,7 @@ class MapCore:
             self._unjudged_bytes -= outcome.insert.size
             effects += self._admission.answer(outcome.insert, outcome.answer)
             if isinstance(outcome.answer, bytes):
-                self._account.accepted(outcome.answer)
+                self._account.accepted(len(outcome.answer))
             else:
                 self._account.refused(outcome.answer)
         return effects
@@ -186,9 +186,9 @@ class MapCore:
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
-        self._account.count()
-        self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, stepped.delta)
-        self._moved_on(stepped.revision, len(stepped.delta))
+        size = len(stepped.delta)
+        self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
+        self._moved_on(stepped.revision, size)
         return [Publish("delta", stepped.delta)]
 
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
