@@ -9,8 +9,8 @@ ours did, over the same Zenoh configuration.  What the client needs to encode th
 given beside it.
 
 All hubs run all the time and are asked in turn, BLOCK exchanges each, in an order that changes.  So they share whatever
-else the machine does, and every exchange follows one with the same hub: with each sample another hub, an exchange also
-pays for what the other hub before it has driven out of the caches, or gains from the cores that it has kept awake.
+else the machine does.  Every exchange follows one with the same hub, as the first of each turn is not counted: one that
+follows another hub also pays for what that has driven out of the caches, or gains from the cores that it has kept awake.
 
 Around every exchange, with whichever hub, the client does the same: before it makes an insert and encodes it, after it
 decodes an answer and a delta.  That is not in the time, but it decides what is in the caches of the client when it
@@ -136,34 +136,26 @@ class Round:
 
 
 def one_round(client: "Client", echo: "Echo", laid_out: "Echo", name: str, samples: int) -> Round:
-    """Every block has a new map, so that the solver's part stays small; the first exchanges are not counted."""
+    """Every block has a new map, so that the solver's part stays small."""
     taken = Round([], [], [], [], [])
     hold_us = 0.0
-
-    def ask_ours() -> None:
-        taken.ours.append(client.exchange())
-
-    def ask_bare() -> None:
-        taken.bare.append(client.at_work(echo.exchange))
-
-    def ask_idle() -> None:
-        taken.idle.append(echo.exchange(client.payload))
-
-    def ask_held() -> None:
-        taken.held.append(client.at_work(echo.exchange, hold_us))
-
-    def ask_laid_out() -> None:
-        taken.laid_out.append(client.at_work(laid_out.exchange))
-
+    turns: list[tuple[list[Any], Callable[[], Any]]] = [
+        (taken.ours, client.exchange),
+        (taken.bare, lambda: client.at_work(echo.exchange)),
+        (taken.idle, lambda: echo.exchange(client.payload)),
+        (taken.held, lambda: client.at_work(echo.exchange, hold_us)),
+        (taken.laid_out, lambda: client.at_work(laid_out.exchange)),
+    ]
     for block in range(-(-samples // BLOCK)):
         with client.joined(f"{name}-{block}"):
             warm_up = [client.exchange() for _ in range(WARM_UP)]
             hold_us = float(np.median([sample.solver for sample in warm_up]))
             for hub in (echo, laid_out):
                 hub.answer_with(warm_up[-1].sizes)
-            for ask in client.random.permutation(np.array([ask_ours, ask_bare, ask_idle, ask_held, ask_laid_out])):
-                for _ in range(BLOCK):
-                    ask()
+            for turn in client.random.permutation(len(turns)):
+                samples_of_hub, exchange = turns[turn]
+                exchange()
+                samples_of_hub += [exchange() for _ in range(BLOCK)]
     return taken
 
 
@@ -267,7 +259,13 @@ def ask(bus: zenoh.Session, key: zenoh.KeyExpr | str, on_reply: Callable[[zenoh.
 
     The library also declares the key of its inserts; the floor, as bare as it is, does not.
     """
-    bus.get(key, Callback(on_reply, indirect=False), consolidation=zenoh.ConsolidationMode.NONE, **what)
+    bus.get(
+        key,
+        Callback(on_reply, indirect=False),
+        consolidation=zenoh.ConsolidationMode.NONE,
+        allowed_destination=zenoh.Locality.REMOTE,
+        **what,
+    )
 
 
 def echo() -> None:

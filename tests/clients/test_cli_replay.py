@@ -171,15 +171,18 @@ def test_no_process_is_left_whoever_is_killed(number: int, whom: str, code: int,
     with subprocess.Popen(
         [FACTORBUS, "replay", str(long_drive)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
-        assert process.stderr is not None
-        pid, endpoint = announced(process.stderr)
-        solver = os.pidfd_open(pid)
-        with connect(endpoint, client="watcher", timeout_s=60) as bus, bus.map("replay") as watched:
-            watched.estimate.wait_for(100, timeout_s=60)
-            os.kill(process.pid if whom == "parent" else pid, number)
-        _, error = process.communicate(timeout=60)
-        assert select.select([solver], [], [], 60)[0], "the solver process is still there"
-        os.close(solver)
+        try:
+            assert process.stderr is not None
+            pid, endpoint = announced(process.stderr)
+            solver = os.pidfd_open(pid)
+            with connect(endpoint, client="watcher", timeout_s=60) as bus, bus.map("replay") as watched:
+                watched.estimate.wait_for(100, timeout_s=60)
+                os.kill(process.pid if whom == "parent" else pid, number)
+            _, error = process.communicate(timeout=60)
+            assert select.select([solver], [], [], 60)[0], "the solver process is still there"
+            os.close(solver)
+        finally:
+            process.kill()  # one that goes on driving would be waited for
     assert process.returncode == code, error
     assert said in error
     assert "Traceback" not in error

@@ -25,7 +25,8 @@ class RemoteMap:
         self._start = self._mirror.revision
         self._received: dict[int, Mapping[str, Any]] = {}
         self._latest: Mapping[str, Any] = {}
-        self._news = threading.Event()
+        self._lock, self._news = threading.RLock(), False
+        self._changed = threading.Condition(self._lock)
         self._forget = self._mirror.on_delta(self._on_delta)
         self._comparisons: list[Future[Chi2]] = []
 
@@ -100,8 +101,9 @@ class RemoteMap:
 
     def await_news(self, timeout_s: float) -> int:
         """Wait for a delta, or until time is up; gives the revision that the estimate here is of."""
-        self._news.wait(timeout_s)
-        self._news.clear()
+        with self._lock:
+            self._changed.wait_for(lambda: self._news, timeout_s)
+            self._news = False
         return self._mirror.revision
 
     def close(self) -> None:
@@ -112,7 +114,9 @@ class RemoteMap:
         """Count a step's own delta; a resynchronisation (previous 0, everything in one) is not one."""
         if delta.previous == delta.revision - 1 and delta.revision > self._start:
             self._received[delta.revision] = self._latest = delta.report
-        self._news.set()
+        with self._lock:
+            self._news = True
+            self._changed.notify_all()
 
     def _collect(self, wait: bool) -> list[Stepped]:
         steps = []

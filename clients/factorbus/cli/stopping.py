@@ -2,14 +2,17 @@
 
 import os
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from factorbus.cli.exits import INTERRUPTED
 
 _LOOK_S = 0.5
+_OURS = (signal.SIGTERM, signal.SIGINT)
+_ENDED = b"\x1b[?25h\ninterrupted\n"  # the cursor was hidden, if a bar was shown
 
 
 @contextmanager
@@ -26,7 +29,7 @@ def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None)
         stop.set()
         on_stop()
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    before = {number: signal.signal(number, on_signal) for number in _OURS}
     if until_eof:
         threading.Thread(target=_wait_for_eof, args=(stop,), daemon=True).start()
     try:
@@ -43,17 +46,50 @@ def wait_until(stop: threading.Event) -> None:
 
 
 @contextmanager
-def interrupt_on_sigterm() -> Iterator[None]:
-    """While inside, SIGTERM ends the command as Ctrl-C does: through every `finally`."""
+def interrupt_on_sigterm(grace_s: float = 10.0) -> Iterator[None]:
+    """While inside, SIGTERM ends the command as Ctrl-C does: through every `finally`.  The second signal is final.
+
+    Both raise KeyboardInterrupt wherever the main thread happens to be, where it may do harm or be lost: in
+    a callback from a library that is not Python's, in the midst of taking a lock.  So a command that has not ended
+    within `grace_s` after the signal is ended.
+    """
 
     def on_signal(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, on_signal)
+    before = {number: signal.signal(number, on_signal) for number in _OURS}
+    told, tell = socket.socketpair()
+    tell.setblocking(False)
+    told_before = signal.set_wakeup_fd(tell.fileno())  # told of by the C part of Python, whatever the main thread does
+    threading.Thread(target=_see_to_the_end, args=(told, grace_s), daemon=True).start()
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.set_wakeup_fd(told_before)
+        tell.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _see_to_the_end(told: socket.socket, grace_s: float) -> None:
+    """After one signal there are so many seconds to end by itself, after another there is none."""
+    with told:
+        if not _signalled(told):
+            return
+        told.settimeout(grace_s)
+        with suppress(TimeoutError):
+            if not _signalled(told):
+                return
+        os.write(sys.stderr.fileno(), _ENDED)
+        os._exit(INTERRUPTED)
+
+
+def _signalled(told: socket.socket) -> bool:
+    """Wait for the next of our signals; False when there is nothing left to end.  Raises TimeoutError."""
+    while number := told.recv(1):
+        if number[0] in _OURS:
+            return True
+    return False
 
 
 def leave_on_eof() -> None:

@@ -9,10 +9,10 @@ import itertools
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from typing import Any
 
 from factorbus.client.link import Link
+from factorbus.client.promise import Promise
 from factorbus.client.replies import Again, Reply, judge
 from factorbus.proto.problems import Problem, Refused, Unavailable
 
@@ -41,8 +41,7 @@ class Errand:
         self.what, self.key, self.payload, self.decode = what, key, payload, decode
         self.passing, self.then = passing, then
         self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        self.future: Future[Any] = Future()
-        self.future.set_running_or_notify_cancel()  # so that an asyncio wrapper cannot cancel what is on its way
+        self.future: Promise[Any] = Promise()
         self.attempt = 0
         self.because = "the first try is out"
         self.sent_at = self.answered_at = 0.0
@@ -56,14 +55,15 @@ class Courier:
         self._due: list[tuple[float, int, Errand]] = []
         self._order = itertools.count()
         self._open: set[Errand] = set()
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._changed = threading.Condition(self._lock)
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="factorbus-courier", daemon=True)
         self._thread.start()
 
     def carry(self, errand: Errand) -> Errand:
         """Send `errand`; its future gets `decode(answer)`, or a Problem."""
-        with self._changed:
+        with self._lock:
             self._open.add(errand)
             closed = self._closed
         errand.sent_at = time.perf_counter()
@@ -78,7 +78,7 @@ class Courier:
 
         Also what is on its way: what reached them before they were ready may well be answered by nobody.
         """
-        with self._changed:
+        with self._lock:
             now = time.monotonic()
             self._due = [each for each in self._due if not each[2].key.startswith(prefix)]
             again = sorted((e for e in self._open if e.key.startswith(prefix)), key=lambda e: e.sent_at)
@@ -92,7 +92,7 @@ class Courier:
 
     def close(self) -> None:
         """Stop.  What is still unanswered fails with Unavailable."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             left = list(self._open)
             self._changed.notify()
@@ -127,13 +127,13 @@ class Courier:
         if errand.deadline is not None and at >= errand.deadline:
             self._finish(errand, Unavailable(errand.what, self._waited(errand), errand.because))
             return
-        with self._changed:
+        with self._lock:
             if errand in self._open:
                 heapq.heappush(self._due, (at, next(self._order), errand))
                 self._changed.notify()
 
     def _finish(self, errand: Errand, result: Any) -> None:
-        with self._changed:
+        with self._lock:
             if errand not in self._open:
                 return
             self._open.remove(errand)
@@ -154,7 +154,7 @@ class Courier:
                 self._try(errand)
 
     def _next(self) -> Errand | None:
-        with self._changed:
+        with self._lock:
             while not self._closed:
                 if not self._due:
                     self._changed.wait()

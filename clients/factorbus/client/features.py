@@ -56,7 +56,8 @@ class Features:
         self._memories = Memories()
         self._shared = True  # until an answer shows that nobody there shares memory with us
         self._stack = ExitStack()
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._changed = threading.Condition(self._lock)
         self._services: set[str] = set()
         self._stack.enter_context(link.watching(keys.any_features_token(), self._see))
 
@@ -129,13 +130,13 @@ class Features:
         return self._courier.carry(Errand(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
 
     def _any_service(self, timeout_s: float) -> str:
-        with self._changed:
+        with self._lock:
             if not self._changed.wait_for(lambda: self._services, timeout_s):
                 raise Unavailable("features", timeout_s, "no service on this bus makes features: is one running?")
             return min(self._services)
 
     def _see(self, token: str, alive: bool) -> None:
-        with self._changed:
+        with self._lock:
             (self._services.add if alive else self._services.discard)(keys.service_of(token))
             self._changed.notify_all()
 

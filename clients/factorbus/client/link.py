@@ -8,7 +8,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import zenoh
@@ -16,6 +16,7 @@ from zenoh.handlers import Callback
 
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet
+from factorbus.proto.kept_state import keep_state
 from factorbus.proto.problems import BadEndpoint, BadSetting, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
@@ -45,19 +46,10 @@ class Link:
                 done(reply)
 
         def on_reply(reply: zenoh.Reply) -> None:
+            keep_state()
             finish(_read(reply))
 
-        handler = Callback(on_reply, drop=lambda: finish(Silence()), indirect=False)
-        try:
-            self._session.get(
-                self._short(key),
-                handler,
-                payload=payload,
-                timeout=timeout_s,
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
-        except zenoh.ZError:  # the session is closed
-            finish(Silence())
+        self._query(self._short(key), payload, timeout_s, on_reply, lambda: finish(Silence()))
 
     def _short(self, key: str) -> zenoh.KeyExpr | str:
         """`key`, declared: it goes as a number, and where it leads is worked out once.  A tenth of an insert's way.
@@ -75,19 +67,38 @@ class Link:
         def on_reply(reply: zenoh.Reply) -> None:
             replies.append(_read(reply))
 
-        handler = Callback(on_reply, drop=lambda: done(replies), indirect=False)
-        try:
+        self._query(key, payload, timeout_s, on_reply, lambda: done(replies))
+
+    def _query(
+        self,
+        key: zenoh.KeyExpr | str,
+        payload: bytes,
+        timeout_s: float,
+        on_reply: Callable[[zenoh.Reply], None],
+        on_end: Callable[[], None],
+    ) -> None:
+        """Query `key`; `on_end` is called once, after the last reply.  If the session is closed, that is at once.
+
+        Only others are asked.  Were this session asked as well, its own share of the query would now and then be the
+        last to end: within `get`, on the thread that asks.  When that is the main thread, Python handles signals in
+        `on_end`, and zenoh discards what their handlers raise: a Ctrl-C would be lost.
+        """
+        with suppress(zenoh.ZError):  # it is closed
             self._session.get(
-                key, handler, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE
+                key,
+                Callback(on_reply, drop=on_end, indirect=False),
+                payload=payload,
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                allowed_destination=zenoh.Locality.REMOTE,
             )
-        except zenoh.ZError:  # the session is closed
-            done([])
 
     @contextmanager
     def listening(self, key: str, hear: Callable[[bytes], None]) -> Iterator[None]:
         """While inside, every publication on `key` goes to `hear`."""
 
         def on_sample(sample: zenoh.Sample) -> None:
+            keep_state()
             hear(sample.payload.to_bytes())
 
         subscriber = self._session.declare_subscriber(key, Callback(on_sample, indirect=False))

@@ -62,7 +62,8 @@ class Map:
         self._size, self._join = window, join
         self._stack, self._presence = ExitStack(), ExitStack()
         self._mirror: Mirror | None = None
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._changed = threading.Condition(self._lock)
         self._sending = threading.Lock()
         self._closed = False
         self._enter(join())
@@ -170,12 +171,12 @@ class Map:
         batch = batch.batch() if isinstance(batch, Draft) else batch
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
-            with self._changed:
+            with self._lock:
                 self._wait_for_room(timeout_s)
             listed = changes.listed() if changes is not None else ()
             insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
             ticket = self._ticket(insert, timeout_s)
-            with self._changed:
+            with self._lock:
                 self._window.sent(ticket)
             self._courier.carry(ticket.errand)
         return ticket
@@ -186,7 +187,7 @@ class Map:
         Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
         """
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
-        with self._changed:
+        with self._lock:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
                 raise Unavailable(
@@ -240,7 +241,7 @@ class Map:
 
     def close(self) -> None:
         """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""
-        with self._changed:
+        with self._lock:
             already, self._closed = self._closed, True
             self._changed.notify_all()
         if not already:
@@ -279,7 +280,7 @@ class Map:
         def then(_: Errand, result: Any) -> None:
             if isinstance(result, Accepted) and self._mirror is not None:
                 self._mirror.expect(result.revision, result.epoch)
-            with self._changed:
+            with self._lock:
                 window.answered(insert.sequence, result if isinstance(result, Problem) else None)
                 self._changed.notify_all()
 
@@ -309,7 +310,7 @@ class Map:
 
     def _give_up(self, hint: str) -> None:
         """Under `_sending`."""
-        with self._changed:
+        with self._lock:
             unanswered = self._window.unanswered
         for ticket in unanswered:
             waited_s = round(time.perf_counter() - ticket.errand.sent_at, 3)

@@ -54,7 +54,8 @@ class Mirror:
     def __init__(self, link: Link, map_name: str, timeout_s: float) -> None:
         self._link, self._map, self._timeout_s = link, map_name, timeout_s
         self._following = Following()
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._changed = threading.Condition(self._lock)
         self._callbacks: list[Callable[[Delta], None]] = []
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._owners: set[str] = set()
@@ -72,7 +73,7 @@ class Mirror:
             number = parse_symbol(key) if isinstance(key, str) else int(key)
         except BadSymbol as bad:
             raise KeyError(bad.message) from None
-        with self._changed:
+        with self._lock:
             value = self._following.value(number)
         if value is None:
             raise KeyError(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
@@ -86,7 +87,7 @@ class Mirror:
         return True
 
     def __len__(self) -> int:
-        with self._changed:
+        with self._lock:
             return self._following.count()
 
     @property
@@ -111,7 +112,7 @@ class Mirror:
 
     def columns(self, kind: str) -> tuple[I64, F64]:
         """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises KeyError."""
-        with self._changed:
+        with self._lock:
             columns = self._following.columns_of(kind)
         if columns is None:
             raise KeyError(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
@@ -119,7 +120,7 @@ class Mirror:
 
     def snapshot(self) -> Snapshot:
         """Everything, at one revision."""
-        with self._changed:
+        with self._lock:
             return Snapshot(self.epoch, self.revision, self._following.columns())
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
@@ -146,7 +147,7 @@ class Mirror:
         It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronisation it gets
         one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.
         """
-        with self._changed:
+        with self._lock:
             self._callbacks = [*self._callbacks, callback]
         return lambda: self._forget(callback)
 
@@ -178,7 +179,7 @@ class Mirror:
     def _try_wait(self, reached: Callable[[], bool], timeout_s: float) -> None:
         """Until `reached`, the mirror's end, or the end of time."""
         end = time.monotonic() + timeout_s
-        with self._changed:
+        with self._lock:
             if not self._changed.wait_for(lambda: self._closing or reached(), min(_IMPATIENT_S, timeout_s)):
                 self._inbox.put(("probe", None))
                 self._changed.wait_for(lambda: self._closing or reached(), max(end - time.monotonic(), 0.0))
@@ -187,7 +188,7 @@ class Mirror:
         return self._following.live and self._following.revision >= revision
 
     def _forget(self, callback: Callable[[Delta], None]) -> None:
-        with self._changed:
+        with self._lock:
             self._callbacks = [each for each in self._callbacks if each is not callback]
 
     def _stop(self) -> None:
@@ -232,12 +233,12 @@ class Mirror:
             case "probe" if self._following.live:
                 self._probe()
             case "stop":
-                with self._changed:
+                with self._lock:
                     self._closing = True
                     self._changed.notify_all()
 
     def _apply_delta(self, delta: Delta) -> None:
-        with self._changed:
+        with self._lock:
             news = self._following.delta(delta)
             self._confirm()
         self._tell(news)
@@ -247,7 +248,7 @@ class Mirror:
         if (estimate.epoch, estimate.revision) == (self.epoch, self.revision) and self._following.live:
             return
         tables = tables_of(estimate)  # outside the lock: readers do not wait for it
-        with self._changed:
+        with self._lock:
             if estimate.epoch != self._following.epoch:
                 self._expected = 0
             news = self._following.estimate(estimate, tables)
@@ -280,7 +281,7 @@ class Mirror:
             return
         told = read_map("stats", reply.payload, ANSWER_LIMITS)
         epoch, revision = fields.integer("stats", told, "epoch"), fields.integer("stats", told, "revision")
-        with self._changed:
+        with self._lock:
             if epoch != self._following.epoch:
                 self._following.lost()
             self._expected = max(self._expected, revision)
@@ -297,11 +298,11 @@ class Mirror:
             if not self._owners:
                 self._lose()
         self._deserted = not self._owners
-        with self._changed:
+        with self._lock:
             self._changed.notify_all()
 
     def _lose(self) -> None:
-        with self._changed:
+        with self._lock:
             self._following.lost()
 
     def _confirm(self) -> None:

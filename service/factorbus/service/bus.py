@@ -15,6 +15,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.proto import codec, discreet, keys
+from factorbus.proto.kept_state import keep_state
 from factorbus.proto.messages import Job
 from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.config import BadConfig, Config
@@ -71,7 +72,12 @@ class Bus:
 
     def answer_on(self, key: str, take: Callable[[Asker], None]) -> None:
         """Every query on `key` goes to `take`."""
-        self._declared.append(self._session.declare_queryable(key, Callback(take, indirect=False)))
+
+        def on_query(query: zenoh.Query) -> None:
+            keep_state()
+            take(query)
+
+        self._declared.append(self._session.declare_queryable(key, Callback(on_query, indirect=False)))
 
     def announce(self, token: str) -> Callable[[], None]:
         """Declare a liveliness token; call what comes back to withdraw it."""

@@ -4,12 +4,15 @@ from typing import Any
 
 from factorbus.service.config import Config
 
-# How Zenoh's threads are laid out in this process.  Its own way is two that receive and another that sends; what an
-# answer or a delta then costs is to wake that one.  When sending is done by those that receive (three of them, as
-# before), a callback's answer and delta leave with one write on its own thread, as soon as it returns.  Measured
-# with a step in between: 50 to 100 µs of 700 to 850.  An operator who sets it otherwise is obeyed.
+# How Zenoh's threads are laid out in this process.  Its own way is two that receive, and one each that sends, accepts
+# connections and does all else; what an answer or a delta then costs is to wake them.  When the two do it all, a
+# callback's answer and delta leave on its own thread, as soon as it returns (measured with a step in between: 50 to 100
+# µs of 700 to 850).  And what comes in is not first seen by the thread that has accepted the connection, nor does every
+# query, and its end, wake one that watches how long queries take (measured: 60 of 550 µs; a third thread to wake costs
+# 15 of them again).  Two are enough, as one at most has a Run (see `host.py`).  An operator who sets it otherwise is
+# obeyed.
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
-RUNTIME = "(rx: (worker_threads: 3), tx: (handover: rx))"
+RUNTIME = "(rx: (worker_threads: 2), tx: (handover: rx), acc: (handover: rx), net: (handover: rx))"
 
 
 def zenoh_settings(config: Config) -> dict[str, Any]:

@@ -1,0 +1,76 @@
+"""A command that is interrupted ends, even where the interrupt is lost."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from factorbus.cli.exits import INTERRUPTED
+from factorbus.cli.stopping import interrupt_on_sigterm
+
+# Waits for signals, and says so; what each raises is lost, as in a callback from C.
+DEAF = """
+import signal, sys
+from factorbus.cli.stopping import interrupt_on_sigterm
+
+signal.signal(signal.SIGUSR1, lambda *_: None)
+with interrupt_on_sigterm(float(sys.argv[1])):
+    print("ready", flush=True)
+    while True:
+        try:
+            signal.pause()
+        except KeyboardInterrupt:
+            pass
+        print("heard", flush=True)
+"""
+
+
+@contextmanager
+def deaf(grace_s: float) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-c", DEAF, str(grace_s)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_does_not_end_by_itself_is_ended(number: int) -> None:
+    with deaf(0.1) as process:
+        process.send_signal(number)
+        out, error = process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED
+    assert out == "heard\n"
+    assert error.endswith("interrupted\n")
+
+
+def test_the_second_signal_is_final() -> None:
+    with deaf(1000.0) as process:
+        assert process.stdout is not None
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "heard\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == INTERRUPTED
+
+
+def test_other_signals_are_others() -> None:
+    with deaf(1000.0) as process:
+        assert process.stdout is not None
+        for _ in range(2):
+            process.send_signal(signal.SIGUSR1)
+            assert process.stdout.readline() == "heard\n"
+        assert process.poll() is None
+
+
+def test_afterwards_all_is_as_it_was() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(KeyboardInterrupt), interrupt_on_sigterm():
+        signal.raise_signal(signal.SIGTERM)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert signal.set_wakeup_fd(-1) == -1

@@ -1,0 +1,97 @@
+"""A future that may be interrupted: waited for by threads, by asyncio, and by one that a signal takes away."""
+
+import asyncio
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import FrameType
+
+import pytest
+
+from factorbus.client.promise import Promise
+
+WAITERS = 4
+INTERRUPTS = 200
+_PAUSE_S = 1e-4
+
+
+def test_all_who_wait_get_it() -> None:
+    promise: Promise[int] = Promise()
+    with ThreadPoolExecutor(WAITERS) as pool:
+        waiting = [pool.submit(promise.result, 60) for _ in range(WAITERS)]
+        promise.set_result(7)
+        assert [each.result() for each in waiting] == [7] * WAITERS
+    assert promise.result() == promise.result(0) == 7
+    assert promise.exception() is None
+
+
+def test_what_failed_raises_for_all() -> None:
+    promise: Promise[int] = Promise()
+    promise.set_exception(KeyError("x1"))
+    for _ in range(2):
+        with pytest.raises(KeyError, match="x1"):
+            promise.result(0)
+    assert isinstance(promise.exception(0), KeyError)
+
+
+@pytest.mark.parametrize("timeout_s", [0.0, 0.001, -1.0])
+def test_time_is_up(timeout_s: float) -> None:
+    promise: Promise[int] = Promise()
+    with pytest.raises(TimeoutError):
+        promise.result(timeout_s)
+    assert not promise.done()
+
+
+def test_asyncio_waits_for_it_and_cannot_cancel_it() -> None:
+    promise: Promise[int] = Promise()
+
+    async def wait() -> int:
+        impatient = asyncio.wrap_future(promise)
+        impatient.cancel()
+        patient = asyncio.wrap_future(promise)
+        threading.Thread(target=promise.set_result, args=(7,)).start()
+        return await patient
+
+    assert asyncio.run(wait()) == 7
+    assert not promise.cancelled()
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """A signal raises KeyboardInterrupt here again and again, wherever Python happens to be."""
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, on_signal)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_interrupted_again_and_again_it_still_can_be_kept() -> None:
+    for number in range(INTERRUPTS):
+        promise: Promise[int] = Promise()
+        end = time.monotonic() + 60
+        try:
+            signal.setitimer(signal.ITIMER_REAL, _PAUSE_S * (1 + number % 7))
+            while time.monotonic() < end:
+                with_no_time(promise)
+            pytest.fail("no signal came in a minute")
+        except KeyboardInterrupt:
+            keeper = threading.Thread(target=promise.set_result, args=(number,), daemon=True)
+            keeper.start()
+            keeper.join(10)
+            assert not keeper.is_alive(), "the lock is held by nobody"
+            assert promise.result(10) == number
+
+
+def with_no_time(promise: Promise[int]) -> None:
+    try:
+        promise.result(0)
+    except TimeoutError:
+        return
+    pytest.fail("there is nothing to get yet")
