@@ -9,8 +9,9 @@ ours did, over the same Zenoh configuration.  What the client needs to encode th
 given beside it.
 
 All hubs run all the time and are asked in turn, BLOCK exchanges each, in an order that changes.  So they share whatever
-else the machine does.  Every exchange follows one with the same hub, as the first of each turn is not counted: one that
-follows another hub also pays for what that has driven out of the caches, or gains from the cores that it has kept awake.
+else the machine does.  Every exchange follows one with the same hub, as the first of each turn is not counted: after
+another hub, an exchange also pays for what that has driven out of the caches, or gains from the cores that it has kept
+awake.
 
 Around every exchange, with whichever hub, the client does the same: before it makes an insert and encodes it, after it
 decodes an answer and a delta.  That is not in the time, but it decides what is in the caches of the client when it

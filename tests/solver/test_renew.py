@@ -118,10 +118,13 @@ def numbers_of(solver: Solver) -> list[tuple[list[int], bytes]]:
 
 def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = Solver(Options(**OFTEN))
-    monkeypatch.setattr("factorbus.solver.tree.roomy", lambda need, _size: need)
+    for where in ("graph", "tree"):
+        monkeypatch.setattr(f"factorbus.solver.{where}.roomy", lambda need, _size: need)
     grown, make_room = list[int](), Tree._make_room
     tight = Solver(Options(**OFTEN))
-    tree_of(tight).numbers = tree_of(tight).numbers[: int(tree_of(tight).state[tl.S_NUMBERS])].copy()
+    tree = tree_of(tight)
+    tree.numbers = tree.numbers[: int(tree.state[tl.S_NUMBERS])].copy()
+    tree.link, tree.stiff, tree.hessian = tree.link[:1].copy(), tree.stiff[:1].copy(), tree.hessian[:121].copy()
 
     def watched(tree: Tree) -> None:
         if tree.state[tl.S_RELINEARISED] > 0:

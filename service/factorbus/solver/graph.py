@@ -36,14 +36,15 @@ class Graph(Arenas):
     NOT_KEPT = ("_rows", "_places", "_stale")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
-        self.keys: I64 = np.empty(64, np.int64)
-        self.var: I64 = np.empty((64, at.V_WIDTH), np.int64)
-        self.dims: I64 = np.empty(64, np.int64)
-        self.values: F64 = np.zeros(256)
-        self.fac: I64 = np.empty((128, at.F_WIDTH), np.int64)
-        self.payload: F64 = np.empty(2048)
+        # Room for the first few hundred factors: the step that finds none takes several times as long.
+        self.keys: I64 = np.empty(256, np.int64)
+        self.var: I64 = np.empty((256, at.V_WIDTH), np.int64)
+        self.dims: I64 = np.empty(256, np.int64)
+        self.values: F64 = np.zeros(1024)
+        self.fac: I64 = np.empty((512, at.F_WIDTH), np.int64)
+        self.payload: F64 = np.empty(8192)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
-        self.table: I64 = np.zeros(256, np.int64)
+        self.table: I64 = np.zeros(1024, np.int64)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
         self._rows = Rows()
