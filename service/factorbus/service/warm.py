@@ -1,7 +1,8 @@
 """Compile every kernel of the service ahead of its first use: the solver's, those of features, those of the wire.
 
-A cold start is shared out: one process for each core, and each takes the next kernel that nobody has.  Who has what is
-told by files, made by whoever comes first; the kernels themselves meet on disk.  Then this process loads them all.
+A cold start is shared out: one process for each core, and each takes one kernel after the other that nobody has
+(`shares.py`).  Who has what is told by files, made by whoever comes first; the kernels themselves meet on disk.  Then
+this process loads them all.
 
 It compiles none itself.  Code that has just been compiled and the same from disk are linked in another order, and may
 round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.
@@ -21,6 +22,7 @@ from factorbus import solver
 from factorbus.idp import kernels as idp_kernels
 from factorbus.idp import warm as warm_idp
 from factorbus.service import kernels
+from factorbus.service.shares import Shares, functions_of
 from factorbus.solver.warm import iter_compile, list_missing
 
 _FEW = 4  # kernels that are worth another process
@@ -72,13 +74,10 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
 def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
     gc.set_threshold(20_000, 20, 1000)  # looking for what the compiler has dropped took a tenth of the time
-    for kernel in _list_missing():
-        try:
-            (claims / f"{kernel.__module__}.{kernel.__name__}").touch(exist_ok=False)
-        except FileExistsError:
-            continue
-        progress(kernel.__name__)
-        for _ in iter_compile(kernel):
+    kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in _list_missing()}
+    for name in Shares(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
+        progress(kernels[name].__name__)
+        for _ in iter_compile(kernels[name]):
             pass
 
 

@@ -28,18 +28,14 @@ def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -
 
 
 def list_missing(*packages: ModuleType) -> list[Any]:
-    """The kernels in `packages`, the solver's own by default, that are not on disk: compiling one puts it there.
-
-    Those that take longest come first, near enough: their files bring the most together.
-    """
-    found = [
+    """The kernels in `packages`, the solver's own by default, that are not on disk: compiling one puts it there."""
+    return [
         one
         for package in packages or (kernels, covariance_kernels)
         for _, group in _iter_groups(package)
         for one in group
         if not is_on_disk(one)
     ]
-    return sorted(found, key=lambda one: -len(one.py_func.__globals__))
 
 
 def _iter_groups(package: ModuleType = kernels) -> Iterator[tuple[str, list[Any]]]:

@@ -269,8 +269,10 @@ def eliminate_again(
         state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
     now = lap(now, tl.COMMIT, state)
     # 8
+    begins = np.empty(tops.size + ids.size, np.int64)
+    begins[: tops.size], begins[tops.size :] = tops, ids
     substitute(
-        np.append(tops, ids), settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
+        begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
         lin, scalars, turns, values, changed, moved, state, account,
     )  # fmt: skip
     bow = pull = 0.0

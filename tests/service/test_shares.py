@@ -1,0 +1,40 @@
+"""Who compiles what: each process keeps to what it knows."""
+
+from pathlib import Path
+
+import pytest
+
+from factorbus.service.shares import Shares, functions_of
+from factorbus.solver import kernels
+from factorbus.solver.kernels import _jit, linearise, tree_step
+from factorbus.solver.warm import list_missing
+
+A, B, C = {"a1": 10, "a2": 10}, {"b1": 9}, {"c": 1}
+KERNELS = {"a": A | C, "a small": {"a1": 10}, "b": B | C, "b small": {"b1": 9}}
+
+
+def test_each_keeps_to_what_it_knows(tmp_path: Path) -> None:
+    one, other = iter(Shares(tmp_path, KERNELS)), iter(Shares(tmp_path, KERNELS))
+    assert [next(one), next(other), next(one), next(other)] == ["a", "b", "a small", "b small"]
+    assert [list(one), list(other)] == [[], []]
+
+
+def test_what_another_knows_is_taken_last_but_taken(tmp_path: Path) -> None:
+    one, other = iter(Shares(tmp_path, KERNELS)), iter(Shares(tmp_path, KERNELS))
+    assert next(one) == "a"
+    assert list(other) == ["b", "b small", "a small"]
+    assert list(one) == []
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without the compiler functions are not kernels")
+def test_all_that_is_compiled_with_a_kernel() -> None:
+    of_step = functions_of(tree_step.tree_step)
+    assert tree_step.tree_step.py_func in of_step
+    shared = of_step.keys() & functions_of(linearise.linearise).keys()
+    assert len(shared) > 30, "the Jacobians of every kind of factor"
+    assert all(size > 0 for size in of_step.values())
+
+
+def test_nothing_is_missing_where_all_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("factorbus.solver.warm.is_on_disk", lambda _: True)
+    assert list_missing(kernels) == []
