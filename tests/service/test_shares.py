@@ -5,12 +5,9 @@ from pathlib import Path
 import pytest
 
 from factorbus.service.shares import Shares, functions_of
-from factorbus.solver import kernels
 from factorbus.solver.kernels import _jit, linearise, tree_step
-from factorbus.solver.warm import list_missing
 
-A, B, C = {"a1": 10, "a2": 10}, {"b1": 9}, {"c": 1}
-KERNELS = {"a": A | C, "a small": {"a1": 10}, "b": B | C, "b small": {"b1": 9}}
+KERNELS = {"a": {"a1": 10, "a2": 10}, "a small": {"a1": 10}, "b": {"b1": 9, "b2": 2}, "b small": {"b1": 9, "a2": 10}}
 
 
 def test_each_keeps_to_what_it_knows(tmp_path: Path) -> None:
@@ -33,8 +30,3 @@ def test_all_that_is_compiled_with_a_kernel() -> None:
     shared = of_step.keys() & functions_of(linearise.linearise).keys()
     assert len(shared) > 30, "the Jacobians of every kind of factor"
     assert all(size > 0 for size in of_step.values())
-
-
-def test_nothing_is_missing_where_all_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorbus.solver.warm.is_on_disk", lambda _: True)
-    assert list_missing(kernels) == []
