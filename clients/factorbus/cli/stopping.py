@@ -74,17 +74,17 @@ def interrupt_on_sigterm(grace_s: float = 10.0) -> Iterator[None]:
 def _see_to_the_end(told: socket.socket, grace_s: float) -> None:
     """After one signal there are so many seconds to end by itself, after another there is none."""
     with told:
-        if not _signalled(told):
+        if not signalled(told):
             return
         told.settimeout(grace_s)
         with suppress(TimeoutError):
-            if not _signalled(told):
+            if not signalled(told):
                 return
         os.write(sys.stderr.fileno(), _ENDED)
         os._exit(INTERRUPTED)
 
 
-def _signalled(told: socket.socket) -> bool:
+def signalled(told: socket.socket) -> bool:
     """Wait for the next of our signals; False when there is nothing left to end.  Raises TimeoutError."""
     while number := told.recv(1):
         if number[0] in _OURS:
