@@ -35,7 +35,7 @@ _find_call_type = types.BaseFunction.get_call_type
 
 def _known_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """What a built-in function comes to with such arguments.  Numba finds that out anew at every call, and in every
-    round of its inference; what was found once is known, which saves an eighth of the time that all kernels take.
+    round of its inference; what was found once is known, which saves an eighth of the time that the step takes.
     """
     known = vars(self).setdefault("factorbus_known", {})
     asked = context, tuple(args), tuple(kws.items())
