@@ -409,7 +409,7 @@ def table(result: dict[str, Any]) -> str:
 def main() -> int:
     """Run it; 1 when the goal is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=32)
     parser.add_argument("--samples", type=int, default=250)
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
     parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)

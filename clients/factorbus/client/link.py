@@ -52,7 +52,7 @@ class Link:
         self._query(self._short(key), payload, timeout_s, on_reply, lambda: finish(Silence()))
 
     def _short(self, key: str) -> zenoh.KeyExpr | str:
-        """`key`, declared: it goes as a number, and where it leads is worked out once.  A tenth of an insert's way.
+        """`key`, declared: where it leads from here is worked out once.  A tenth of an insert's way.
 
         A declaration stays until the session ends, so there are not more of them than a front end has use for.
         """

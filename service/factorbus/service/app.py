@@ -28,7 +28,7 @@ from factorbus.service.arrival import read_insert
 from factorbus.service.bus import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
 from factorbus.service.config import BadConfig, Config, checked
 from factorbus.service.delivery import Delivery
-from factorbus.service.events import Answer, Asked, Asker, Publish, Refuse
+from factorbus.service.events import Asked, Asker, Refuse
 from factorbus.service.features import Features
 from factorbus.service.health import Health
 from factorbus.service.jobs import Jobs
@@ -38,6 +38,7 @@ from factorbus.service.maps import Maps
 from factorbus.service.metrics import open_metrics
 from factorbus.service.optima import Optima
 from factorbus.service.questions import Question, Snapshot
+from factorbus.service.senders import Senders
 from factorbus.service.start import get_ready_to_compute
 from factorbus.service.trips import Trips
 from factorbus.service.vitals import Vitals
@@ -45,10 +46,6 @@ from factorbus.service.vitals import Vitals
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.25
-_SENDERS = 4096
-_AT_ONCE_BYTES = 64 << 10
-_MESSAGES = (Answer, Publish)
-_ANSWERERS = 4
 _ADMIN_WAITING = 1024
 _TOKEN_S = 10.0
 
@@ -113,8 +110,8 @@ class Shell:
         self._bus, self._config = bus, config
         self._service = config.name or f"s{secrets.token_hex(4)}"
         self._decoding = config.limits.message()
-        self._senders: dict[str, tuple[str, str]] = {}  # keys of inserts taken apart before
         self._desk = Lane("desk")
+        self._senders = Senders(self._desk, bus.know)
         self._delivery = Delivery(self._about, self._find_optimum, self._fork)
         lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
@@ -175,9 +172,8 @@ class Shell:
 
     def _on_insert(self, query: Asker) -> None:
         key, payload = received(query)
-        place = self._senders.get(key)
         try:
-            name, client = place or self._sender(key)
+            name, client = sender = self._senders.find(key)
         except Problem as problem:
             self._delivery.refusals.hand(refuse, query, problem)
             return
@@ -189,18 +185,10 @@ class Shell:
         if isinstance(read, Refuse):
             self._delivery.refusals.hand(refuse, query, read.problem)
             return
+        self._senders.remember(key, sender)
         if (full := self.vitals.memory.no_room(read.size)) is not None:
             read = read._replace(content=full, message=b"")
         found.host.insert(read)
-
-    def _sender(self, key: str) -> tuple[str, str]:
-        """(map, client) of the key of an insert.  Raises BadName."""
-        parts = key.split("/")
-        sender = keys.checked_name("map", parts[3]), keys.checked_name("client", parts[-1])
-        if len(self._senders) >= _SENDERS:
-            self._senders.clear()
-        self._senders[key] = sender
-        return sender
 
     def _on_question(self, query: Asker) -> None:
         name, question = _chunks(query)

@@ -79,6 +79,11 @@ class Bus:
 
         self._declared.append(self._session.declare_queryable(key, Callback(on_query, indirect=False)))
 
+    def know(self, key: str) -> Callable[[], None]:
+        """Declare `key`, so that Zenoh remembers the way of what comes on it; call what comes back to undo that."""
+        declared = self._session.declare_keyexpr(key)
+        return lambda: self._session.undeclare(declared)
+
     def announce(self, token: str) -> Callable[[], None]:
         """Declare a liveliness token; call what comes back to withdraw it."""
         return self._session.liveliness().declare_token(token).undeclare

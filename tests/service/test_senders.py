@@ -1,0 +1,87 @@
+"""Who sends inserts: taken apart once, known to Zenoh as long as there is room."""
+
+import threading
+
+import pytest
+
+from factorbus.proto.keys import insert_key
+from factorbus.proto.problems import Problem
+from factorbus.service.lane import Lane
+from factorbus.service.senders import Senders
+
+
+class Declared:
+    """What a session has declared, and all that it ever had."""
+
+    def __init__(self) -> None:
+        self.now: list[str] = []
+        self.ever: list[str] = []
+
+    def declare(self, key: str):
+        self.now.append(key)
+        self.ever.append(key)
+        return lambda: self.now.remove(key)
+
+
+def settle(desk: Lane) -> None:
+    """Return when the desk is done with what it has."""
+    reached = threading.Event()
+    desk.hand(reached.set)
+    assert reached.wait(10)
+
+
+def remembered(senders: Senders, desk: Lane, *clients: str) -> list[str]:
+    """Have `clients` send to one map; their keys."""
+    sent = [insert_key("m", client) for client in clients]
+    for key in sent:
+        senders.remember(key, senders.find(key))
+    desk.close()
+    return sent
+
+
+def test_a_key_is_taken_apart_and_declared_once():
+    desk, declared = Lane("desk"), Declared()
+    senders = Senders(desk, declared.declare)
+    key, *_ = remembered(senders, desk, "robot", "robot", "robot")
+    assert senders.find(key) == ("m", "robot")
+    assert declared.ever == [key]
+
+
+def test_who_only_asked_is_not_declared():
+    desk, declared = Lane("desk"), Declared()
+    senders = Senders(desk, declared.declare)
+    assert senders.find(insert_key("m", "robot")) == ("m", "robot")
+    desk.close()
+    assert not declared.ever
+
+
+@pytest.mark.parametrize("key", ["factorbus/v1/map/*/in/robot", "factorbus/v1/map/m/in/**"])
+def test_a_key_of_nobody_is_refused(key: str):
+    desk = Lane("desk")
+    senders = Senders(desk, Declared().declare)
+    with pytest.raises(Problem) as caught:
+        senders.find(key)
+    assert caught.value.code == "bad_name"
+    desk.close()
+
+
+def test_the_oldest_makes_room():
+    desk, declared = Lane("desk"), Declared()
+    senders = Senders(desk, declared.declare, most=2)
+    a, b, c, again = remembered(senders, desk, "a", "b", "c", "b")
+    assert again == b
+    assert declared.now == [b, c]
+    assert senders.find(a) == ("m", "a"), "it is taken apart anew"
+
+
+def test_who_made_room_can_come_back():
+    desk, declared = Lane("desk"), Declared()
+    senders = Senders(desk, declared.declare, most=1)
+    a, b = insert_key("m", "a"), insert_key("m", "b")
+    for key in (a, b):
+        senders.remember(key, senders.find(key))
+    settle(desk)
+    assert declared.now == [b]
+    senders.remember(a, senders.find(a))
+    desk.close()
+    assert declared.now == [a]
