@@ -18,7 +18,7 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-LEAST_BURDEN, MOST_BURDEN = 0.01, 2.0
+LEAST_BURDEN, MOST_BURDEN, MOST_WITH_LANDMARKS = 0.01, 2.0, 4.0
 LEAST_LOOK, MANY_LOOKS = 0.02, 1000
 
 
@@ -39,11 +39,14 @@ def find_bent(
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED] = 0
-    total, scalars_waiting, waited = 0.0, 0, state[tl.S_STEP] - state[tl.S_WAITING]
+    total, scalars_waiting, waited, most_burden = 0.0, 0, state[tl.S_STEP] - state[tl.S_WAITING], MOST_BURDEN
     for k in range(state[tl.S_PENDING]):
-        total += turns[pending[k], tl.U_STRAIN]
-        scalars_waiting += dim_of_variable(var, pending[k])
-    total /= burden(scalars_waiting, settings)
+        v = pending[k]
+        total += turns[v, tl.U_STRAIN]
+        scalars_waiting += dim_of_variable(var, v)
+        if var[v, at.V_KIND] != at.SE2 and var[v, at.V_KIND] != at.SE3:
+            most_burden = MOST_WITH_LANDMARKS
+    total /= burden(scalars_waiting, most_burden, settings)
     if total > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
         state[tl.S_DUE] = 1
     return most, total
@@ -119,10 +122,10 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 
 
 @inline_kernel
-def burden(count: int, settings: F64) -> float:
+def burden(count: int, most: float, settings: F64) -> float:
     """By how much more than `many` of them so many scalars have to be worth to be relinearised.  (9.22)"""
     share = count / settings[tl.P_MANY]
-    return min(max(share * share * share, LEAST_BURDEN), MOST_BURDEN)
+    return min(max(share * share * share, LEAST_BURDEN), most)
 
 
 @inline_kernel
