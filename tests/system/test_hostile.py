@@ -26,7 +26,8 @@ SLOWER, BESIDES_S, LONGEST_S = 5.0, 0.02, 0.9
 def service(tmp_path: Path, spawn: Spawn) -> str:
     settings = tmp_path / "serve.toml"
     # No front end here inserts 20,000 poses at once, so none may: who may has the solver for as long as that takes.
-    settings.write_text("[limits]\nsessions = 200\ninsert_variables = 1000\n")
+    # A flood of questions is refused but for a few, and whoever floods does not take these refusals either.
+    settings.write_text("[limits]\nsessions = 200\ninsert_variables = 1000\nquestions = 4\n")
     process = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
     return process.ready()[0]
 

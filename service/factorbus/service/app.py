@@ -4,7 +4,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
                            fold an insert in instead, and send what comes of it, when that is soon done
           solver <map>     folds and steps, and encodes what comes of it
           outbox           answers to inserts, and publications, in order
-          refusals         of what cannot be read, or is for no map
+          refusals         of inserts and questions
           desk             maps that come and go, jobs for workers
           answers 0..3     answers to questions, which can be large
           in-place <kind>  jobs when there is no worker

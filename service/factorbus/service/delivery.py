@@ -1,9 +1,9 @@
-"""What maps want done is done: answers, refusals and publications leave in order, and large ones hold up nobody else.
+"""What maps want done is done: answers to inserts and publications leave in order, and large ones hold up nobody else.
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
-lanes a second, then Zenoh closes that client's transport.  Refusals of what cannot even be read have a lane of their
-own: of these a client can have filled its queue with tens of thousands before the first is taken.
+lanes a second, then Zenoh closes that client's transport.  Refusals have a lane of their own: of these a client can
+have filled its queue with tens of thousands before the first is taken.
 """
 
 import logging
@@ -22,7 +22,6 @@ from factorbus.solver.errors import SolverError
 log = logging.getLogger(__name__)
 
 _AT_ONCE_BYTES = 64 << 10
-_MESSAGES = (Answer, Publish)
 _ANSWERERS = 4
 
 
@@ -110,6 +109,8 @@ class MapDelivery:
                 self._all.tell(effect.asker, {**effect.content, **self._tell()})
             elif isinstance(effect, Drained):
                 self._drained()
+            elif isinstance(effect, Refuse):
+                self._all.refusals.hand(refuse, effect.asker, effect.problem)
             else:
                 sending.append(effect)
         if sending:
@@ -120,12 +121,17 @@ class MapDelivery:
 
         That might wait in vain to be emptied: this thread may be the one that does it.
         """
+        sending: list[Answer | Publish] = []
         size = 0
         for effect in effects:
-            if isinstance(effect, _MESSAGES):
+            if isinstance(effect, Answer | Publish):
+                sending.append(effect)
                 size += len(effect.message)
-        hand = self._all.outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._all.outbox.hand
-        hand(_send, self._place, effects)
+            elif isinstance(effect, Refuse):
+                self._all.refusals.hand(refuse, effect.asker, effect.problem)
+        if sending:
+            hand = self._all.outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._all.outbox.hand
+            hand(_send, self._place, sending)
 
     def send_both(self, asker: Asker, message: bytes, delta: bytes) -> None:
         """What was written in one piece is small enough to be sent at once."""
@@ -144,8 +150,6 @@ def _send(place: Place, effects: list[Effect]) -> None:
             reply(effect.asker, effect.message)
         elif isinstance(effect, Publish):
             place.publish(effect.channel, effect.message)
-        elif isinstance(effect, Refuse):
-            refuse(effect.asker, effect.problem)
 
 
 def _send_both(place: Place, asker: Asker, message: bytes, delta: bytes) -> None:
