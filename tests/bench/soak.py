@@ -3,10 +3,10 @@
     python tests/bench/soak.py [--inserts 1000000] [--clients 8] [--minutes M] [--durability commit] [--json]
 
 Clients are processes of their own.  Each streams one pose and its odometry an insert, with a window; after hundreds or
-thousands it leaves the bus and joins again, and every few seconds one is killed (SIGKILL) and another starts in its
-place.  What was sent and what was answered each client writes into memory that outlives it.  Maps take turns: after
-`--rotate` inserts all clients leave and rest, everything is counted, the map is dropped, and the memory is read: so it
-is that of a service, not that of a map, whatever size the maps came to.
+thousands it leaves the bus and joins again, and every few seconds, and once on every map, one is killed (SIGKILL) and
+another starts in its place.  What was sent and what was answered each client writes into memory that outlives it.  Maps
+take turns: after `--rotate` inserts all clients leave and rest, everything is counted, the map is dropped, and the
+memory is read: so it is that of a service, not that of a map, whatever size the maps came to.
 
 Lost: answered, and not in the map.  Duplicated: more factors than the poses there would have, or more inserts in the
 journal than poses.  Memory: resident, with no map, fitted over the second half of the maps: what the
@@ -248,14 +248,16 @@ def _serve(start: Any, folder: Path, durability: str) -> tuple[str, int]:
 
 
 def _churn(bus: Bus, name: str, fleet: Fleet, rotate: int, end: float) -> None:
-    """Kill one now and then, until the map has enough."""
+    """Kill one now and then, and at least one, until the map has enough."""
+    before = fleet.kills
     while time.monotonic() < end:
         row = next(each for each in bus.maps() if each.name == name)
-        if row.variables >= rotate:
+        full = row.variables >= rotate
+        if time.monotonic() - fleet.killed_at > KILL_EVERY_S or (full and fleet.kills == before):
+            fleet.kill_one()
+        if full:
             return
         time.sleep(0.2)  # the map has no mirror here that would tell how far it is
-        if time.monotonic() - fleet.killed_at > KILL_EVERY_S:
-            fleet.kill_one()
 
 
 def _close(bus: Bus, name: str, letters: str, folder: Path, account: Account, pid: int) -> None:

@@ -16,11 +16,9 @@ def test_what_a_journal_costs_is_measured_in_turn(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-def test_clients_that_leave_and_are_killed_lose_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(soak, "KILL_EVERY_S", 0.7)
+def test_clients_that_leave_and_are_killed_lose_nothing(tmp_path: Path) -> None:
     options = argparse.Namespace(inserts=2500, clients=3, minutes=3.0, rotate=900, durability="commit")
     result = soak.run(options, tmp_path)
     assert (result["lost"], result["duplicated"]) == (0, 0)
     assert result["inserts"] >= 2500
-    assert result["maps"] > 1
-    assert result["kills"] >= 1
+    assert result["kills"] >= result["maps"] > 1
