@@ -15,6 +15,7 @@ from factorbus.solver.kernels import tree_layout as tl
 NEAR = 60
 ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3}  # of more than 27 flops
 NEVER = {"heavy": math.inf}
+LINEAR = {"bent_soon": math.inf, "bent_now": math.inf, "bent_most": math.inf}  # little is relinearised
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
 
 
@@ -60,7 +61,7 @@ def above(v: int, solver: Solver, cliques: dict[int, Clique]) -> set[int]:
 
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> None:
-    options = Options(**ALWAYS)
+    options = Options(**ALWAYS, **LINEAR)
     solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
     for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](250, 7)))):
         tree = tree_of(solver)
@@ -84,7 +85,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
 def test_it_saves_eliminations_where_they_are_heavy(world: str, poses: int, most: float) -> None:
     flops = {}
     for name, how in {"as it is": {}, "never": NEVER}.items():
-        solver = Solver(Options(**how))
+        solver = Solver(Options(**how, **LINEAR))
         flops[name] = sum(tree_of(solver).state[tl.S_FLOPS] for _ in drive(solver, steps(world, poses)))
     assert flops["as it is"] < most * flops["never"]
 

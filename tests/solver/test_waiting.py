@@ -11,6 +11,7 @@ from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_look import burden, dearness, is_time_to_look
 from factorbus.solver.tree import Tree
 
 NEVER = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "patience": 10**9}
@@ -43,7 +44,8 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
         most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
         scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
-        most *= min(max((scalars / options.many) ** 3, 0.01), 2.0)
+        most *= min(max((scalars / options.many) ** 3, 0.01), 1.0)
+        most *= 24.0 if (solver._graph.var[waiting(tree), at.V_KIND] == at.POINT2).any() else 1.0
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             waited += waiting(tree).size > 0
@@ -67,6 +69,35 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
     assert min(shares[True]) > 3.0 * min(shares[False])
 
 
+def test_poses_in_space_and_landmarks_have_to_be_worth_more() -> None:
+    """(9.22): one of them among all that wait is enough."""
+    assert [dearness(kind) for kind in (at.SE2, at.SE3, at.POINT2, at.POINT3)] == [1.0, 12.0, 24.0, 24.0]
+    settings = np.zeros(tl.P_SIZE)
+    settings[tl.P_MANY] = 1000
+    assert [burden(count, settings) for count in (3, 500, 1000, 10**5)] == [0.01, 0.125, 1.0, 1.0]
+
+
+def test_it_is_looked_when_a_loop_closes_and_else_seldom() -> None:
+    settings, state = np.zeros(tl.P_SIZE), np.zeros(tl.S_SIZE, np.int64)
+    settings[tl.P_EVERY], state[tl.S_LOOKED], state[tl.S_MOVED] = 4, 100, 1000
+
+    def looks(closes: bool) -> list[int]:
+        found = []
+        for step in range(101, 120):
+            state[tl.S_STEP] = step
+            if is_time_to_look(closes, settings, state):
+                found.append(step - 100)
+        return found
+
+    assert looks(True)[0] == 4
+    assert looks(False)[0] == 16
+    state[tl.S_MOVED] = 249
+    assert looks(True)[0] == 1
+    assert looks(False)[0] == 16
+    state[tl.S_EXACT] = 1
+    assert looks(False)[0] == 1
+
+
 def test_nothing_waits_longer_than_patience() -> None:
     patience, every = 30, 4
     solver = Solver(Options(**{**NEVER, "patience": patience}, look_every=every))
@@ -76,7 +107,7 @@ def test_nothing_waits_longer_than_patience() -> None:
         fresh = tree.node[:, tl.N_LINEARISED] == tree.state[tl.S_STEP]
         since = {v: n if fresh[v] else since.get(v, n) for v in waiting(tree).tolist()}
         longest = max([longest, *(n - first for first in since.values())])
-    assert patience // 2 < longest <= patience + 2 * every
+    assert patience // 2 < longest <= patience + 5 * every
 
 
 def test_what_is_bent_far_does_not_wait() -> None:

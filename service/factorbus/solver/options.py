@@ -43,11 +43,11 @@ class Options:
     rest, reluctance   tree: for so many steps after a relinearisation both shares are more, up to so many times
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
                     if what waits has `many` scalars
-    many            tree: for fewer scalars much less is worth it, and for more up to twice as much
+    many            tree: for fewer scalars much less is worth it; poses in space and landmarks have to be worth more
     trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
                     replaced
-    look_every, look_moved   tree: it is looked for what is bent every so many steps, and when so much moved since that
-                    this may add this share to χ²
+    look_every, look_moved   tree: it is looked for what is bent so many steps apart when a loop closes, four times as
+                    many without one, and when so much moved since that this may add this share to χ²
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
                     scalars were (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
@@ -74,18 +74,18 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 5e-4
-    bent_soon: float = 6e-5
-    bent_now: float = 4e-4
-    many: int = 2000
+    bent_soon: float = 1.5e-5
+    bent_now: float = 1e-4
+    many: int = 2500
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96
-    reluctance: float = 8.0
+    reluctance: float = 4.0
     trust: float = 3.0
     rounds: int = 3
-    look_every: int = 8
+    look_every: int = 4
     look_moved: float = 0.05
-    ripple: float = 0.03
+    ripple: float = 0.02
     recent_steps: int = 2
     heavy: float = 1e5
     near: float = 1.4

@@ -18,8 +18,10 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-LEAST_BURDEN, MOST_BURDEN, MOST_WITH_LANDMARKS = 0.01, 2.0, 4.0
+LEAST_BURDEN = 0.01
+IN_SPACE, WITH_LANDMARKS = 12.0, 24.0
 LEAST_LOOK, MANY_LOOKS = 0.02, 1000
+WITHOUT_LOOP, FEW = 4, 250
 
 
 @part
@@ -30,6 +32,7 @@ def find_bent(
     """Add to `pending` what is bent of what `moved`, empty that, and see whether it is due; gives the largest bend of
     what moved, and Σ bend² of all that waits, as a multiple of (9.22).
     """
+    state[tl.S_LOOKED] = state[tl.S_STEP]
     if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
     bent = settings[tl.P_BENT]
@@ -39,14 +42,13 @@ def find_bent(
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED] = 0
-    total, scalars_waiting, waited, most_burden = 0.0, 0, state[tl.S_STEP] - state[tl.S_WAITING], MOST_BURDEN
+    total, scalars_waiting, dearest, waited = 0.0, 0, 1.0, state[tl.S_STEP] - state[tl.S_WAITING]
     for k in range(state[tl.S_PENDING]):
         v = pending[k]
         total += turns[v, tl.U_STRAIN]
         scalars_waiting += dim_of_variable(var, v)
-        if var[v, at.V_KIND] != at.SE2 and var[v, at.V_KIND] != at.SE3:
-            most_burden = MOST_WITH_LANDMARKS
-    total /= burden(scalars_waiting, most_burden, settings)
+        dearest = max(dearest, dearness(var[v, at.V_KIND]))
+    total /= dearest * burden(scalars_waiting, settings)
     if total > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
         state[tl.S_DUE] = 1
     return most, total
@@ -122,10 +124,28 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 
 
 @inline_kernel
-def burden(count: int, most: float, settings: F64) -> float:
-    """By how much more than `many` of them so many scalars have to be worth to be relinearised.  (9.22)"""
+def burden(count: int, settings: F64) -> float:
+    """The share that so many scalars have to be worth of what `many` have to, to be relinearised.  (9.22)"""
     share = count / settings[tl.P_MANY]
-    return min(max(share * share * share, LEAST_BURDEN), most)
+    return min(max(share * share * share, LEAST_BURDEN), 1.0)
+
+
+@inline_kernel
+def dearness(kind: int) -> float:
+    """How many times as much as planar poses a variable has to be worth, with all that wait beside it.  (9.22)"""
+    if kind == at.SE2:
+        return 1.0
+    return IN_SPACE if kind == at.SE3 else WITH_LANDMARKS
+
+
+@inline_kernel
+def is_time_to_look(closes: bool, settings: F64, state: I64) -> bool:
+    """Whether it is looked for what is bent, in a step that `closes` a loop or does not.  MATH §9.6"""
+    since = state[tl.S_STEP] - state[tl.S_LOOKED]
+    # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
+    if state[tl.S_EXACT] > 0 or since >= WITHOUT_LOOP * settings[tl.P_EVERY]:
+        return True
+    return closes and (since >= settings[tl.P_EVERY] or state[tl.S_MOVED] < FEW)
 
 
 @inline_kernel

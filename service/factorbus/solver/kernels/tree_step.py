@@ -31,7 +31,7 @@ from factorbus.solver.kernels.tree_fronts import (
     keep_root,
     place_fronts,
 )
-from factorbus.solver.kernels.tree_look import find_bent, is_alarming
+from factorbus.solver.kernels.tree_look import find_bent, is_alarming, is_time_to_look
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
@@ -276,9 +276,8 @@ def eliminate_again(
         lin, scalars, turns, values, changed, moved, state, account,
     )  # fmt: skip
     bow = pull = 0.0
-    # What bends with its depth or its weight gives no sign of it that is as cheap as a turn.
-    due = state[tl.S_EXACT] > 0 or state[tl.S_STEP] % settings[tl.P_EVERY] == 0
-    if due or is_alarming(settings, state, account):
+    closes = f1 - state[tl.S_TAKEN] > v1 - v0
+    if is_time_to_look(closes, settings, state) or is_alarming(settings, state, account):
         bow, pull = find_bent(
             settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved,
             state,
