@@ -18,10 +18,10 @@ from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_relinearise import WAITS
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-LEAST_BURDEN = 0.01
-IN_SPACE, WITH_LANDMARKS = 12.0, 24.0
+LEAST_BURDEN = 0.02
+IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 LEAST_LOOK, MANY_LOOKS = 0.02, 1000
-WITHOUT_LOOP, FEW = 4, 250
+WITHOUT_LOOP, FEW = 4, 60
 
 
 @part
