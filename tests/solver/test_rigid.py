@@ -13,7 +13,6 @@ from factorbus.simulate import city_trees, manhattan, sphere
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_rigid import MOTION
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 FAR = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "trust": np.inf}
@@ -64,7 +63,8 @@ def motions(solver: Solver) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray
         scalars = [int(graph.var[v, at.V_SCALAR]) for v in clique.frontals]
         sizes = [VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim for v in clique.frontals]
         ours = np.concatenate([tree.scalars[0, d : d + n] for d, n in zip(scalars, sizes, strict=True)])
-        motion = tree.numbers[used + p + m : used + p + m + MOTION].copy()
+        since = c * tl.M_WIDTH
+        motion = tree.motions[since : since + tl.MOTION] * row[tl.C_MOVES]
         moved = [tree.numbers[used + p : used + p + m]]
         if motion.any():
             forms = [VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])] for v in clique.separator]

@@ -15,7 +15,7 @@ from factorbus.solver.tree import Tree
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "values": 7, "fac": 1, "payload": 28}
 TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "turns": 1, "pending": 1}
-TREE |= {"changed": 1, "moved": 1, "marked": 1}
+TREE |= {"changed": 1, "moved": 1, "marked": 1, "motions": 8}
 
 
 def cramped() -> Solver:

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from factorbus.solver.arenas import Arenas
+from factorbus.solver.arenas import Arenas, lines
 from factorbus.solver.errors import printed
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.groups import FactorGroup, Group
@@ -38,10 +38,10 @@ class Graph(Arenas):
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
         self.keys: I64 = np.empty(256, np.int64)
-        self.var: I64 = np.empty((256, at.V_WIDTH), np.int64)
+        self.var: I64 = lines((256, at.V_WIDTH), np.int64)
         self.dims: I64 = np.empty(256, np.int64)
         self.values: F64 = np.zeros(1024)
-        self.fac: I64 = np.empty((512, at.F_WIDTH), np.int64)
+        self.fac: I64 = lines((512, at.F_WIDTH), np.int64)
         self.payload: F64 = np.empty(8192)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(1024, np.int64)
@@ -194,7 +194,7 @@ class Graph(Arenas):
 
 def grown(array: np.ndarray, need: int) -> np.ndarray:
     """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
-    larger = np.zeros((roomy(need, len(array)), *array.shape[1:]), array.dtype)
+    larger = lines((roomy(need, len(array)), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
 

@@ -16,9 +16,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from factorbus.solver.arenas import lines
+
 State: TypeAlias = dict[str, Any]
 
-_LINE = 64  # bytes of a cache line
 _PLAIN = (bool, int, float, str, type(None))
 _TYPE = "type"
 
@@ -51,9 +52,7 @@ def load(thing: Any, state: Mapping[str, Any], types: Mapping[str, type]) -> Non
 
 def aligned_copy(array: np.ndarray) -> np.ndarray:
     """A copy that starts at a cache line, with a line behind it that may be read: kernels want both of some arrays."""
-    raw = np.zeros(array.nbytes + 2 * _LINE, np.uint8)
-    skip = -raw.ctypes.data % _LINE
-    made = raw[skip : skip + array.nbytes].view(array.dtype).reshape(array.shape)
+    made = lines(array.shape, array.dtype)
     made[...] = array
     return made
 

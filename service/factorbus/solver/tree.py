@@ -6,7 +6,7 @@ This is the memory of `kernels/tree_step.py`, which does the work in one call; h
 import numpy as np
 
 from factorbus.solver import pages
-from factorbus.solver.arenas import Arenas
+from factorbus.solver.arenas import Arenas, lines
 from factorbus.solver.graph import Graph, grown, roomy
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
@@ -46,16 +46,17 @@ class Tree(Arenas):
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
         self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_WORTH]] = options.heavy, options.near, options.worth
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
-        self.node: I64 = np.empty((256, tl.N_WIDTH), np.int64)
-        self.link: I64 = np.empty((512, tl.L_WIDTH), np.int64)
-        self.clique: I64 = np.empty((256, tl.C_WIDTH), np.int64)
+        self.node: I64 = lines((256, tl.N_WIDTH), np.int64)
+        self.link: I64 = lines((512, tl.L_WIDTH), np.int64)
+        self.clique: I64 = lines((256, tl.C_WIDTH), np.int64)
+        self.motions: F64 = lines(256 * tl.M_WIDTH, np.float64)
         self.lists: I64 = np.empty(4096, np.int64)
         self.numbers: F64 = pages.zeros(16384)
         self.hessian: F64 = np.empty(16384)
         self.lin: F64 = np.empty((3, 1024))
         self.scalars: F64 = np.zeros((3, 1024))
-        self.stiff: F64 = np.zeros((512, tl.B_WIDTH))
-        self.turns: F64 = np.zeros((256, tl.U_WIDTH))
+        self.stiff: F64 = lines((512, tl.B_WIDTH), np.float64)
+        self.turns: F64 = lines((256, tl.U_WIDTH), np.float64)
         self.pending: I64 = np.empty(256, np.int64)
         self.changed: I64 = np.empty(256, np.int64)
         self.moved: I64 = np.empty(256, np.int64)
@@ -115,7 +116,8 @@ class Tree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.B_WIDTH) + cliques * tl.C_WIDTH
+        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.B_WIDTH)
+        rows += cliques * (tl.C_WIDTH + tl.M_WIDTH)
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
 
@@ -128,6 +130,7 @@ class Tree(Arenas):
         state = self.state
         if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
             self.clique = grown(self.clique, need)
+            self.motions = grown(self.motions, len(self.clique) * tl.M_WIDTH)
         if len(self.clique) > self.marked.size:
             self.marked = np.empty(len(self.clique), np.int64)
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:

@@ -15,7 +15,6 @@ from factorbus.solver.kernels.symbolic import (
     make_records,
 )
 from factorbus.solver.kernels.tree_mark import dim_of_variable
-from factorbus.solver.kernels.tree_rigid import MOTION
 from factorbus.solver.kernels.tree_store import (
     give_clique,
     give_list,
@@ -78,8 +77,8 @@ def keep_root(n: int, affected: I64, var: I64) -> tuple:
 
 @inline_kernel
 def row_layout(p: int, m: int) -> tuple:
-    """(offset of the rows in their block, stride, offset of the used δ and ξ, size of the block)."""
-    ahead = fr.padded(p + m + MOTION)
+    """(offset of the rows in their block, stride, offset of the used δ, size of the block)."""
+    ahead = fr.padded(p + m)
     stride = fr.row_stride(fr.padded(p) + m + 1)
     return ahead + fr.padded(p) - p, stride, 0, ahead + p * stride + fr.LANES
 

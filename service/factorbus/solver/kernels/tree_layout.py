@@ -8,10 +8,10 @@ S, with a last column for the right-hand side and a corner for χ²,
 
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
-The arenas of a tree are:
-    node    (n, 13) int64     one row per variable, by its index in the graph
+The arenas of a tree are, each from the start of a cache line on:
+    node    (n, 16) int64    one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
-    clique  (c, 21) int64    records of cliques
+    clique  (c, 24) int64    records of cliques
     lists   int64            variables of cliques
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
@@ -26,7 +26,8 @@ The arenas of a tree are:
                              while it waits to be relinearised; cosine and sine where a plane pose is linearised
     pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
                              since they were looked at last
-    marked  (c,) int64       scratch: cliques that an elimination touches
+    marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
+    motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
     settings (20,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
@@ -37,29 +38,30 @@ The arenas of a tree are:
 ARENAS = (
     "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "turns",
     "pending",
-    "changed", "moved", "marked", "saved", "state", "account",
+    "changed", "moved", "marked", "motions", "saved", "state", "account",
 )  # fmt: skip
 (
     T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_TURNS,
     T_PENDING,
-    T_CHANGED, T_MOVED, T_MARKED, T_SAVED, T_STATE, T_ACCOUNT,
+    T_CHANGED, T_MOVED, T_MARKED, T_MOTIONS, T_SAVED, T_STATE, T_ACCOUNT,
 ) = range(len(ARENAS))  # fmt: skip
 
-# Columns of `node`.
+# Columns of `node`, a cache line each: what most steps look at,
 N_CLIQUE = 0  # where it is a frontal; -1: nowhere yet, or fixed
 N_PLACE = 1  # its index in that clique's list
-N_OWN = 2  # first factor that is added where this variable is eliminated; -1: none
-N_ADJ = 3  # first incidence, 2 · factor + end; -1: none
-N_STAMP = 4  # the last elimination it took part in
-N_LOCAL = 5  # its index there
-N_SEEN = 6  # the last step that brought a factor of it
+N_STAMP = 2  # the last elimination it took part in
+N_LOCAL = 3  # its index there
+N_ADJ = 4  # first incidence, 2 · factor + end; -1: none
+N_MOVED = 5  # the last step that changed its estimate
+N_LISTED = 6  # 1: it is in `moved`
 N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
-N_MOVED = 8  # the last step that changed its estimate
-N_LISTED = 9  # 1: it is in `moved`
+# and the rest.
+N_OWN = 8  # first factor that is added where this variable is eliminated; -1: none
+N_SEEN = 9  # the last step that brought a factor of it
 N_COLUMN = 10  # scratch: its column in the clique at hand
 N_LINEARISED = 11  # the last step that gave it a linearisation point
 N_NEAR = 12  # the last elimination that brought it near the root
-N_WIDTH = 13
+N_WIDTH = 16
 
 # Columns of `stiff`: d, √ω, |r| or |Ω r|, ω_θ, and what was measured of the translation.
 B_LEVER, B_ROOT, B_PULL, B_TURN, B_MEASURED, B_WIDTH = 0, 1, 2, 3, 4, 8
@@ -81,29 +83,38 @@ L_WIDTH = 8
 # In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
 EXACT, ASLEEP = 1000, 1001
 
-# Columns of `clique`.
+# Columns of `clique`, a cache line each: what back-substitution reads of a clique,
 C_LIST = 0
 C_FRONTALS = 1  # variables
 C_SEPARATORS = 2  # variables
 C_PIVOTS = 3  # p
-C_BORDER = 4  # m
-C_ROWS = 5  # column j of row i of R is at ROWS + i · LD + j
-C_LD = 6
-C_UPDATE = 7  # column j of row i of U is at UPDATE + i · LDU + j
-C_LDU = 8
-C_PARENT = 9  # -1: a root
-C_CHILD = 10
-C_NEXT = 11  # next child of the same parent; next free record
-C_ABOVE = 12  # place in the parent's list of the first separator variable to be eliminated
-C_MARK = 13  # the last elimination that touched it
-C_FIRST = 14  # the first place touched then
-C_USED = 15  # where δ_F and δ_S are as the frontals were solved last, p + m doubles, and the motion since, (9.20)
-C_BLOCK = 16  # the block that holds all of that and the rows, and its size
-C_BLOCK_SIZE = 17
-C_UPDATE_BLOCK_SIZE = 18
-C_LIST_SIZE = 19
-C_ANCHORED = 20  # 1: a factor in it or below tells where in the world its variables are
-C_WIDTH = 21
+C_USED = 4  # where δ_F and δ_S are as the frontals were solved last, p + m doubles
+C_CHILD = 5
+C_NEXT = 6  # next child of the same parent; next free record
+C_PARENT = 7  # -1: a root
+# what it reads of one that has moved,
+C_FIRST = 8  # the first place touched by the elimination C_MARK; -1: not solved yet
+C_ANCHORED = 9  # 1: a factor in it or below tells where in the world its variables are
+C_MOVES = 10  # 1: it has moved as a whole since it was solved
+C_BORDER = 11  # m
+C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
+C_LD = 13
+C_UPDATE = 14  # column j of row i of U is at UPDATE + i · LDU + j
+C_LDU = 15
+# and the rest.
+C_ABOVE = 16  # place in the parent's list of the first separator variable to be eliminated
+C_MARK = 17  # the last elimination that touched it
+C_BLOCK = 18  # the block that holds the rows and what is at USED, and its size
+C_BLOCK_SIZE = 19
+C_UPDATE_BLOCK_SIZE = 20
+C_LIST_SIZE = 21
+C_WIDTH = 24
+
+# Entries of `motions`, by clique.
+M_SINCE = 0  # ξ since it was solved, (9.20), MOTION numbers: t, ω
+M_BODY = 6  # scratch: the body it moves with,
+M_TURN = 7  # and the angle that it has turned by since it was solved
+MOTION, M_WIDTH = 6, 8
 
 # Entries of `state`.
 S_STAMP = 0  # of the present elimination

@@ -3,6 +3,7 @@
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.ascending import put_in_order
 from factorbus.solver.kernels.tree_bend import (
     SEEN,
     axes_of,
@@ -36,6 +37,7 @@ def find_bent(
     if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
     bent = settings[tl.P_BENT]
+    put_in_order(moved[: state[tl.S_MOVED]], state[tl.S_VARIABLES])
     most = look(
         bent, var, fac, payload, node, link, stiff, lin, scalars, values, turns, pending, moved, state
     )  # fmt: skip

@@ -11,9 +11,12 @@ Where the separator moved by J_S ξ, all that was eliminated below it moves by J
 
 import math
 
+import numpy as np
+
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.ascending import put_in_order
 from factorbus.solver.kernels.se3 import rotation
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
@@ -21,9 +24,12 @@ from factorbus.solver.kernels.tree_bend import turn_of
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_move import list_moved, move_variable
 
-MOTION = 6  # numbers of a motion: t, ω
-# Scratch of this: ξ since a clique was solved, what of it is new, and the displacement of the variable at hand.
-WHOLE, FRESH, LOCAL, SIZE = 0, 6, 12, 18
+MOTION = tl.MOTION
+BODIES = 64  # that move at once, at most
+# Scratch of this: ξ since a clique was solved, what of it is new, the displacement of the variable at hand, and the new
+# motion of each body.
+WHOLE, FRESH, LOCAL, TABLE = 0, 6, 12, 18
+SIZE = TABLE + BODIES * MOTION
 SINGULAR = 1e-12
 
 
@@ -42,10 +48,11 @@ def is_relative(f: int, var: I64, fac: I64) -> bool:
 
 @part
 def fit_motion(
-    row: I64, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64, motion: F64
-) -> bool:
+    row: I64, since: int, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64,
+    turns: F64, motions: F64, motion: F64,
+) -> bool:  # fmt: skip
     """Whether the separator moved as a rigid body since the frontals were solved with it, no scalar being off by more
-    than √far σ; motion gets ξ.
+    than √far σ; motion gets ξ.  since: where `motions` has what is known of it already
     """
     first = row[tl.C_LIST] + row[tl.C_FRONTALS]
     last, used = first + row[tl.C_SEPARATORS], row[tl.C_USED] + row[tl.C_PIVOTS]
@@ -64,7 +71,7 @@ def fit_motion(
                 return False
             used += 1
     for a in range(MOTION):
-        motion[FRESH + a] = motion[WHOLE + a] - load(numbers, used + a)
+        motion[FRESH + a] = motion[WHOLE + a] - (load(motions, since + a) if row[tl.C_MOVES] != 0 else 0.0)
     return True
 
 
@@ -176,21 +183,21 @@ def fit_space(
 
 
 @inline_kernel
-def displace(v: int, var: I64, lin: F64, turns: F64, numbers: F64, xi: int, motion: F64) -> None:
-    """motion[LOCAL :] = J ξ of variable v, ξ at offset xi of `numbers`."""
+def displace(v: int, var: I64, lin: F64, turns: F64, given: F64, xi: int, motion: F64) -> None:
+    """motion[LOCAL :] = J ξ of variable v, ξ at offset xi of `given`."""
     kind, x = var[v, at.V_KIND], var[v, at.V_AT]
     if kind == at.SE2 or kind == at.POINT2:
-        turn = load(numbers, xi + 5)
-        gx, gy = load(numbers, xi) - turn * load(lin, x + 1), load(numbers, xi + 1) + turn * load(lin, x)
+        turn = load(given, xi + 5)
+        gx, gy = load(given, xi) - turn * load(lin, x + 1), load(given, xi + 1) + turn * load(lin, x)
         if kind == at.SE2:
             c, z = turns[v, tl.U_COS], turns[v, tl.U_SIN]
             gx, gy = c * gx + z * gy, c * gy - z * gx
         motion[LOCAL], motion[LOCAL + 1], motion[LOCAL + 2] = gx, gy, turn
         return
-    ox, oy, oz = load(numbers, xi + 3), load(numbers, xi + 4), load(numbers, xi + 5)
+    ox, oy, oz = load(given, xi + 3), load(given, xi + 4), load(given, xi + 5)
     px, py, pz = load(lin, x), load(lin, x + 1), load(lin, x + 2)
-    gx, gy = load(numbers, xi) + oy * pz - oz * py, load(numbers, xi + 1) + oz * px - ox * pz
-    gz = load(numbers, xi + 2) + ox * py - oy * px
+    gx, gy = load(given, xi) + oy * pz - oz * py, load(given, xi + 1) + oz * px - ox * pz
+    gz = load(given, xi + 2) + ox * py - oy * px
     if kind == at.SE3:
         a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(lin, x + 3)
         gx, gy, gz = a0 * gx + a3 * gy + a6 * gz, a1 * gx + a4 * gy + a7 * gz, a2 * gx + a5 * gy + a8 * gz
@@ -200,49 +207,66 @@ def displace(v: int, var: I64, lin: F64, turns: F64, numbers: F64, xi: int, moti
     motion[LOCAL], motion[LOCAL + 1], motion[LOCAL + 2] = gx, gy, gz
 
 
-@inline_kernel
-def has_motion(row: I64, numbers: F64) -> bool:
-    """Whether a clique moved as a rigid body since it was solved."""
-    k, most = row[tl.C_USED] + row[tl.C_PIVOTS] + row[tl.C_BORDER], 0.0
-    for a in range(MOTION):
-        most = max(most, abs(load(numbers, k + a)))
-    return most > 0.0
-
-
 @part
-def move_subtree(
-    top: int, quiet: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, delta: F64, lin: F64,
-    before: F64, turns: F64, values: F64, changed: I64, moved: I64, motion: F64, state: I64, account: F64,
-) -> None:  # fmt: skip
-    """All that was eliminated in clique `top` and below it moves by the new part of `motion`.
+def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, listed: I64, count: int) -> int:
+    """All that was eliminated in clique `top` and below it moves by the new part of `motion`, as body number `body`.
 
-    Of what bends by its turns since it was solved, (9.21), no more than `quiet`, it is not looked for what is bent.
+    Its cliques remember that at once, and are listed from `count` on; `move_bodies` moves their variables.  Gives the
+    new count.
     """
+    for a in range(MOTION):
+        motion[TABLE + body * MOTION + a] = motion[FRESH + a]
     c = top
     while True:
-        row = clique[c]
-        own = row[tl.C_USED] + row[tl.C_PIVOTS] + row[tl.C_BORDER]
+        row, since = clique[c], c * tl.M_WIDTH
         for a in range(MOTION):
-            put(numbers, own + a, load(numbers, own + a) + motion[FRESH + a])
-        wx, wy, wz = load(numbers, own + 3), load(numbers, own + 4), load(numbers, own + 5)
-        turn = math.sqrt(wx * wx + wy * wy + wz * wz)
-        start = row[tl.C_LIST]
-        for s in range(start, start + row[tl.C_FRONTALS]):
-            v = lists[s]
-            displace(v, var, lin, turns, motion, FRESH, motion)
-            kind, d = var[v, at.V_KIND], var[v, at.V_SCALAR]
-            for a in range(dim_of_variable(var, v)):
-                put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
-            move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
-            bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * turn
-            account[tl.A_ALARM] += bend * bend
-            if bend > quiet:
-                list_moved(v, node, moved, state)
+            before = load(motions, since + a) if row[tl.C_MOVES] != 0 else 0.0
+            put(motions, since + a, before + motion[FRESH + a])
+        row[tl.C_MOVES] = 1
+        wx, wy, wz = load(motions, since + 3), load(motions, since + 4), load(motions, since + 5)
+        put(motions, since + tl.M_BODY, float(body))
+        put(motions, since + tl.M_TURN, math.sqrt(wx * wx + wy * wy + wz * wz))
+        listed[count] = c
+        count += 1
         if row[tl.C_CHILD] >= 0:
             c = row[tl.C_CHILD]
             continue
         while c != top and clique[c, tl.C_NEXT] < 0:
             c = clique[c, tl.C_PARENT]
         if c == top:
-            return
+            return count
         c = clique[c, tl.C_NEXT]
+
+
+@part
+def move_bodies(
+    listed: I64, quiet: float, var: I64, node: I64, clique: I64, lists: I64, delta: F64, lin: F64, before: F64,
+    turns: F64, values: F64, changed: I64, moved: I64, motions: F64, motion: F64, state: I64, account: F64,
+) -> None:  # fmt: skip
+    """The variables of the listed cliques move with their bodies, in the order in which they lie in memory.
+
+    Of what bends by its turns since it was solved, (9.21), no more than `quiet`, it is not looked for what is bent.
+    """
+    n, alarm = 0, 0.0
+    for k in range(listed.size):
+        n += clique[listed[k], tl.C_FRONTALS]
+    variables = np.empty(n, np.int64)
+    n = 0
+    for k in range(listed.size):
+        start = clique[listed[k], tl.C_LIST]
+        for s in range(start, start + clique[listed[k], tl.C_FRONTALS]):
+            variables[n] = lists[s]
+            n += 1
+    put_in_order(variables, state[tl.S_VARIABLES])
+    for k in range(n):
+        v = variables[k]
+        since, kind, d = node[v, tl.N_CLIQUE] * tl.M_WIDTH, var[v, at.V_KIND], var[v, at.V_SCALAR]
+        displace(v, var, lin, turns, motion, TABLE + int(load(motions, since + tl.M_BODY)) * MOTION, motion)
+        for a in range(dim_of_variable(var, v)):
+            put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
+        move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
+        bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
+        alarm += bend * bend
+        if bend > quiet:
+            list_moved(v, node, moved, state)
+    account[tl.A_ALARM] += alarm

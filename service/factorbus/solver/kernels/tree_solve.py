@@ -21,14 +21,16 @@ from factorbus.solver.kernels.tree_move import list_moved, move_variable
 @part
 def substitute(
     ids: I64, ripple: float, quiet: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, lin: F64,
-    scalars: F64, turns: F64, values: F64, changed: I64, moved: I64, state: I64, account: F64,
+    scalars: F64, turns: F64, values: F64, changed: I64, moved: I64, listed: I64, motions: F64, state: I64,
+    account: F64,
 ) -> None:  # fmt: skip
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2]
-    gets what they were.  moved: gets those that may be bent by it, where they are not there yet
+    gets what they were.  moved: gets those that may be bent by it, where they are not there yet.  listed: scratch, as long as there are cliques
     """
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
+    body = count = 0
     for f in range(ids.size - 1, -1, -1):
         if clique[ids[f], tl.C_PARENT] >= 0:
             continue
@@ -37,47 +39,65 @@ def substitute(
             row = clique[c]
             gather_separator(row, var, lists, delta, numbers)
             solve_rows(row, numbers)
-            row[tl.C_FIRST] = 0
+            row[tl.C_FIRST] = row[tl.C_MOVES] = 0
             state[tl.S_SOLVED] += 1
             move_frontals(
                 row, var, node, lists, numbers, scalars, lin[0], lin[2], turns, values, changed, moved, state, account
             )
             child, above = row[tl.C_CHILD], c
             while True:
-                c = next_clique(child, above, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motion)
-                if c < 0 or not moves_along(clique[c], far, var, lists, numbers, delta, weight, lin[0], turns, motion):
+                c = next_clique(
+                    child, above, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
+                )
+                if c < 0 or not moves_along(
+                    c, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
+                ):
                     break
-                rg.move_subtree(
-                    c, quiet, var, node, clique, lists, numbers, delta, lin[0], lin[2], turns, values, changed, moved,
-                    motion, state, account,
-                )  # fmt: skip
+                # What is in it nobody outside looks at, so it can move later.
+                if body == rg.BODIES:
+                    rg.move_bodies(
+                        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed,
+                        moved, motions, motion, state, account,
+                    )  # fmt: skip
+                    body = count = 0
+                count = rg.list_subtree(c, body, clique, motions, motion, listed, count)
+                body += 1
                 child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
+    rg.move_bodies(
+        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed, moved, motions,
+        motion, state, account,
+    )  # fmt: skip
 
 
 @inline_kernel
 def moves_along(
-    row: I64, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64, motion: F64
-) -> bool:
+    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
+    motions: F64, motion: F64,
+) -> bool:  # fmt: skip
     """Whether a clique and all below it only move as a whole; motion gets by how much."""
+    row = clique[c]
     return (
         row[tl.C_FIRST] != -1
         and row[tl.C_ANCHORED] == 0
-        and rg.fit_motion(row, far, var, lists, numbers, delta, weight, lin, turns, motion)
+        and rg.fit_motion(
+            row, c * tl.M_WIDTH, far, var, lists, numbers, delta, weight, lin, turns, motions, motion
+        )
     )
 
 
 @inline_kernel
 def next_clique(
     child: int, above: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64,
-    lin: F64, turns: F64, motion: F64,
+    lin: F64, turns: F64, motions: F64, motion: F64,
 ) -> int:  # fmt: skip
     """The next clique that has moved, from `child` of clique `above` on, depth first; −1: none is left."""
     while True:
         while child >= 0:
-            row = clique[child]
-            if row[tl.C_FIRST] == -1 or has_moved(row, far, var, lists, numbers, delta, weight, lin, turns, motion):
+            if clique[child, tl.C_FIRST] == -1 or has_moved(
+                child, far, var, clique, lists, numbers, delta, weight, lin, turns, motions, motion
+            ):
                 return child
-            child = row[tl.C_NEXT]
+            child = clique[child, tl.C_NEXT]
         if clique[above, tl.C_PARENT] < 0:
             return -1
         child, above = clique[above, tl.C_NEXT], clique[above, tl.C_PARENT]
@@ -85,19 +105,20 @@ def next_clique(
 
 @inline_kernel
 def has_moved(
-    row: I64, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64, motion: F64
-) -> bool:
+    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
+    motions: F64, motion: F64,
+) -> bool:  # fmt: skip
     """Whether a scalar of the separator is further than √far σ from where the frontals have it, who were solved with
     it and may have moved since.
     """
+    row = clique[c]
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
-    used = row[tl.C_USED] + row[tl.C_PIVOTS]
-    own, moves = used + row[tl.C_BORDER], rg.has_motion(row, numbers)
+    used, moves = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0
     for s in range(start, start + row[tl.C_SEPARATORS]):
         v = lists[s]
         d = var[v, at.V_SCALAR]
         if moves:
-            rg.displace(v, var, lin, turns, numbers, own, motion)
+            rg.displace(v, var, lin, turns, motions, c * tl.M_WIDTH, motion)
         for a in range(dim_of_variable(var, v)):
             gap = load(delta, d + a) - load(numbers, used)
             if moves:
@@ -110,7 +131,7 @@ def has_moved(
 
 @inline_kernel
 def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -> None:
-    """δ_S behind the place of δ_F, and behind that no motion."""
+    """δ_S behind the place of δ_F."""
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
     x = row[tl.C_USED] + row[tl.C_PIVOTS]
     for s in range(start, start + row[tl.C_SEPARATORS]):
@@ -119,8 +140,6 @@ def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -
         for a in range(dim_of_variable(var, v)):
             put(numbers, x, load(delta, d + a))
             x += 1
-    for a in range(rg.MOTION):
-        put(numbers, x + a, 0.0)
 
 
 @inline_kernel

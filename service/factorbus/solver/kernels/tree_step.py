@@ -72,6 +72,7 @@ def tree_step(graph: I64, tree: I64) -> int:
     lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
     turns, pending, changed = float_rows(tree, tl.T_TURNS), ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
     moved, marked, saved = ints(tree, tl.T_MOVED), ints(tree, tl.T_MARKED), float_rows(tree, tl.T_SAVED)
+    motions = floats(tree, tl.T_MOTIONS)
     state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
     if state[tl.S_BEGUN] == 0:
@@ -102,7 +103,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         lap(began, tl.LINEARISE, state)
         bow, pull, status = eliminate_again(
             v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, turns, pending, changed, moved, marked, state, account,
+            scalars, stiff, turns, pending, changed, moved, marked, motions, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
@@ -162,7 +163,7 @@ def count_due(state: I64) -> int:
 def eliminate_again(
     v0: int, v1: int, f1: int, moving: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
-    pending: I64, changed: I64, moved: I64, marked: I64, state: I64, account: F64,
+    pending: I64, changed: I64, moved: I64, marked: I64, motions: F64, state: I64, account: F64,
 ) -> tuple[float, float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, what waits, as `find_bent` has them, and the status."""
     # 3
@@ -180,7 +181,7 @@ def eliminate_again(
     if near > 0:
         count = touch_near(near, f1, var, fac, node, link, clique, state, marked, count)
         renewed = still_renewed(renewed, clique, state)
-    marked = marked[:count]
+    listed, marked = marked, marked[:count]
     room = v1 - v0
     hanging = 0
     for k in range(count):
@@ -273,7 +274,7 @@ def eliminate_again(
     begins[: tops.size], begins[tops.size :] = tops, ids
     substitute(
         begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
-        lin, scalars, turns, values, changed, moved, state, account,
+        lin, scalars, turns, values, changed, moved, listed, motions, state, account,
     )  # fmt: skip
     bow = pull = 0.0
     closes = f1 - state[tl.S_TAKEN] > v1 - v0
