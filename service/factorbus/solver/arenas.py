@@ -7,7 +7,6 @@ import numpy as np
 from factorbus.solver.kernels._jit import I64
 from factorbus.solver.kernels.places import WIDTH
 
-
 _LINE = 64  # bytes of a cache line
 
 

@@ -26,6 +26,7 @@ from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
+_COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
 
 
 class TreeSteps:
@@ -157,29 +158,29 @@ class TreeSteps:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
-        state = self._tree.state[: tl.S_FREE].tolist()
-        relinearised, changed = state[tl.S_RELINEARISED], self._moved.size if course else state[tl.S_TOLD]
+        told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
+        nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return StepReport._make((
             "tree",
-            "batch" if course else ("tree" if state[tl.S_CHANGED] or relinearised else "extend"),
+            "batch" if course else ("tree" if moved or relinearised else "extend"),
             because or f"{relinearised} variables bent too far",
-            course.iterations if course else state[tl.S_ROUNDS],
+            course.iterations if course else rounds,
             chi2,  # chi2
             chi2,  # chi2_before
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - before[at.FACTORS],
-            changed,
+            self._moved.size if course else changed,
             relinearised,
-            state[tl.S_ELIMINATED],
-            state[tl.S_ASLEEP],
-            state[tl.S_NONZEROS],
-            float(state[tl.S_FLOPS]),
+            eliminated,
+            asleep,
+            nonzeros,
+            float(flops),
             0.0,  # damping
             course.converged if course else True,
-            Shares(tl.PHASES, state[tl.S_CYCLES : tl.S_CYCLES + len(tl.PHASES)], compiled_ms),
+            Shares(tl.PHASES, told[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip

@@ -39,7 +39,8 @@ def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
         if reach(True, v0, f0, counts[at.FACTORS], var, fac, values, payload, reached) < 0:
             return f0
     remove_keys(v0, counts[at.VARIABLES], table, keys)
-    counts[:] = before
+    for k in range(counts.size):
+        counts[k] = before[k]
     return -1
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.ascending import sort
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, zero
 
@@ -143,7 +144,7 @@ def reach_rows(
                 n += 1
                 scalars += rec[k, DIM]
                 k = index[rec[k, LIST] + 1] if rec[k, COUNT] > 1 else -1
-    out[:n].sort()
+    sort(out[:n])
     for e in range(n):
         mark[out[e]] = 0
     seen[0] = scalars

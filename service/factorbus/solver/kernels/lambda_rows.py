@@ -11,6 +11,7 @@ import numpy as np
 
 from factorbus.solver.kernels import block_rows as br
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.ascending import sort
 from factorbus.solver.kernels.dense import PIVOT_TOLERANCE
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, zero
@@ -114,7 +115,7 @@ def renew_structure(
                     count += 1
             child = after[child]
         if count != rec[j, br.COUNT]:
-            list_[:count].sort()
+            sort(list_[:count])
             width = 0
             for e in range(count):
                 width += rec[list_[e], br.DIM]

@@ -14,6 +14,7 @@ import numpy as np
 from factorbus.solver.kernels import block_rows as br
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.ascending import sort
 from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, zero
@@ -72,7 +73,7 @@ def ends_of(f0: int, f1: int, var: I64, fac: I64, place: I64, out: I64) -> int:
             if v >= 0 and var[v, at.V_COLUMN] >= 0:
                 found[n] = place[var[v, at.V_COLUMN]]
                 n += 1
-    found[:n].sort()
+    sort(found[:n])
     count = 0
     for e in range(n):
         if e == 0 or found[e] != found[e - 1]:

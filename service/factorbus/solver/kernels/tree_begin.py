@@ -40,8 +40,7 @@ def begin(
         ):
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
-    state[tl.S_ELIMINATED : tl.S_ROUNDS + 1] = 0
-    state[tl.S_CYCLES : tl.S_CYCLES + tl.SUBSTITUTE + 1] = 0
+    state[tl.S_TOLD : tl.S_TOLD_TO] = 0
     state[tl.S_FAILED] = -1
     state[tl.S_STEP] += 1
     state[tl.S_BEGUN] = 1

@@ -26,8 +26,8 @@ def substitute(
 ) -> None:  # fmt: skip
     """Solve the new cliques and whatever moves with them.
 
-    changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2]
-    gets what they were.  moved: gets those that may be bent by it, where they are not there yet.  listed: scratch, as long as there are cliques
+    changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
+    were.  moved: gets those that may be bent by it, where they are not there yet.  listed: scratch, for all cliques
     """
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
     body = count = 0
@@ -79,9 +79,7 @@ def moves_along(
     return (
         row[tl.C_FIRST] != -1
         and row[tl.C_ANCHORED] == 0
-        and rg.fit_motion(
-            row, c * tl.M_WIDTH, far, var, lists, numbers, delta, weight, lin, turns, motions, motion
-        )
+        and rg.fit_motion(row, c * tl.M_WIDTH, far, var, lists, numbers, delta, weight, lin, turns, motions, motion)
     )
 
 

@@ -271,7 +271,8 @@ def eliminate_again(
     now = lap(now, tl.COMMIT, state)
     # 8
     begins = np.empty(tops.size + ids.size, np.int64)
-    begins[: tops.size], begins[tops.size :] = tops, ids
+    for k in range(begins.size):
+        begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
     substitute(
         begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
         lin, scalars, turns, values, changed, moved, listed, motions, state, account,

@@ -12,6 +12,7 @@ import numpy as np
 
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.ascending import sort
 
 UNIT = 8  # doubles: a cache line
 FOLLOWING, SIZE = 0, 1  # entries of a free block
@@ -120,7 +121,7 @@ def join_free(numbers: F64, state: I64) -> None:
             starts[put] = block - 1
             put += 1
             block = int(numbers[block - 1 + FOLLOWING])
-    starts.sort()
+    sort(starts)
     state[tl.S_IDLE] = state[tl.S_GIVEN] = state[tl.S_LARGEST] = 0
     k, behind = count - 1, state[tl.S_NUMBERS]
     while k >= 0:

@@ -39,7 +39,8 @@ def search(
             k = depth_of[n]
             if total[k] <= gates[k] and (k > most or (k == most and total[k] < least)):
                 most, least = k, total[k]
-                best[:] = chosen
+                for q in range(n):
+                    best[q] = chosen[q]
             t -= 1
             continue
         k = depth_of[t]

@@ -74,7 +74,8 @@ def list_paths(variables: I64, node: I64, clique: I64) -> I64:
         while c >= 0 and depth[c] == 0:
             if count == found.size:
                 larger = np.empty(2 * count, np.int64)
-                larger[:count] = found
+                for k in range(count):
+                    larger[k] = found[k]
                 found = larger
             found[count] = c
             count += 1

@@ -117,7 +117,8 @@ def is_stirred(row: I64, lists: I64, stirred: I64, tick: int) -> bool:
 def grown(a: F64, kept: int, size: int) -> F64:
     """A copy of the first `kept` with room for `size`."""
     larger = np.empty(size)
-    larger[:kept] = a[:kept]
+    for k in range(kept):
+        larger[k] = a[k]
     return larger
 
 

@@ -2,6 +2,8 @@
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel
 from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.simd import put
 
 
 @kernel("int64(int64[::1], int64[:,::1])")
@@ -22,6 +24,7 @@ def copy_rows(order: I64, clique: I64, numbers: F64, out: F64) -> None:
         p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_LD]
         for i in range(p):
             start = row[tl.C_ROWS] + i * ld
-            out[first + i * width + i : first + (i + 1) * width] = numbers[start + i : start + width]
+            for k in range(i, width):
+                put(out, first + i * width + k, load(numbers, start + k))
         row[tl.C_ROWS], row[tl.C_LD] = first, width
         first += p * width
