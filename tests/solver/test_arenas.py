@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorbus.solver import Solver
-from factorbus.solver.arenas import Arenas
+from factorbus.solver.arenas import Arenas, lines
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
@@ -71,3 +71,22 @@ def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
         assert rows(thing) == [of(getattr(thing, name)) for name in names]
     assert Graph.ARENAS[at.T_FAC] == "fac"
     assert type(tree).ARENAS[tl.T_ACCOUNT] == "account"
+
+
+def test_rows_begin_with_cache_lines() -> None:
+    for shape in (8, (3, 8), (1000, 24), (5, 3)):
+        made = lines(shape, np.int64)
+        assert made.ctypes.data % 64 == 0
+        assert made.shape == (shape if isinstance(shape, tuple) else (shape,))
+        assert not made.any()
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_what_grew_still_does(few: bool) -> None:
+    solver = Solver()
+    if not few:
+        solver._graph.reserve_variables(5000, 3)
+        solver._graph.reserve_factors(5000, 9)
+    graph = solver._graph
+    assert graph.var.ctypes.data % 64 == 0
+    assert graph.fac.ctypes.data % 64 == 0

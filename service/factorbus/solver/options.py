@@ -75,7 +75,7 @@ class Options:
     recent_poses: int = 1
     bent: float = 5e-4
     bent_soon: float = 1.5e-5
-    bent_now: float = 1e-4
+    bent_now: float = 5e-5
     many: int = 2500
     bent_most: float = 2.0
     patience: int = 1000
