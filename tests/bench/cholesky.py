@@ -10,6 +10,10 @@ Both sides get the matrix in final elimination order, so CHOLMOD has nothing to 
 all that it reads.  Thread CPU time, repetitions interleaved, ratios taken within a repetition, medians.  CHOLMOD is as
 fast as its BLAS, so the report names it: the reference BLAS (Debian's libblas3) makes it up to four times slower, and a
 comparison with that is not an honest one.
+
+The two solutions x of the same random right-hand side η are to agree to 1e-10 of their largest entry, or to the digits
+that any solver has: the 2e-16 of rounding times ‖Λ‖ ‖x‖ / ‖η‖, which is no more than Λ's condition.  Of victoria_park,
+whose weights go from 1.6 to 250,000 along 7,000 poses, these are seven.
 """
 
 import os
@@ -68,8 +72,8 @@ def main() -> None:
             print(line(row), flush=True)
     if options.json:
         print(json.dumps(report, indent=2))
-    if any(row["difference"] > 1e-10 for row in report["problems"]):
-        sys.exit("the two solutions differ by more than 1e-10")
+    if apart := [row["name"] for row in report["problems"] if not agree(row)]:
+        sys.exit(f"the two solutions differ on {', '.join(apart)}")
     slower = [row["name"] for row in report["problems"] if row["ratio"] < 1.0]
     if slower:
         sys.exit(f"CHOLMOD is faster on {', '.join(slower)}")
@@ -113,7 +117,20 @@ def measure(system: BlockSystem, repetitions: int) -> dict[str, Any]:
         "cholmod_best": best,
         "ratio": statistics.median(b / a for a, b in zip(ours, theirs, strict=True)),
         "difference": float(np.abs(cholesky.solve(eta)[in_order] - expected).max() / np.abs(expected).max()),
+        "condition": norm(lower) * float(np.abs(expected).max() / np.abs(eta).max()),
     }
+
+
+def agree(row: dict[str, Any]) -> bool:
+    """Whether the two have the same digits."""
+    return row["difference"] < max(1e-10, np.finfo(float).eps * row["condition"])
+
+
+def norm(lower: csc_matrix) -> float:
+    """The largest sum of a row of |Λ|."""
+    sizes = abs(lower)
+    ones = np.ones(sizes.shape[0])
+    return float((sizes @ ones + sizes.T @ ones - sizes.diagonal()).max())
 
 
 def interleaved(jobs: dict[str, Callable[[], Any]], repetitions: int) -> dict[str, list[float]]:
@@ -153,7 +170,7 @@ def pin() -> int:
 
 HEAD = (
     f"{'':16}{'scalars':>8}{'nnz(R)':>9}{'/ AMD':>7}{'order':>8}{'analyze':>8}{'factor':>8}{'GF/s':>6}{'solve':>7}"
-    f"{'simplicial':>12}{'supernodal':>12}{'ratio':>7}{'difference':>12}"
+    f"{'simplicial':>12}{'supernodal':>12}{'ratio':>7}{'difference':>12}{'condition':>11}"
 )
 
 
@@ -163,7 +180,7 @@ def line(row: dict[str, Any]) -> str:
         f"{row['name']:16}{row['scalars']:8}{row['nnz_r']:9}{row['nnz_r'] / row['nnz_r_cholmod_amd']:7.3f}"
         f"{row['order_ms']:8.2f}{row['analyze_ms']:8.2f}{row['factorize_ms']:8.2f}{row['gigaflops_per_s']:6.1f}"
         f"{row['solve_ms']:7.2f}{row['cholmod_simplicial_ms']:12.2f}{row['cholmod_supernodal_ms']:12.2f}"
-        f"{row['ratio']:7.2f}{row['difference']:12.1e}"
+        f"{row['ratio']:7.2f}{row['difference']:12.1e}{row['condition']:11.1e}"
     )
 
 
