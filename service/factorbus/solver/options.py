@@ -80,7 +80,7 @@ class Options:
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96
-    reluctance: float = 4.0
+    reluctance: float = 6.0
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
