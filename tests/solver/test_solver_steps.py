@@ -37,7 +37,8 @@ def test_every_step_is_the_dense_gauss_newton_solution(seed: int, mode: str) -> 
         twin.put(solver.estimate())
         assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-10)
         assert report.chi2 <= report.chi2_before
-        assert twin.gauss_newton(iterations=2) < 1e-9
+        # From a point that is as good as χ² can tell (below) the second step still goes a fraction of that.
+        assert twin.gauss_newton(iterations=2) < 5e-9
         for key, (kind, value) in by_key(solver.estimate()).items():
             assert distance(kind, value, twin.values[key]) < 5e-8  # what χ², good to 1e-16 of it, can tell
         assert solver.chi2() == pytest.approx(twin.chi2(), rel=1e-9)
