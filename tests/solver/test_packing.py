@@ -1,5 +1,7 @@
 """A batch that is packed into bytes goes in as it would have otherwise, bit for bit."""
 
+import pickle
+
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
@@ -66,6 +68,17 @@ def edge(measured: np.ndarray, keys: np.ndarray | None = None, **more: object) -
 )
 def test_what_is_not_plain_is_left_to_admission(batch: Batch) -> None:
     assert Packing().pack(batch) is None
+
+
+def test_what_came_from_another_process_is_packed_too() -> None:
+    batch = Batch((Variables("se2", np.array([1, 2]), np.zeros((2, 3))),), edge(np.zeros((1, 3))).factors)
+    came = pickle.loads(pickle.dumps(batch))
+    packed, wanted = Packing().pack(came), Packing().pack(batch)
+    assert came.factors[0].measured.dtype is not batch.factors[0].measured.dtype, "its types are the same objects"
+    assert packed is not None
+    assert wanted is not None
+    assert packed[0] == wanted[0]
+    assert (packed[1] == wanted[1]).all()
 
 
 def test_many_shapes_are_not_remembered_for_ever() -> None:

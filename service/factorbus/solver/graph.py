@@ -20,7 +20,7 @@ from factorbus.solver.groups import FactorGroup, Group
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
-from factorbus.solver.kernels.move import gather
+from factorbus.solver.kernels.move import gather, label_of
 from factorbus.solver.rows import Rows
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
@@ -143,6 +143,8 @@ class Graph(Arenas):
             return [
                 span.group(keys, values) if span.together else self._gathered(span.label, span.rows()) for span in spans
             ]
+        if (label := label_of(picked, self.places())) >= 0:
+            return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
         return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
@@ -150,7 +152,7 @@ class Graph(Arenas):
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
         keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
-        gather(rows, self.var, self.keys, self.values, keys, values)
+        gather(rows, self.places(), keys, values)
         return Group(kind.name, keys, values, fixed=bool(label % 2))
 
     def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:

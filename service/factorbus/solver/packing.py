@@ -36,12 +36,12 @@ class Packing:
         raw: list[Any] = []
         for group in batch.variables:
             keys, values = group.keys, group.values
-            if type(keys) is not ndarray or keys.dtype is not _I64:
+            if type(keys) is not ndarray or not _is(keys.dtype, _I64):
                 return None
             raw.append(keys)
             if values is None:
                 shape += (group.kind, group.fixed, keys.shape, None)
-            elif type(values) is ndarray and values.dtype is _F64:
+            elif type(values) is ndarray and _is(values.dtype, _F64):
                 raw.append(values)
                 shape += (group.kind, group.fixed, keys.shape, values.shape)
             else:
@@ -52,8 +52,8 @@ class Packing:
             if (
                 group.loss
                 or not type(keys) is type(measured) is type(information) is ndarray
-                or keys.dtype is not _I64
-                or not measured.dtype is information.dtype is _F64
+                or not _is(keys.dtype, _I64)
+                or not (_is(measured.dtype, _F64) and _is(information.dtype, _F64))
             ):
                 return None
             raw += (keys, measured, information)
@@ -74,6 +74,11 @@ class Packing:
             if len(self._known) == _SHAPES:
                 self._known.clear()
             return self._known.setdefault(shape, _laid_out(shape))
+
+
+def _is(seen: np.dtype, wanted: np.dtype) -> bool:
+    """Whether they are the same; arrays that came from another process have types of their own."""
+    return seen is wanted or seen == wanted
 
 
 def _laid_out(shape: tuple) -> I64 | None:

@@ -97,12 +97,8 @@ class Tree(Arenas):
     def list_moved(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
         graph = self._graph
-        found = np.empty(int(graph.counts[at.VARIABLES]), np.int64)
-        count = list_moved(
-            first_new, found.size, self.changed[: self.state[tl.S_CHANGED]], graph.var, self.lin.view(np.int64),
-            graph.values.view(np.int64), found,
-        )  # fmt: skip
-        return np.sort(found[:count])
+        found = np.empty(self.state.item(tl.S_CHANGED) + graph.counts.item(at.VARIABLES) - first_new, np.int64)
+        return found[: list_moved(first_new, graph.places(), self.places(), found)]
 
     def exchange(self) -> None:
         """Exchange the estimate and the one from before the last step, of the variables that it changed."""

@@ -2,6 +2,7 @@
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.places import floats, int_rows, ints
 from factorbus.solver.kernels.points import move_point2, move_point3
 from factorbus.solver.kernels.se2 import move_se2
 from factorbus.solver.kernels.se3 import move_se3
@@ -53,9 +54,25 @@ def differs(x: int, size: int, a: I64, b: I64) -> bool:
     return False
 
 
-@kernel("void(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[:,::1])")
-def gather(picked: I64, var: I64, keys: I64, values: F64, out_keys: I64, out_values: F64) -> None:
-    """Keys and values of the picked variables, which are of one kind: those that follow each other, together."""
+@kernel("int64(int64[::1], int64[::1])")
+def label_of(picked: I64, graph: I64) -> int:
+    """2 · kind of the picked variables, and 1 more where they are fixed; −1: they differ, or there are none."""
+    var, label = int_rows(graph, at.T_VAR), -1
+    for n in range(picked.size):
+        own = 2 * var[picked[n], at.V_KIND] + int(var[picked[n], at.V_COLUMN] < 0)
+        if n > 0 and own != label:
+            return -1
+        label = own
+    return label
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1], float64[:,::1])")
+def gather(picked: I64, graph: I64, out_keys: I64, out_values: F64) -> None:
+    """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
+
+    graph: the table of its arenas (`places`).
+    """
+    var, keys, values = int_rows(graph, at.T_VAR), ints(graph, at.T_KEYS), floats(graph, at.T_VALUES)
     size, out = out_values.shape[1], out_values.reshape(-1)
     n = 0
     while n < picked.size:

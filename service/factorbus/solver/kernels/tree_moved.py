@@ -3,25 +3,34 @@
 import numpy as np
 
 from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.ascending import SPARSE, put_in_order, sort
+from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.sizes import size_of
 
 
-@kernel("int64(int64, int64, int64[::1], int64[:,::1], int64[:,::1], int64[::1], int64[::1])")
-def list_moved(first: int, count: int, changed: I64, var: I64, lin: I64, values: I64, out: I64) -> int:
-    """List in `out` the variables `first` .. count−1, and those of `changed` whose bits are not those of lin[2].
+@kernel("int64(int64, int64[::1], int64[::1], int64[::1])")
+def list_moved(first: int, graph: I64, tree: I64, out: I64) -> int:
+    """List in `out`, ascending, the variables that have other bits than before the last step, and all from `first` on.
 
-    lin and values are given as the integers that their bits are, so that −0.0 is not 0.0.  Gives how many.
+    graph, tree: tables of their arenas (`places`).  Gives how many.
     """
+    counts, var, values = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), floats(graph, at.T_VALUES)
+    changed, lin, state = ints(tree, tl.T_CHANGED), float_rows(tree, tl.T_LIN), ints(tree, tl.T_STATE)
+    before, now = lin.view(np.int64), values.view(np.int64)  # bits: −0.0 is not 0.0
     n = 0
-    for v in range(first, count):
-        out[n] = v
-        n += 1
-    for k in range(changed.size):
+    for k in range(state[tl.S_CHANGED]):
         v = changed[k]
-        if v < first and differs_in_tree(v, var, lin, values):
+        if v < first and differs_in_tree(v, var, before, now):
             out[n] = v
             n += 1
+    put_in_order(out[:n], first)
+    if n * SPARSE < first:
+        sort(out[:n])
+    for v in range(first, counts[at.VARIABLES]):
+        out[n] = v
+        n += 1
     return n
 
 
