@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from naive.tree_records import Clique, assert_is_a_tree, tree_of
 
@@ -13,7 +14,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 
 NEAR = 60
-ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3}  # of more than 27 flops
+ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3, "around": 0.0, "detour": math.inf}  # of more than 27 flops
 NEVER = {"heavy": math.inf}
 LINEAR = {"bent_soon": math.inf, "bent_now": math.inf, "bent_most": math.inf}  # little is relinearised
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
@@ -39,11 +40,15 @@ def neighbours(solver: Solver) -> dict[int, set[int]]:
     return found
 
 
+def ends(solver: Solver, first: int) -> list[int]:
+    """Of the factors from `first` on."""
+    return solver._graph.fac[first : solver.factor_count, [at.F_I, at.F_J]].ravel().tolist()
+
+
 def nearest(solver: Solver, first: int, count: int) -> set[int]:
     """All variables in whole shells around the ends of the factors from `first` on, as far as `count` reaches."""
-    graph, joined = solver._graph, neighbours(solver)
-    ends = graph.fac[first : solver.factor_count, [at.F_I, at.F_J]].ravel().tolist()
-    shell, found = {v for v in ends if v in joined}, set()
+    joined = neighbours(solver)
+    shell, found = {v for v in ends(solver, first) if v in joined}, set()
     while shell and len(found) + len(shell) <= count:
         found |= shell
         shell = set().union(*(joined[v] for v in shell)) - found
@@ -59,6 +64,13 @@ def above(v: int, solver: Solver, cliques: dict[int, Clique]) -> set[int]:
     return found
 
 
+def rings(solver: Solver) -> dict[int, int]:
+    """The ring of each variable that the last elimination brought near the root."""
+    tree, n = tree_of(solver), solver.variable_count
+    near, ring = tree.node[:n, tl.N_NEAR] == tree.state[tl.S_STAMP], tree.node[:n, tl.N_RING]
+    return {int(v): int(ring[v]) for v in np.flatnonzero(near & (ring >= 0))}
+
+
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> None:
     options = Options(**ALWAYS, **LINEAR)
@@ -69,7 +81,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
             cliques = assert_is_a_tree(solver)
             close = nearest(solver, first, NEAR // dim)
             recent = {v for v in range(solver.variable_count) if tree.node[v, tl.N_SEEN] > n - options.recent_steps}
-            brought = {v for v in range(solver.variable_count) if tree.node[v, tl.N_NEAR] == tree.state[tl.S_STAMP]}
+            brought = set(rings(solver))
             assert close <= brought
             # Small fronts are joined, so that a few others may come along.
             more = [len(above(v, solver, cliques) - brought - recent) for v in close]
@@ -79,6 +91,93 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
         first = solver.factor_count
     assert looked > 100
     assert alone > 0.9 * looked
+
+
+@pytest.mark.parametrize("world", ["manhattan", "sphere"])
+def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
+    options = Options(**{**ALWAYS, "near": 25.0}, **LINEAR)
+    solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
+    for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](400, 7)))):
+        found = rings(solver)
+        if n >= 200 and n % 5 == 0 and solver.factor_count - first > 1 and found and max(found.values()) > 0:
+            # Each with all inside it has a quarter of the next.
+            sizes = np.cumsum(np.bincount(list(found.values()))[::-1])[::-1]
+            if sizes[0] < n:
+                assert (sizes[1:] * options.rings <= sizes[:-1] + options.rings).all()
+            assert sizes[-1] * dim >= 30 - dim
+            # What is further inside is nearer.
+            far, shell, hops = {}, {v for v in ends(solver, first) if v in found}, 0
+            while shell:
+                far |= dict.fromkeys(shell, hops)
+                shell, hops = set().union(*(neighbours(solver)[v] for v in shell)) - far.keys(), hops + 1
+            for ring in range(1, len(sizes)):
+                inside, outside = ([far[v] for v in found if found[v] == r] for r in (ring, ring - 1))
+                assert max(inside) <= min(outside)
+            tree, cliques = tree_of(solver), assert_is_a_tree(solver)
+            recent = {v for v in range(solver.variable_count) if tree.node[v, tl.N_SEEN] > n - options.recent_steps}
+            more = [
+                len([w for w in above(v, solver, cliques) - recent if found.get(w, -1) < ring])
+                for v, ring in found.items()
+            ]
+            assert max(more) <= 8  # small fronts are joined
+            alone += more.count(0)
+            looked += len(more)
+        first = solver.factor_count
+    assert looked > 100
+    assert alone > 0.9 * looked
+
+
+@pytest.mark.parametrize("detour", [0.0, 0.5])
+def test_what_is_out_of_the_way_stays_where_it_is(detour: float) -> None:
+    solver = Solver(Options(**{**ALWAYS, "near": 60.0, "detour": detour}, **LINEAR))
+    first, stayed, came = 0, 0, 0
+    node, clique = (array.copy() for array in (tree_of(solver).node, tree_of(solver).clique))
+    for n, _ in enumerate(drive(solver, steps("manhattan", 500))):
+        tree = tree_of(solver)
+        old = {v for v in ends(solver, first) if v < n}
+        needed = cliques_above(old, node, clique)
+        brought = cliques_above({v for v in rings(solver) if v < n}, node, clique)
+        if n > 100:
+            assert flops_of(brought - needed, clique) <= detour * flops_of(needed, clique)
+            came += len(brought - needed)
+            near = tree.node[:n, tl.N_NEAR] == tree.state[tl.S_STAMP]
+            stayed += int((near & (tree.node[:n, tl.N_RING] == -1)).sum())
+        first, node, clique = solver.factor_count, tree.node.copy(), tree.clique.copy()
+    assert stayed > 100
+    assert came > 100 or detour == 0.0
+
+
+def cliques_above(variables: set[int], node: np.ndarray, clique: np.ndarray) -> set[int]:
+    """The cliques that have these as frontals, and those above."""
+    found: set[int] = set()
+    for v in variables:
+        c = int(node[v, tl.N_CLIQUE])
+        while c >= 0 and c not in found:
+            found.add(c)
+            c = int(clique[c, tl.C_PARENT])
+    return found
+
+
+def flops_of(cliques: set[int], clique: np.ndarray) -> float:
+    """What it takes to eliminate these."""
+    p, m = (clique[sorted(cliques)][:, column] for column in (tl.C_PIVOTS, tl.C_BORDER))
+    return float((p * (p + m + 1) ** 2).sum())
+
+
+def test_the_more_an_elimination_takes_the_more_comes_with_it() -> None:
+    near, around = 2.0, 0.05
+    options = {"heavy": 0.0, "worth": 0.0, "near": near, "around": around, "detour": math.inf}
+    solver, seen = Solver(Options(**options, **LINEAR)), set()
+    node, clique, first = tree_of(solver).node.copy(), tree_of(solver).clique.copy(), 0
+    for n, _ in enumerate(drive(solver, steps("manhattan", 900))):
+        tree = tree_of(solver)
+        F = flops_of(cliques_above({v for v in ends(solver, first) if v < n}, node, clique), clique)
+        wanted = max(near * F ** (1 / 3), around * F ** (2 / 3))
+        if n > 100 and wanted < n and tree.state[tl.S_RELINEARISED] == 0:
+            assert abs(3 * len(rings(solver)) - wanted) <= 3
+            seen.add(near * F ** (1 / 3) > around * F ** (2 / 3))
+        first, node, clique = solver.factor_count, tree.node.copy(), tree.clique.copy()
+    assert seen == {True, False}
 
 
 @pytest.mark.parametrize(("world", "poses", "most"), [("manhattan", 3000, 0.7), ("sphere", 900, 0.4)])

@@ -40,7 +40,9 @@ class Options:
     bent_soon, bent_most, patience   tree: all that wait are so in the next step when together they add more than this
                     share to χ², if they have `many` scalars, when a factor is bent by more than so many, or when one
                     has waited for so many steps
-    rest, reluctance   tree: for so many steps after a relinearisation both shares are more, up to so many times
+    rest, reluctance, dear   tree: for so many steps after a relinearisation both shares are more, up to so many times;
+                    after one that took k times `dear` flops for k times as many steps, up to √k times as much as that,
+                    and `patience` is k times as long
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
                     if what waits has `many` scalars
     many            tree: for fewer scalars much less is worth it; poses in space and landmarks have to be worth more
@@ -49,11 +51,13 @@ class Options:
     look_every, look_moved   tree: it is looked for what is bent so many steps apart when a loop closes, four times as
                     many without one, and when so much moved since that this may add this share to χ²
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
-                    scalars were (MATH §9.7)
+                    scalars were; in wide cliques, which take longer, by more than that (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
-    heavy, near, worth   tree: an elimination of more than so many flops brings this times their cube root of scalars
-                    around the newest factors near the root, once this share of what that took last has been spent
-                    since (MATH §9.4)
+    heavy, near, around, worth   tree: an elimination of F flops, more than `heavy`, brings what surrounds the newest
+                    factors near the root, near ∛F scalars or around ∛F² of them, whichever is more, once the share
+                    `worth` of what that took last has been spent since (MATH §9.4)
+    rings, detour   tree: ring by ring, each with what is inside it `rings` times as large as the next; what would take
+                    more than this share of F in addition stays where it is
     split_pivots, split_share   tree: cliques of more scalars, less than this share of them touched, are split
     backend         "blocks": block multifrontal Cholesky; "cholmod": CHOLMOD on scalars, through scikit-sparse
     """
@@ -81,15 +85,19 @@ class Options:
     patience: int = 1000
     rest: int = 96
     reluctance: float = 6.0
+    dear: float = 1.5e8
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
     look_moved: float = 0.05
-    ripple: float = 0.02
+    ripple: float = 0.014
     recent_steps: int = 2
     heavy: float = 1e5
     near: float = 1.4
-    worth: float = 0.5
+    around: float = 0.0055
+    worth: float = 0.1
+    rings: float = 4.0
+    detour: float = 0.5
     split_pivots: int = 24
     split_share: float = 0.5
     backend: Literal["blocks", "cholmod"] = "blocks"

@@ -42,9 +42,10 @@ class Tree(Arenas):
             options.bent_most,
         )
         self.settings[tl.P_MANY] = options.many
-        self.settings[[tl.P_REST, tl.P_RELUCTANCE]] = options.rest, options.reluctance
+        self.settings[[tl.P_REST, tl.P_RELUCTANCE, tl.P_DEAR]] = options.rest, options.reluctance, options.dear
         self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
-        self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_WORTH]] = options.heavy, options.near, options.worth
+        self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_AROUND]] = options.heavy, options.near, options.around
+        self.settings[[tl.P_WORTH, tl.P_RINGS, tl.P_DETOUR]] = options.worth, options.rings, options.detour
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.node: I64 = lines((256, tl.N_WIDTH), np.int64)
         self.link: I64 = lines((512, tl.L_WIDTH), np.int64)

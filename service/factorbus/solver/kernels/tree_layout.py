@@ -29,7 +29,7 @@ The arenas of a tree are, each from the start of a cache line on:
     marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (20,) float64   see P_RIPPLE and so on
+    settings (24,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
     account (5,) float64     what a step found
 """
@@ -60,7 +60,8 @@ N_OWN = 8  # first factor that is added where this variable is eliminated; -1: n
 N_SEEN = 9  # the last step that brought a factor of it
 N_COLUMN = 10  # scratch: its column in the clique at hand
 N_LINEARISED = 11  # the last step that gave it a linearisation point
-N_NEAR = 12  # the last elimination that brought it near the root
+N_NEAR = 12  # the last elimination that looked whether to bring it near the root,
+N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
 N_WIDTH = 16
 
 # Columns of `stiff`: d, √ω, |r| or |Ω r|, ω_θ, and what was measured of the translation.
@@ -165,7 +166,8 @@ S_LOOKED = 47  # the step that looked last for what is bent
 S_IDLE = 48  # doubles of free blocks of `numbers`,
 S_GIVEN = 49  # of those given back since they were joined,
 S_LARGEST = 50  # and no class above this one has any
-S_FREE = 51  # heads of free lists: numbers, then lists
+S_RELINEARISING = 51  # flops of the last elimination that relinearised
+S_FREE = 52  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
@@ -193,7 +195,11 @@ P_NEAR = 16  # so many scalars, times the cube root of the flops
 P_REST = 17  # for so many steps after a relinearisation P_SOON and P_BENT_NOW are more,
 P_RELUCTANCE = 18  # up to so many times
 P_MANY = 19  # P_SOON and P_BENT_NOW are for so many scalars that wait, (9.22)
-P_SIZE = 20
+P_DEAR = 20  # P_REST is for a relinearisation of so many flops
+P_AROUND = 21  # or so many times its square, if that is more,
+P_RINGS = 22  # in rings, each with all inside it so many times as large as the next one,
+P_DETOUR = 23  # unless that takes more than this share of the elimination in addition
+P_SIZE = 24
 
 # The phases of a step, in the order of `tree_step`.
 PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")

@@ -12,6 +12,8 @@ from factorbus.solver.kernels._jit import I64, inline_kernel, part
 from factorbus.solver.kernels.amd import ELEMENT, eliminate
 from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
 
+NEWEST = 64  # a group above those of all rings
+
 
 @part
 def order_affected(
@@ -20,8 +22,8 @@ def order_affected(
 ) -> I64:  # fmt: skip
     """perm (n,): affected[perm[k]] is eliminated k-th.
 
-    Last go those that are near, then variables with a factor in the last `recent` steps, then the variable `last`; −1:
-    none does.
+    Last go those that are near, ring by ring, then variables with a factor in the last `recent` steps, then the
+    variable `last`; −1: none does.
     """
     dims, group = np.empty(n, np.int64), np.zeros(n, np.int64)
     since, stamp, m = state[tl.S_STEP] - recent, state[tl.S_STAMP], orphans.size
@@ -29,11 +31,11 @@ def order_affected(
         v = affected[k]
         dims[k] = dim_of_variable(var, v)
         if v == last:
-            group[k] = 3
+            group[k] = NEWEST
         elif node[v, tl.N_SEEN] > since:
-            group[k] = 2
+            group[k] = NEWEST - 1
         elif node[v, tl.N_NEAR] == stamp:
-            group[k] = 1
+            group[k] = 1 + node[v, tl.N_RING]
     length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
     for e in range(m):
         start = clique[orphans[e], tl.C_LIST]

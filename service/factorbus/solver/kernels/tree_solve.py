@@ -17,6 +17,8 @@ from factorbus.solver.kernels.tree_bend import turn_of
 from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_move import list_moved, move_variable
 
+NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
+
 
 @part
 def substitute(
@@ -76,6 +78,7 @@ def moves_along(
 ) -> bool:  # fmt: skip
     """Whether a clique and all below it only move as a whole; motion gets by how much."""
     row = clique[c]
+    far = far_of(row, far)
     return (
         row[tl.C_FIRST] != -1
         and row[tl.C_ANCHORED] == 0
@@ -106,10 +109,11 @@ def has_moved(
     c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
     motions: F64, motion: F64,
 ) -> bool:  # fmt: skip
-    """Whether a scalar of the separator is further than √far σ from where the frontals have it, who were solved with
+    """Whether a scalar of the separator is further than (9.17) from where the frontals have it, who were solved with
     it and may have moved since.
     """
     row = clique[c]
+    far = far_of(row, far)
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
     used, moves = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0
     for s in range(start, start + row[tl.C_SEPARATORS]):
@@ -125,6 +129,12 @@ def has_moved(
                 return True
             used += 1
     return False
+
+
+@inline_kernel
+def far_of(row: I64, far: float) -> float:
+    """The square of (9.17) for a clique, `far` being that of one with NARROW numbers of R a scalar."""
+    return far * max(1.0, (row[tl.C_BORDER] + 0.5 * row[tl.C_PIVOTS]) / NARROW)
 
 
 @inline_kernel

@@ -88,8 +88,11 @@ def tree_step(graph: I64, tree: I64) -> int:
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_MOST] *= unit
-    scaled[tl.P_BENT_NOW] *= unit * unit * max(f1, 1) * reluctance(settings, state)  # a share of χ²
-    scaled[tl.P_SOON] *= unit * unit * max(f1, 1) * reluctance(settings, state)
+    scaled[tl.P_DEAR] = max(state[tl.S_RELINEARISING] / settings[tl.P_DEAR], 1.0)
+    share = unit * unit * max(f1, 1) * reluctance(scaled, state)  # of χ²
+    scaled[tl.P_BENT_NOW] *= share
+    scaled[tl.P_SOON] *= share
+    scaled[tl.P_PATIENCE] *= scaled[tl.P_DEAR]
     scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
@@ -148,8 +151,9 @@ def residual_unit(factors: int, account: F64) -> float:
 @inline_kernel
 def reluctance(settings: F64, state: I64) -> float:
     """How many times as much has to be bent, so soon after the last relinearisation.  (9.19)"""
-    rested = settings[tl.P_REST] / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
-    return min(max(rested * rested, 1.0), settings[tl.P_RELUCTANCE])
+    dear = settings[tl.P_DEAR]
+    rested = settings[tl.P_REST] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
+    return min(max(rested * rested, 1.0), settings[tl.P_RELUCTANCE] * math.sqrt(dear))
 
 
 @inline_kernel
@@ -179,7 +183,7 @@ def eliminate_again(
         count = touch_around(moving, fac, node, link, clique, state, marked, count)
     near = count_near(marked[:count], reorders, settings, clique, state)
     if near > 0:
-        count = touch_near(near, f1, var, fac, node, link, clique, state, marked, count)
+        count = touch_near(near, f1, settings, var, fac, node, link, clique, state, marked, count)
         renewed = still_renewed(renewed, clique, state)
     listed, marked = marked, marked[:count]
     room = v1 - v0
@@ -268,6 +272,7 @@ def eliminate_again(
     if moving.size > 0:
         state[tl.S_PENDING] = state[tl.S_DUE] = 0
         state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
+        state[tl.S_RELINEARISING] = state[tl.S_FLOPS] - flops
     now = lap(now, tl.COMMIT, state)
     # 8
     begins = np.empty(tops.size + ids.size, np.int64)
