@@ -78,14 +78,14 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 5e-4
-    bent_soon: float = 1.5e-5
+    bent_soon: float = 1.35e-5
     bent_now: float = 5e-5
     many: int = 2500
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96
     reluctance: float = 6.0
-    dear: float = 1.5e8
+    dear: float = 5e8
     trust: float = 3.0
     rounds: int = 3
     look_every: int = 4
