@@ -22,7 +22,10 @@ _I64, _F64 = np.dtype(np.int64), np.dtype(np.float64)
 
 
 class Packing:
-    """Packs small batches."""
+    """Packs small batches.
+
+    Types are compared where they are not the same object, as those of arrays from another process.
+    """
 
     def __init__(self) -> None:
         self._known: dict[tuple, I64 | None] = {}
@@ -36,12 +39,12 @@ class Packing:
         raw: list[Any] = []
         for group in batch.variables:
             keys, values = group.keys, group.values
-            if type(keys) is not ndarray or not _is(keys.dtype, _I64):
+            if type(keys) is not ndarray or (keys.dtype is not _I64 and keys.dtype != _I64):
                 return None
             raw.append(keys)
             if values is None:
                 shape += (group.kind, group.fixed, keys.shape, None)
-            elif type(values) is ndarray and _is(values.dtype, _F64):
+            elif type(values) is ndarray and (values.dtype is _F64 or values.dtype == _F64):
                 raw.append(values)
                 shape += (group.kind, group.fixed, keys.shape, values.shape)
             else:
@@ -52,8 +55,9 @@ class Packing:
             if (
                 group.loss
                 or not type(keys) is type(measured) is type(information) is ndarray
-                or not _is(keys.dtype, _I64)
-                or not (_is(measured.dtype, _F64) and _is(information.dtype, _F64))
+                or (keys.dtype is not _I64 and keys.dtype != _I64)
+                or (measured.dtype is not _F64 and measured.dtype != _F64)
+                or (information.dtype is not _F64 and information.dtype != _F64)
             ):
                 return None
             raw += (keys, measured, information)
@@ -74,11 +78,6 @@ class Packing:
             if len(self._known) == _SHAPES:
                 self._known.clear()
             return self._known.setdefault(shape, _laid_out(shape))
-
-
-def _is(seen: np.dtype, wanted: np.dtype) -> bool:
-    """Whether they are the same; arrays that came from another process have types of their own."""
-    return seen is wanted or seen == wanted
 
 
 def _laid_out(shape: tuple) -> I64 | None:
