@@ -10,8 +10,10 @@ from naive.tree_records import Clique, assert_is_a_tree, tree_of
 from factorbus.proto.messages import Batch
 from factorbus.simulate import manhattan, sphere
 from factorbus.solver import Options, Solver
+from factorbus.solver.errors import BadOption
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_near import MOST_RINGS
 
 NEAR = 60
 ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3, "around": 0.0, "detour": math.inf}  # of more than 27 flops
@@ -125,6 +127,19 @@ def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
         first = solver.factor_count
     assert looked > 100
     assert alone > 0.9 * looked
+
+
+@pytest.mark.parametrize("rings", [1.0, 0.0, math.nan])
+def test_a_ring_is_larger_than_what_is_inside_it(rings: float) -> None:
+    with pytest.raises(BadOption, match="rings"):
+        Options(rings=rings)
+
+
+def test_no_more_rings_than_there_are_groups_for() -> None:
+    solver = Solver(Options(**{**ALWAYS, "near": 60.0}, rings=1.001, **LINEAR))
+    for _ in drive(solver, steps("manhattan", 200)):
+        assert max(rings(solver).values(), default=0) <= MOST_RINGS
+    assert_is_a_tree(solver)
 
 
 @pytest.mark.parametrize("detour", [0.0, 0.5])

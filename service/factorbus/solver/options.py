@@ -108,6 +108,8 @@ class Options:
             raise BadOption("backend", repr(self.backend), '"blocks" or "cholmod"')
         if not 0 <= self.small_loop <= self.big_loop:
             raise BadOption("small_loop, big_loop", f"{self.small_loop}, {self.big_loop}", "0 ≤ small_loop ≤ big_loop")
+        if not self.rings > 1.0:
+            raise BadOption("rings", str(self.rings), "more than 1")
         if self.recent_poses < 1:
             raise BadOption("recent_poses", str(self.recent_poses), "1 or more")
         if self.max_iterations < 0 or self.settle_iterations < 0:

@@ -12,7 +12,7 @@ from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.tree_mark import dim_of_variable, touch
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-INNERMOST = 30.0  # scalars of the smallest ring, at least
+INNERMOST, MOST_RINGS = 30.0, 60  # scalars of the smallest ring, at least
 NO_RING = -1  # what is too far out of the way
 
 
@@ -58,7 +58,7 @@ def touch_near(
     stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
     detour, wider = settings[tl.P_DETOUR] * flops_of(marked[:count], clique), settings[tl.P_RINGS]
     ring, within, scalars = 0, float(room), 0
-    while within >= wider * INNERMOST:
+    while within >= wider * INNERMOST and ring < MOST_RINGS:
         ring, within = ring + 1, within / wider
     for f in range(min(state[tl.S_TAKEN], f1 - 1), f1):
         put = _queue(fac[f, at.F_I], queue, put, var, node, stamp)

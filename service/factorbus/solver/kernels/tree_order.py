@@ -11,8 +11,9 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64, inline_kernel, part
 from factorbus.solver.kernels.amd import ELEMENT, eliminate
 from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
+from factorbus.solver.kernels.tree_near import MOST_RINGS
 
-NEWEST = 64  # a group above those of all rings
+NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of what is recent
 
 
 @part
