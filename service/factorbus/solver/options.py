@@ -80,7 +80,7 @@ class Options:
     bent: float = 5e-4
     bent_soon: float = 1.35e-5
     bent_now: float = 5e-5
-    many: int = 2500
+    many: int = 1500
     bent_most: float = 2.0
     patience: int = 1000
     rest: int = 96

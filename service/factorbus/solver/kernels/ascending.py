@@ -8,13 +8,13 @@ SPARSE = 64  # of so many variables one at the most: each has pages of its own a
 
 
 @part
-def put_in_order(indices: I64, count: int) -> None:
-    """Sort different indices below `count`; where they are few among so many they stay as they are.
+def put_in_order(indices: I64, count: int) -> bool:
+    """Sort different indices below `count`; where they are few among so many they stay as they are, and it gives False.
 
     What is done with each of thousands of variables then finds its rows in the cache, for they are read ahead.
     """
     if indices.size * SPARSE < count:
-        return
+        return False
     words = np.zeros(count // 8 + 1, np.int64)
     there, n = words.view(np.uint8), 0
     for k in range(indices.size):
@@ -25,6 +25,7 @@ def put_in_order(indices: I64, count: int) -> None:
                 if there[v] != 0:
                     indices[n] = v
                     n += 1
+    return True
 
 
 @part

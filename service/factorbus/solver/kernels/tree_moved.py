@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.ascending import SPARSE, put_in_order, sort
+from factorbus.solver.kernels.ascending import put_in_order, sort
 from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.sizes import size_of
 
@@ -25,8 +25,7 @@ def list_moved(first: int, graph: I64, tree: I64, out: I64) -> int:
         if v < first and differs_in_tree(v, var, before, now):
             out[n] = v
             n += 1
-    put_in_order(out[:n], first)
-    if n * SPARSE < first:
+    if not put_in_order(out[:n], first):
         sort(out[:n])
     for v in range(first, counts[at.VARIABLES]):
         out[n] = v

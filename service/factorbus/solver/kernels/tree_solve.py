@@ -32,6 +32,7 @@ def substitute(
     were.  moved: gets those that may be bent by it, where they are not there yet.  listed: scratch, for all cliques
     """
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
+    shares = np.empty(64)
     body = count = 0
     for f in range(ids.size - 1, -1, -1):
         if clique[ids[f], tl.C_PARENT] >= 0:
@@ -40,7 +41,9 @@ def substitute(
         while c >= 0:
             row = clique[c]
             gather_separator(row, var, lists, delta, numbers)
-            solve_rows(row, numbers)
+            if row[tl.C_PIVOTS] > shares.size:
+                shares = np.empty(2 * row[tl.C_PIVOTS])
+            solve_rows(row, numbers, shares)
             row[tl.C_FIRST] = row[tl.C_MOVES] = 0
             state[tl.S_SOLVED] += 1
             move_frontals(
@@ -151,27 +154,56 @@ def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -
 
 
 @inline_kernel
-def solve_rows(row: I64, numbers: F64) -> None:
-    """δ_F = R_F⁻¹ (d − R_S δ_S), the product first: its rows do not wait for each other.
+def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
+    """δ_F = R_F⁻¹ (d − R_S δ_S).  shares: scratch for the pivots.
 
-    Of a pivot only the product with the one that was solved just before waits for that.
+    The product first, whose rows do not wait for each other, and what each pivot is divided by, since a division takes
+    longer than all else that the next one waits for.  Rows are taken by threes: a plane pose has three scalars, and six
+    one in space.
     """
     p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
     width = p + row[tl.C_BORDER]
     for i in range(p):
-        line, total = row[tl.C_ROWS] + i * ld, 0.0
+        put(shares, i, 1.0 / load(numbers, row[tl.C_ROWS] + i * (ld + 1)))
+    i = 0
+    while i + 3 <= p:
+        line, x, y, z = row[tl.C_ROWS] + i * ld, 0.0, 0.0, 0.0
         for k in range(p, width):
-            total += load(numbers, line + k) * load(numbers, used + k)
-        put(numbers, used + i, load(numbers, line + width) - total)
-    before = 0.0
-    for i in range(p - 1, -1, -1):
-        line, total = row[tl.C_ROWS] + i * ld, load(numbers, used + i)
-        share = 1.0 / load(numbers, line + i)
-        for k in range(i + 2, p):
-            total -= load(numbers, line + k) * load(numbers, used + k)
-        # Behind the last column there is d, and `before` is zero.
-        before = (total - load(numbers, line + i + 1) * before) * share
-        put(numbers, used + i, before)
+            known = load(numbers, used + k)
+            x += load(numbers, line + k) * known
+            y += load(numbers, line + ld + k) * known
+            z += load(numbers, line + 2 * ld + k) * known
+        put(numbers, used + i, load(numbers, line + width) - x)
+        put(numbers, used + i + 1, load(numbers, line + ld + width) - y)
+        put(numbers, used + i + 2, load(numbers, line + 2 * ld + width) - z)
+        i += 3
+    while i < p:
+        line, x = row[tl.C_ROWS] + i * ld, 0.0
+        for k in range(p, width):
+            x += load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, load(numbers, line + width) - x)
+        i += 1
+    while i >= 3:
+        i -= 3
+        line = row[tl.C_ROWS] + i * ld
+        x, y, z = load(numbers, used + i), load(numbers, used + i + 1), load(numbers, used + i + 2)
+        for k in range(i + 3, p):
+            known = load(numbers, used + k)
+            x -= load(numbers, line + k) * known
+            y -= load(numbers, line + ld + k) * known
+            z -= load(numbers, line + 2 * ld + k) * known
+        z *= load(shares, i + 2)
+        y = (y - load(numbers, line + ld + i + 2) * z) * load(shares, i + 1)
+        x = (x - load(numbers, line + i + 2) * z - load(numbers, line + i + 1) * y) * load(shares, i)
+        put(numbers, used + i, x)
+        put(numbers, used + i + 1, y)
+        put(numbers, used + i + 2, z)
+    while i > 0:
+        i -= 1
+        line, x = row[tl.C_ROWS] + i * ld, load(numbers, used + i)
+        for k in range(i + 1, p):
+            x -= load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, x * load(shares, i))
 
 
 @inline_kernel
