@@ -23,6 +23,7 @@ LEAST_BURDEN = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 LEAST_LOOK, MANY_LOOKS = 0.02, 1000
 WITHOUT_LOOP, FEW = 4, 60
+MUCH = 8  # one variable in so many
 
 
 @part
@@ -65,46 +66,79 @@ def look(
     more than `bent`, (9.4), with what they see where that is what has moved, (9.5), (9.12) and (9.13), and both ends of
     one for which that is computed, (9.11).  turns: gets Σ bend² of each.  Gives the largest bend.
     """
+    if state[tl.S_EXACT] == 0 and state[tl.S_MOVED] * MUCH > state[tl.S_VARIABLES]:
+        return look_through(bent, var, fac, node, link, stiff, lin, scalars, values, turns, pending, moved, state)
     most, delta = 0.0, scalars[0]
     for k in range(state[tl.S_MOVED]):
         v = moved[k]
         pull, phi = 0.0, turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
         if phi == 0.0 and state[tl.S_EXACT] == 0:
             continue
-        planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
-        axes, turned = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), False
         slot = node[v, tl.N_ADJ]
         while slot >= 0:
             f = slot // 2
-            kind, y = link[f, tl.L_KIND], link[f, tl.L_FAR]
-            if kind >= tl.EXACT:
+            if link[f, tl.L_KIND] >= tl.EXACT:
                 bend = exact_bend(f, var, fac, lin, values, payload, delta)
                 most = max(most, bend)
                 if bend > bent:
                     pull += 0.5 * bend * bend  # half of it for each end
                     await_ends(f, fac, var, node, pending, state)
-            elif slot % 2 == 0 and phi > 0.0 and y >= 0:
-                d, root, pulled = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], stiff[f, tl.B_PULL]
-                shift = shift_between(planar, x, y, values, lin)
-                bend = bend_of(kind, root, d, phi, shift)
-                slip = slip_of(kind, root, d, shift, pulled)
-                if may_slip(kind, root, d, phi, shift, pulled, stiff[f, tl.B_TURN], bent - bend):
-                    if not turned:
-                        axes, turned = axes_of(planar, x, values), True
-                    slip = slip_between(planar, axes, x, y, shift, values, stiff, f)
-                both = kind == at.BEARING_RANGE_SE2 or slip > bend
-                bend += slip
+            elif slot % 2 == 0 and phi > 0.0 and link[f, tl.L_FAR] >= 0:
+                bend, counts = look_at(f, v, phi, bent, var, node, link, stiff, lin, values, pending, state)
                 most = max(most, bend)
-                if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
-                    bend *= SEEN
-                if bend > bent:
-                    pull += bend * bend
-                    await_move(v, node, pending, state)
-                    if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
-                        await_move(link[f, tl.L_SECOND], node, pending, state)
+                pull += counts
             slot = next_incidence(slot, link)
         turns[v, tl.U_STRAIN] = pull
     return most
+
+
+@part
+def look_through(
+    bent: float, var: I64, fac: I64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64, values: F64, turns: F64,
+    pending: I64, moved: I64, state: I64,
+) -> float:  # fmt: skip
+    """`look` where much has moved and no bend is computed exactly: at all factors, in the order in which they lie in
+    memory, for in that of the variables each waits for the one before.
+    """
+    most, delta = 0.0, scalars[0]
+    for k in range(state[tl.S_MOVED]):
+        v = moved[k]
+        if turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) > 0.0:
+            turns[v, tl.U_STRAIN] = 0.0
+    for f in range(state[tl.S_FACTORS]):
+        v = fac[f, at.F_I]
+        if node[v, tl.N_LISTED] != 0 and link[f, tl.L_FAR] >= 0:
+            phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR])
+            if phi > 0.0:
+                bend, counts = look_at(f, v, phi, bent, var, node, link, stiff, lin, values, pending, state)
+                most = max(most, bend)
+                turns[v, tl.U_STRAIN] += counts
+    return most
+
+
+@inline_kernel
+def look_at(
+    f: int, v: int, phi: float, bent: float, var: I64, node: I64, link: I64, stiff: F64, lin: F64, values: F64,
+    pending: I64, state: I64,
+) -> tuple[float, float]:  # fmt: skip
+    """How far factor f, seen from v, is bent, and what of its square counts: 0 where that is less than `bent`."""
+    planar, x = var[v, at.V_KIND] == at.SE2, var[v, at.V_AT]
+    kind, y = link[f, tl.L_KIND], link[f, tl.L_FAR]
+    d, root, pulled = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], stiff[f, tl.B_PULL]
+    shift = shift_between(planar, x, y, values, lin)
+    bend = bend_of(kind, root, d, phi, shift)
+    slip = slip_of(kind, root, d, shift, pulled)
+    if may_slip(kind, root, d, phi, shift, pulled, stiff[f, tl.B_TURN], bent - bend):
+        slip = slip_between(planar, axes_of(planar, x, values), x, y, shift, values, stiff, f)
+    both = kind == at.BEARING_RANGE_SE2 or slip > bend
+    bend += slip
+    counts = bend if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3 else SEEN * bend
+    if counts <= bent:
+        return bend, 0.0
+    await_move(v, node, pending, state)
+    if both and var[link[f, tl.L_SECOND], at.V_COLUMN] >= 0:
+        await_move(link[f, tl.L_SECOND], node, pending, state)
+    return bend, counts * counts
 
 
 @inline_kernel
