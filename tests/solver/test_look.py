@@ -37,7 +37,7 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
 
 
 def found(solver: Solver, tree: Tree, moved: np.ndarray, bent: float, variables: int) -> tuple:
-    """The largest bend, Σ bend² by variable, who waits, in order, and how each is marked."""
+    """The largest bend, Σ bend² by variable, who waits, ascending, and how each is marked."""
     graph, state, node = solver._graph, tree.state.copy(), tree.node.copy()
     turns, pending, listed = tree.turns.copy(), tree.pending.copy(), np.zeros_like(tree.moved)
     node[:, tl.N_FLAGS] = node[:, tl.N_LISTED] = 0

@@ -23,7 +23,7 @@ LEAST_BURDEN = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 LEAST_LOOK, MANY_LOOKS = 0.02, 1000
 WITHOUT_LOOP, FEW = 4, 60
-MUCH = 8  # one variable in so many
+MUCH = 8  # where more than one variable in so many has moved, all factors are looked through
 
 
 @part

@@ -12,7 +12,8 @@ from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.tree_mark import dim_of_variable, touch
 from factorbus.solver.kernels.tree_take_in import next_incidence
 
-INNERMOST, MOST_RINGS = 30.0, 60  # scalars of the smallest ring, at least
+INNERMOST = 30.0  # scalars of the smallest ring, at least
+MOST_RINGS = 60  # each has a group of its own in the order
 NO_RING = -1  # what is too far out of the way
 
 
