@@ -15,7 +15,7 @@ from factorbus.solver.admission import admit
 from factorbus.solver.factors import FACTOR_KINDS, FactorKind
 from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.linearise import evaluate_one
+from factorbus.solver.kernels.candidates import evaluate_factors
 from factorbus.solver.variables import VARIABLE_KINDS
 
 seeds = st.integers(0, 2**32 - 1)
@@ -49,9 +49,9 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Gra
 
 
 def evaluate(kind: FactorKind, graph: Graph) -> tuple[np.ndarray, list[np.ndarray]]:
-    r, A, B = np.full(at.R_SIZE, np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan)
-    evaluate_one(0, graph.var, graph.fac, graph.values, graph.payload, r, A, B)
-    return r[: kind.dim], [J[: kind.dim, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
+    r, A, B, W = (np.full((1, *shape), np.nan) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
+    evaluate_factors(0, 1, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    return r[0, : kind.dim], [J[0, : kind.dim, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
 
 
 @every_kind

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core.runtime import _nrt_python, rtsys
 
-from factorbus.solver.kernels import _jit, _lowering
+from factorbus.solver.kernels import _compile_time, _jit, _lowering
 
-MAKERS = Path(_jit.__file__), Path(_lowering.__file__)
+MAKERS = Path(_compile_time.__file__), Path(_jit.__file__), Path(_lowering.__file__)
 CALLER = """
 from kernels import _jit
 from kernels.callee import twice
@@ -327,6 +328,32 @@ def test_arrays_live_as_long_as_they_are_used():
     for _ in range(10):
         last_row(pair)
     assert sys.getrefcount(pair) == before, "a row that is given back is counted, and let go again"
+
+
+@_jit.kernel("float64(float64[:,::1], int64[::1])")
+def first_of_chosen(rows, some):
+    """A choice of rows is a copy of them, and no call has made it."""
+    return rows[some][0, 0]
+
+
+@_jit.kernel("float64(float64[:,::1])")
+def first_of_sum(rows):
+    return (rows[0] + rows[1])[0]
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without compilation Python counts")
+@pytest.mark.parametrize(("kernel", "more"), [(first_of_chosen, (np.ones(1, int),)), (first_of_sum, ())])
+def test_what_is_copied_in_passing_is_given_back(kernel, more):
+    rows = np.ones((2, 3))
+    assert kernel(rows, *more) == 1.0 + (not more)
+    _nrt_python.memsys_enable_stats()
+    before, references = rtsys.get_allocation_stats(), sys.getrefcount(rows)
+    for _ in range(10):
+        kernel(rows, *more)
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    assert after.alloc - before.alloc == after.free - before.free > 0
+    assert sys.getrefcount(rows) == references
 
 
 def test_first_calls_from_many_threads():

@@ -19,7 +19,7 @@ from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.linearise import evaluate_one
+from factorbus.solver.kernels.candidates import evaluate_factors
 from factorbus.solver.kernels.sights import ASLEEP
 
 X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
@@ -54,9 +54,9 @@ def sight_map(
 def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """r, A, B, whole."""
     graph = solver._graph
-    r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
-    evaluate_one(factor, graph.var, graph.fac, graph.values, graph.payload, r, A, B)
-    return r, A, B
+    r, A, B, W = (np.zeros((1, *shape)) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
+    evaluate_factors(factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    return r[0], A[0], B[0]
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept: numba is imported here and in `_lowering` alone, and flags are chosen here.
+"""How kernels are compiled and kept: numba is imported here, in `_lowering` and `_compile_time`; flags are chosen here.
 
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
@@ -48,8 +48,8 @@ from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
 
-# From beside this file: a copy of both elsewhere is one by itself.
-from . import _lowering
+# From beside this file: a copy of all three elsewhere is one by itself.
+from . import _compile_time, _lowering
 from ._lowering import KernelCompiler, PartCompiler
 
 __all__ = [
@@ -148,6 +148,8 @@ class KernelFolder:
     def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
         """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
         dispatcher = _ours(numba.njit(pipeline_class=PartCompiler, **flags, **self._flags)(function))
+        find = dispatcher.get_call_template
+        dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
 
         @functools.cache
         def alone() -> Any:
@@ -205,7 +207,7 @@ def sources_hash(folder: Path, *also: Path) -> str:
     """The name of the cache folder for kernels whose sources are the Python files in `folder`, those that make
     kernels, and `also`."""
     digest = hashlib.sha256()
-    makers = Path(__file__), Path(_lowering.__file__)
+    makers = (Path(one) for one in (__file__, _compile_time.__file__, _lowering.__file__))
     for path in sorted({*folder.glob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
@@ -247,6 +249,13 @@ def _on_first_call(dispatcher: Any) -> Callable[..., Any]:
         return dispatcher
 
     return compile_for_args
+
+
+def _common(kind: Any) -> Any:
+    """The kind of an argument.  Constants are kinds of their own, and a part is compiled apart for each: for sizes.  A
+    zero is no size but the place where something begins, and what is true or false decides nothing inside a loop."""
+    is_zero = isinstance(kind, types.IntegerLiteral) and kind.literal_value == 0
+    return types.intp if is_zero else types.boolean if isinstance(kind, types.BooleanLiteral) else kind
 
 
 def _ours(dispatcher: Any) -> Any:

@@ -14,8 +14,12 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
+from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
+
+# From beside this file: a copy of both elsewhere is one by itself.
+from ._compile_time import QuickFlags, keep_needed
 
 _from_the_end = arrayobj.fix_integer_index
 
@@ -30,22 +34,6 @@ def _fix_integer_index(context: Any, builder: Any, kind: Any, index: Any, size: 
 
 arrayobj.fix_integer_index = _fix_integer_index
 
-_find_call_type = types.BaseFunction.get_call_type
-
-
-def _known_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """What a built-in function comes to with such arguments.  Numba finds that out anew at every call, and in every
-    round of its inference; what was found once is known, which saves an eighth of the time that the step takes.
-    """
-    known = vars(self).setdefault("factorbus_known", {})
-    asked = context, tuple(args), tuple(kws.items())
-    if asked not in known:
-        known[asked] = _find_call_type(self, context, args, kws)
-    return known[asked]
-
-
-types.BaseFunction.get_call_type = _known_call_type
-
 
 class OurLower(Lower):
     """The code of our functions: it says that it is, and borrows arrays.
@@ -54,16 +42,31 @@ class OurLower(Lower):
 
     Numba counts one more and one less for each row or block of them that is looked at, by atomic operations: up to
     four fifths of the time of short kernels.  A function that gives back an array may give back one that it was given,
-    so such a one does count.
+    so such a one does count.  One that has no arrays but those, and their rows and blocks, counts nothing at all.
     """
 
     def pre_lower(self) -> None:
         super().pre_lower()
         self.module.factorbus = True
+        self.module.factorbus_borrows = self._is_plain(self.fndesc.restype) and not any(
+            self._is_owner(expression, signature) for expression, signature in self.fndesc.calltypes.items()
+        )
+
+    def _is_owner(self, expression: Any, signature: Any) -> bool:
+        """Whether what it comes to may be, or have, an array of its own."""
+        if signature is None or self._is_plain(signature.return_type):
+            return False
+        looks_at = getattr(expression, "op", None) in {"getitem", "static_getitem"}
+        return not looks_at or any(map(_has_array, signature.args[1:]))
+
+    def _is_plain(self, kind: Any) -> bool:
+        """Whether there are no references to count in it."""
+        return not self.context.data_model_manager[kind].contains_nrt_meminfo()
 
     def lower_assign(self, ty: Any, inst: Any) -> Any:
         given = inst.value
-        if not (isinstance(given, numba_ir.Arg) and isinstance(ty, types.Array) and _is_plain(self.fndesc.restype)):
+        borrowed = isinstance(given, numba_ir.Arg) and isinstance(ty, types.Array)
+        if not (borrowed and self._is_plain(self.fndesc.restype)):
             return super().lower_assign(ty, inst)
         value = self.context.cast(self.builder, self.fnargs[given.index], self.typeof(f"arg.{given.name}"), ty)
         array = self.context.make_array(ty)(self.context, self.builder, value)
@@ -71,11 +74,21 @@ class OurLower(Lower):
         return array._getvalue()
 
 
-def _is_plain(kind: Any) -> bool:
-    """Whether there is no array in it."""
-    if isinstance(kind, types.Tuple | types.UniTuple):
-        return all(map(_is_plain, kind.types))
-    return kind == types.none or isinstance(kind, types.Number | types.Boolean)
+def _has_array(kind: Any) -> bool:
+    """An index that has one makes a copy of what it looks at."""
+    return isinstance(kind, types.Array) or any(map(_has_array, getattr(kind, "types", ())))
+
+
+_count = NRTContext._call_incref_decref
+
+
+def _count_owned(self: Any, builder: Any, typ: Any, value: Any, funcname: str) -> None:
+    """One more or one less, unless the function has only borrowed arrays."""
+    if not getattr(builder.module, "factorbus_borrows", False):
+        _count(self, builder, typ, value, funcname)
+
+
+NRTContext._call_incref_decref = _count_owned
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -110,11 +123,14 @@ class _KernelLibrary(JITCodeLibrary):
     def _optimize_final_module(self) -> None:
         """What the kernel calls is made its own first: nothing of another kernel is taken for it, whatever came before,
         and LLVM passes no argument that nobody reads.  An array is nine words of them, of which two or three are read.
+
+        Numba runs cheap passes before, to see the counting of references in one function; here hardly any is left.
         """
         for function in self._final_module.functions:
             if function.linkage == llvmlite.binding.Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = llvmlite.binding.Linkage.internal
-        super()._optimize_final_module()
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
 
     def _get_module_for_linking(self) -> Any:
         """What is kept on disk beside the machine code, to be linked by others: nobody does, so only the names."""
@@ -135,20 +151,6 @@ def _add_linked(linked: list[Any], library: Any) -> None:
         linked.append(one)
 
 
-class _Flags(Flags):
-    """Numba's flags, compared in a tenth of the time: it looks all functions up by the flags they are called with."""
-
-    __slots__ = ()
-    _defaults = Flags().values()
-    _hash = hash(Flags())
-
-    def values(self) -> dict[str, Any]:
-        return {**self._defaults, **self._values}
-
-    def __hash__(self) -> int:
-        return self._hash  # of the names alone, as numba has it
-
-
 class _Compiler(Compiler):
     """Numba's own compiler, with our lowering."""
 
@@ -157,6 +159,7 @@ class _Compiler(Compiler):
     def define_pipelines(self) -> list[Any]:
         pipelines = super().define_pipelines()
         for pipeline in pipelines:
+            keep_needed(pipeline)
             pipeline.passes = [(self.lowering if one is NativeLowering else one, why) for one, why in pipeline.passes]
             pipeline.finalize()
         return pipelines
@@ -171,7 +174,7 @@ class KernelCompiler(_Compiler):
         if library is None:
             library = _KernelLibrary(targetctx.codegen(), "kernel")
             library.enable_object_caching()
-        ours: Any = _Flags(flags)
+        ours: Any = QuickFlags(flags)
         ours.no_cfunc_wrapper = True  # nobody calls it from C
         super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
 
@@ -199,4 +202,4 @@ class PartCompiler(_Compiler):
         self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
     ) -> None:
         library = library or _PartLibrary(targetctx.codegen(), "part")
-        super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), names)
+        super().__init__(typingctx, targetctx, library, args, return_type, QuickFlags(flags), names)

@@ -51,14 +51,6 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
     return chi2
 
 
-@kernel(
-    "void(int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[:,::1], float64[:,::1])"
-)
-def evaluate_one(f: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, A: F64, B: F64) -> None:
-    """Residual and Jacobians of factor `f` alone: r (7,), A and B (6, 6), upper left corners filled."""
-    evaluate_apart(f, var, fac, values, payload, r, A, B)
-
-
 @part
 def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
     """`evaluate`, compiled apart: for kernels that have more to do than this."""
