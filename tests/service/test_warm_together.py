@@ -1,5 +1,6 @@
 """A cold start shares the kernels out among processes."""
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
@@ -66,3 +67,19 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
     assert {tuple(command[:3]) for command in asked} == {(sys.executable, "-m", "factorbus.service.warm")}
     assert together.compiled_seconds() > before, "who waits for them says so"
+
+
+@pytest.mark.parametrize(("gigabytes", "collects"), [(7, True), (8, False)])
+def test_memory_is_spent_to_save_time_where_each_process_has_plenty(
+    monkeypatch: pytest.MonkeyPatch, gigabytes: int, collects: bool
+) -> None:
+    monkeypatch.setattr(together, "_cores", lambda: 2)
+    monkeypatch.setattr(together, "available", lambda: gigabytes << 30)
+    before = gc.get_threshold()
+    try:
+        together._look_less()
+        assert gc.isenabled() == collects
+        assert (gc.get_threshold() > before) == collects
+    finally:
+        gc.enable()
+        gc.set_threshold(*before)

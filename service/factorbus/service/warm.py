@@ -22,11 +22,13 @@ from factorbus import solver
 from factorbus.idp import kernels as idp_kernels
 from factorbus.idp import warm as warm_idp
 from factorbus.service import kernels
+from factorbus.service.memory import available
 from factorbus.service.shares import Shares, functions_of
 from factorbus.solver.warm import iter_compile, list_missing
 
 _FEW = 4  # kernels that are worth another process
 _MOST = 8  # processes: compiling takes half a gigabyte of memory each
+_PLENTY = 4 << 30  # for each of them: where nothing of what the compiler drops is looked for, it takes 1.3 gigabytes
 # Numba colours the messages of the attempts that it gives up: a twentieth of the time.
 _PLAIN_MESSAGES = {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
 _apart: list[float] = []  # seconds of waiting for them
@@ -73,12 +75,20 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
 
 def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
-    gc.set_threshold(20_000, 20, 1000)  # looking for what the compiler has dropped took a tenth of the time
+    _look_less()
     kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in _list_missing()}
     for name in Shares(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
         progress(kernels[name].__name__)
         for _ in iter_compile(kernels[name]):
             pass
+
+
+def _look_less() -> None:
+    """Python looks for what the compiler has dropped a tenth of the time; rarely, half of that; or not at all."""
+    if available() >= _PLENTY * min(_cores(), _MOST):
+        gc.disable()
+    else:
+        gc.set_threshold(20_000, 20, 1000)
 
 
 def _tell(name: str) -> None:

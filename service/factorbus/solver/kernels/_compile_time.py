@@ -3,7 +3,8 @@
 import functools
 from typing import Any
 
-from numba.core import ir, types
+from llvmlite.ir import instructions
+from numba.core import base, ir, types
 from numba.core.compiler import Flags
 from numba.core.compiler_machinery import PassManager
 from numba.np import arrayobj
@@ -96,3 +97,17 @@ def _list_variables(self: Any, val: Any) -> list[ir.Var]:
 
 _WITHOUT_VARIABLES = {ir.Loc, str, int, type(None)}
 ir.Inst._rec_list_vars = _list_variables
+
+# Whether a function takes a `loc` is asked anew for each use of it.
+base._has_loc = functools.lru_cache(1024)(base._has_loc)
+
+
+def _take_number(self: Any, name: str) -> None:
+    """What an instruction is called in the text that LLVM reads: a number of its own within its function, where
+    llvmlite looks for a name that is free and like the one it is given."""
+    numbers = self.parent.scope._basenamemap
+    numbers["="] += 1
+    self._name = f"={numbers['=']}"  # no other name begins so
+
+
+instructions.Instruction._set_name = _take_number

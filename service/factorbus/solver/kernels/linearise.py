@@ -44,8 +44,6 @@ def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F
         elif kind == at.LANDMARK_SE3 or kind == at.PRIOR_POINT3:
             first_size = 6 if kind == at.LANDMARK_SE3 else 3
             chi2 += add_factor(3, first_size, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
-        elif kind == at.PRIOR_POINT2:
-            chi2 += add_factor(2, 2, 2, f, var, fac, payload[p + 2 :], r, H, W, data, eta)
         else:
             chi2 += add_other(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
     return chi2
