@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
@@ -260,6 +260,7 @@ def test_relative_to_a_point_is_refused() -> None:
 
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
+@example(seed=111)  # a point so near that what little is left to solve would move linearisation points off the estimate
 def test_why_a_factor(seed: int) -> None:
     """χ² without a factor, and how much of it is known from it, by solving without it."""
     solver = solved(seed, "all-batch", steps=4)

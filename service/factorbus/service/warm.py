@@ -84,7 +84,8 @@ def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
 
 
 def _look_less() -> None:
-    """Python looks for what the compiler has dropped a tenth of the time; rarely, half of that; or not at all."""
+    """To look for what the compiler has dropped takes a tenth of the time; done rarely, half of that.  Where there is
+    memory for all of it, it is not done."""
     if available() >= _PLENTY * min(_cores(), _MOST):
         gc.disable()
     else:

@@ -63,8 +63,9 @@ def factored_anew(graph: Graph) -> Factored:
     """The same for a graph that is solved in another way: factorised here at its values.  Raises Underconstrained."""
     copy = graph.copied()
     values = copy.values.copy()
-    # The graph is solved, so all of it is held; and the linearisation points are the estimate.
-    tree = Tree(copy, Options(mode="tree", place_new=False))
+    # The graph is solved, so all of it is held; and the linearisation points are the estimate.  They stay there, in one
+    # round, wherever what is left of the gradient leads.
+    tree = Tree(copy, Options(mode="tree", place_new=False, rounds=1))
     if tree.step(sure=True) == tl.FAILED:
         key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
         raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")

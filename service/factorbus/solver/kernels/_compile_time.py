@@ -69,7 +69,7 @@ def _array_struct(kind: Any) -> Any:
     """How an array lies in memory: one class for each kind, where Numba makes one for every use of an array, and asks
     for the `__array__` of what is an array already."""
     found = _find_array_struct(kind)
-    if type(kind) is types.Array and "_make_refs" in vars(found):
+    if type(kind) is types.Array and "_make_refs" in vars(found):  # else a copy of this file has done it
         del found._make_refs
     return found
 
