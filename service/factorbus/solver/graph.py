@@ -21,12 +21,13 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.move import gather, label_of
-from factorbus.solver.rows import Rows
+from factorbus.solver.rows import Rows, Span
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 Mark: TypeAlias = tuple[int, ...]
 
 _MUCH = 4096  # rows
+_NO_KEYS: I64 = np.empty(0, np.int64)
 
 
 class Graph(Arenas):
@@ -63,7 +64,8 @@ class Graph(Arenas):
         """Go back to `mark`."""
         remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.counts[:] = mark
-        self._rows.forget(mark[at.VARIABLES])
+        if self._rows.forget(mark[at.VARIABLES]):
+            self.keys = self.keys.copy()  # somebody may have an estimate of what is gone, and its keys
 
     def copied(self) -> "Graph":
         """The same graph with arrays of its own, as large as what is in use."""
@@ -136,18 +138,24 @@ class Graph(Arenas):
         return int(find_variable(key, self.table, self.keys))
 
     def variables(self, picked: I64 | None = None) -> list[Group]:
-        """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness."""
+        """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness.
+
+        Of all variables, keys and the values of fixed ones are read-only: they may have been given before.
+        """
         if picked is None:
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
             keys, values = self.keys, self.values
-            return [
-                span.group(keys, values) if span.together else self._gathered(span.label, span.rows()) for span in spans
-            ]
+            return [span.group(keys, values) if span.together else self._scattered(span) for span in spans]
         if (label := label_of(picked, self.places())) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
         return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
+
+    def _scattered(self, span: Span) -> Group:
+        values = np.empty((span.count, span.size))
+        gather(span.rows(), self.places(), _NO_KEYS, values)
+        return Group(span.kind, span.keys_apart(self.keys), values, span.fixed)
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]

@@ -25,7 +25,7 @@ class Span:
     """
 
     __slots__ = (
-        "_keys", "_keys_seen", "_rows", "_values", "_values_seen",
+        "_apart", "_held", "_keys", "_keys_seen", "_known", "_rows", "_values", "_values_seen",
         "behind", "count", "first", "fixed", "kind", "label", "size", "start", "together",
     )  # fmt: skip
 
@@ -36,23 +36,45 @@ class Span:
         self._rows: I64 = np.empty(0, np.int64)  # not while together
         self._keys, self._keys_seen = _NO_KEYS, _NO_KEYS
         self._values, self._values_seen = _NO_VALUES, _NO_VALUES
+        self._held: Group | None = None  # of fixed ones, whose values stay
+        self._apart, self._known = _NO_KEYS, 0  # keys of the first so many, of those that are not together
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
         """For copies: their arenas are others."""
         own = {name: getattr(self, name) for name in self.__slots__}
-        return None, own | {"_keys_seen": _NO_KEYS, "_values_seen": _NO_VALUES}
+        return None, own | {"_keys_seen": _NO_KEYS, "_values_seen": _NO_VALUES, "_held": None}
 
     def group(self, keys: I64, values: F64) -> Group:
-        """Copies of their keys and values, while they are together: then no others are between them."""
+        """Their keys and a copy of their values, while they are together: then no others are between them.
+
+        What never changes, keys and the values of fixed variables, may have been given before, and is read-only.
+        """
         if self._keys_seen is not keys or self._values_seen is not values:
             self._look_at(keys, values)
+        if self._held:
+            return self._held
         count = self.count
         # By no call that Python would have to bind the fields for: a robot asks for this after every step.
-        return _new(Group, (self.kind, self._keys[:count].copy(), self._values[:count].copy(), self.fixed))
+        group = _new(Group, (self.kind, self._keys[:count], self._values[:count].copy(), self.fixed))
+        if self.fixed:
+            group.values.flags.writeable = False
+            self._held = group
+        return group
+
+    def keys_apart(self, keys: I64) -> I64:
+        """Their keys where they are not together, read-only."""
+        if self._known < self.count:
+            more = keys[self._rows[self._known : self.count]]
+            self._apart = _behind_each_other(self._apart, self._apart[: self._known], more)
+            self._known = self.count
+        lent = self._apart[: self.count]
+        lent.flags.writeable = False
+        return lent
 
     def _look_at(self, keys: I64, values: F64) -> None:
         """Remember these arenas from the first of them on: to shape them takes as long as to copy a hundred values."""
-        self._keys, self._keys_seen = keys[self.first :], keys
+        self._keys, self._keys_seen, self._held = keys[self.first :], keys, None
+        self._keys.flags.writeable = False
         whole = (values.size - self.start) // self.size * self.size
         self._values, self._values_seen = values[self.start : self.start + whole].reshape(-1, self.size), values
 
@@ -62,6 +84,7 @@ class Span:
 
     def extend(self, found: I64) -> None:
         """More of them, ascending, behind all others; one at least."""
+        self._held = None
         last = int(found[-1]) + 1
         if self.together and last - self.behind == found.size:
             self.count += found.size
@@ -74,8 +97,11 @@ class Span:
     def forget(self, variables: int) -> None:
         """Only those below `variables` are left."""
         if variables < self.behind:
+            self._held = None
             left = self.rows()
             self.count = int(np.searchsorted(left, variables))
+            if self._known > self.count:  # what is behind them may have been given to somebody
+                self._apart, self._known = self._apart[: self.count].copy(), self.count
             self.behind = int(left[self.count - 1]) + 1 if self.count else self.first
 
 
@@ -86,13 +112,15 @@ class Rows:
         self._spans: dict[int, Span] = {}
         self._seen = 0
 
-    def forget(self, variables: int) -> None:
-        """The graph has no more than `variables` now."""
-        if variables < self._seen:
-            self._seen = variables
-            for span in self._spans.values():
-                span.forget(variables)
-            self._spans = {label: span for label, span in self._spans.items() if span.count}
+    def forget(self, variables: int) -> bool:
+        """The graph has no more than `variables` now.  Gives whether it was followed further."""
+        if variables >= self._seen:
+            return False
+        self._seen = variables
+        for span in self._spans.values():
+            span.forget(variables)
+        self._spans = {label: span for label, span in self._spans.items() if span.count}
+        return True
 
     def follow(self, var: I64, variables: int) -> Iterable[Span]:
         """All that the graph has, which is `variables` rows of `var`; labels ascend."""
@@ -107,7 +135,7 @@ class Rows:
                 row = var[v].tolist()
                 label = 2 * row[_KIND] + (row[_COLUMN] < 0)
                 span = self._spans.get(label) or self._span(label, row, v)
-                if span.together and v == span.behind:
+                if span.together and v == span.behind and not span.fixed:
                     span.behind = v + 1
                     span.count += 1
                 else:

@@ -150,7 +150,10 @@ class Solver:
         return report
 
     def estimate(self) -> list[Group]:
-        """A copy of all values: per kind, in insertion order, fixed variables in groups of their own."""
+        """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.
+
+        What never changes, keys and the values of fixed variables, is read-only: estimates may have it in common.
+        """
         return self._graph.variables()
 
     def changed(self) -> list[Group]:

@@ -70,7 +70,7 @@ def label_of(picked: I64, graph: I64) -> int:
 def gather(picked: I64, graph: I64, out_keys: I64, out_values: F64) -> None:
     """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
 
-    graph: the table of its arenas (`places`).
+    graph: the table of its arenas (`places`).  Without room in out_keys only the values.
     """
     var, keys, values = int_rows(graph, at.T_VAR), ints(graph, at.T_KEYS), floats(graph, at.T_VALUES)
     size, out = out_values.shape[1], out_values.reshape(-1)
@@ -80,7 +80,7 @@ def gather(picked: I64, graph: I64, out_keys: I64, out_values: F64) -> None:
         while n + run < picked.size and picked[n + run] == v + run:
             run += 1
         x = var[v, at.V_AT]
-        for k in range(run):
+        for k in range(run if out_keys.size > 0 else 0):
             out_keys[n + k] = keys[v + k]
         for c in range(run * size):
             out[n * size + c] = values[x + c]
