@@ -90,8 +90,10 @@ def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None
     held = solver.estimate()
     before = bits(held)
     for group in held:
-        group.values[...] = np.nan
-        group.keys[...] = -7
+        assert group.values.flags.writeable != group.fixed
+        assert not group.keys.flags.writeable
+        if not group.fixed:
+            group.values[...] = np.nan
     assert bits(solver.estimate()) == before
     solver.stage(second)
     assert bits(solver.estimate()) != before

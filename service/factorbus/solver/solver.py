@@ -232,8 +232,8 @@ class Solver:
 
         variables, factors: no more than the first so many.
         """
-        picked = None if variables is None else np.arange(min(variables, self.variable_count))
-        return self._graph.variables(picked), self._graph.factors(factors, find_apart(self._graph))
+        count = self.variable_count if variables is None else min(variables, self.variable_count)
+        return self._graph.variables(np.arange(count)), self._graph.factors(factors, find_apart(self._graph))
 
     def content(self) -> Graph:
         """A copy of everything, as of the last step, for computations elsewhere."""
