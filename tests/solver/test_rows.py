@@ -97,7 +97,7 @@ def test_keys_that_were_given_stay_when_what_had_them_is_refused(between: bool) 
         assert not any(group.keys.flags.writeable for group in given)
 
 
-def test_an_estimate_is_nobody_elses() -> None:
+def test_what_is_done_to_an_estimate_is_not_in_the_next() -> None:
     solver = Solver()
     solver.stage(posed(0, 1, fixed=True))
     solver.stage(posed(1, 5))
@@ -112,3 +112,4 @@ def test_an_estimate_is_nobody_elses() -> None:
     held = next(group for group in solver.estimate() if group.fixed)
     assert held.keys.tolist() == [0, 6, 7]
     assert held.values[:, 0].tolist() == [0.1, 6.1, 7.1]
+    assert not held.values.flags.writeable

@@ -155,6 +155,7 @@ class Graph(Arenas):
     def _scattered(self, span: Span) -> Group:
         values = np.empty((span.count, span.size))
         gather(span.rows(), self.places(), _NO_KEYS, values)
+        values.flags.writeable = not span.fixed  # as where they are together
         return Group(span.kind, span.keys_apart(self.keys), values, span.fixed)
 
     def _gathered(self, label: int, rows: I64) -> Group:

@@ -113,7 +113,7 @@ class Rows:
         self._seen = 0
 
     def forget(self, variables: int) -> bool:
-        """The graph has no more than `variables` now.  Gives whether it was followed further."""
+        """The graph has no more than `variables` now.  Gives whether it was followed further, and keys given of it."""
         if variables >= self._seen:
             return False
         self._seen = variables
@@ -135,7 +135,7 @@ class Rows:
                 row = var[v].tolist()
                 label = 2 * row[_KIND] + (row[_COLUMN] < 0)
                 span = self._spans.get(label) or self._span(label, row, v)
-                if span.together and v == span.behind and not span.fixed:
+                if span.together and v == span.behind and not span.fixed:  # `extend`, in a robot's usual step
                     span.behind = v + 1
                     span.count += 1
                 else:
