@@ -8,7 +8,16 @@ from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_store import FOLLOWING, SIZE, give_numbers, join_free, take_numbers
+from factorbus.solver.kernels.tree_store import (
+    AHEAD,
+    FOLLOWING,
+    PAGE,
+    SIZE,
+    give_numbers,
+    join_free,
+    take_numbers,
+    write_ahead,
+)
 from factorbus.solver.tree import Tree
 
 ROOM = 1 << 16
@@ -99,3 +108,46 @@ def test_what_a_drive_leaves_free_is_used_again() -> None:
     assert most < 2.1
     kept = solver.dump()["_tree"]["_tree"]["numbers"]
     assert kept.size == tree.state[tl.S_NUMBERS] < tree.numbers.size
+
+
+def test_pages_ahead_are_written_to_a_few_at_a_time() -> None:
+    numbers, state = np.full(8 * AHEAD * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
+    state[tl.S_NUMBERS] = fr.SCRATCH
+    start, size = take_numbers(2 * AHEAD * PAGE, numbers, state)
+    end = start + size
+    for steps in (1, 2):
+        write_ahead(numbers, state)
+        assert np.array_equal(np.flatnonzero(numbers == 0.0), end + PAGE * np.arange(steps * AHEAD))
+    for _ in range(3):
+        write_ahead(numbers, state)
+    written = np.flatnonzero(numbers == 0.0)
+    assert 2 * end - PAGE <= written[-1] < 2 * end  # as much again as the cliques have
+
+
+def test_no_pages_ahead_where_as_much_is_free() -> None:
+    numbers, state = np.full(8 * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
+    state[tl.S_NUMBERS] = fr.SCRATCH
+    first = take_numbers(PAGE, numbers, state)
+    take_numbers(PAGE // 2, numbers, state)
+    give_numbers(*first, numbers, state)
+    before = np.isnan(numbers[state[tl.S_NUMBERS] :]).sum()
+    write_ahead(numbers, state)
+    assert np.isnan(numbers[state[tl.S_NUMBERS] :]).sum() == before
+
+
+def test_pages_ahead_end_with_the_arena() -> None:
+    numbers, state = np.full(5 * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
+    state[tl.S_NUMBERS] = 3 * PAGE
+    write_ahead(numbers, state)
+    assert np.array_equal(np.flatnonzero(numbers == 0.0), [3 * PAGE, 4 * PAGE])
+
+
+def test_a_drive_has_its_pages_before_it_needs_them() -> None:
+    solver = Solver(Options())
+    assert solver._tree
+    tree = solver._tree.tree
+    for step in manhattan(1500, 3):
+        solver.stage(step.batch)
+        solver.step()
+    cliques = int(tree.state[tl.S_NUMBERS] - tree.state[tl.S_IDLE])
+    assert tree.state[tl.S_FRESH] >= min(2 * cliques, tree.numbers.size)

@@ -53,7 +53,7 @@ class Tree(Arenas):
         self.motions: F64 = lines(256 * tl.M_WIDTH, np.float64)
         self.lists: I64 = np.empty(4096, np.int64)
         self.numbers: F64 = pages.zeros(16384)
-        self.hessian: F64 = np.empty(16384)
+        self.hessian: F64 = pages.zeros(16384)
         self.lin: F64 = np.empty((3, 1024))
         self.scalars: F64 = np.zeros((3, 1024))
         self.stiff: F64 = lines((512, tl.B_WIDTH), np.float64)
@@ -133,6 +133,7 @@ class Tree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
+            state[tl.S_FRESH] = min(int(state[tl.S_FRESH]), self.numbers.size)  # of a copy it may be more
             pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 
@@ -152,7 +153,7 @@ class Tree(Arenas):
             self.scalars = _widened(self.scalars, counts[at.SCALARS])
         new = factors - int(self.state[tl.S_FACTORS])
         if (need := int(self.state[tl.S_HESSIAN]) + new * HESSIAN) > self.hessian.size:
-            self.hessian = grown(self.hessian, need)
+            pages.enlarge(self, "hessian", roomy(need, self.hessian.size))
         if 2 * new > len(self.saved):
             self.saved = np.empty((4 * new, 8))
 

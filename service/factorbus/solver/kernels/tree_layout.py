@@ -167,7 +167,8 @@ S_IDLE = 48  # doubles of free blocks of `numbers`,
 S_GIVEN = 49  # of those given back since they were joined,
 S_LARGEST = 50  # and no class above this one has any
 S_RELINEARISING = 51  # flops of the last elimination that relinearised
-S_FREE = 52  # heads of free lists: numbers, then lists
+S_FRESH = 52  # doubles of `numbers` behind which nothing was ever written
+S_FREE = 53  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

@@ -48,10 +48,12 @@ from factorbus.solver.kernels.tree_renew import (
     still_renewed,
 )
 from factorbus.solver.kernels.tree_solve import substitute
+from factorbus.solver.kernels.tree_store import write_ahead
 from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factors, take_in_variables, take_out
 
 FREE = 0
 LEAST_CHI2 = 1e-2
+LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
 
 
@@ -130,6 +132,8 @@ def tree_step(graph: I64, tree: I64) -> int:
             break
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
+    if state[tl.S_FLOPS] < LIGHT:
+        write_ahead(numbers, state)
     return tl.DONE
 
 

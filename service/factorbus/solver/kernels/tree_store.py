@@ -16,6 +16,8 @@ from factorbus.solver.kernels.ascending import sort
 
 UNIT = 8  # doubles: a cache line
 FOLLOWING, SIZE = 0, 1  # entries of a free block
+PAGE = 512  # doubles in the smallest page that there is
+AHEAD = 64  # pages that are written to in a step before they are needed
 
 
 @inline_kernel
@@ -42,6 +44,21 @@ def size_below(size: int) -> int:
         units >>= 1
         shift += 1
     return 8 * shift + units
+
+
+@inline_kernel
+def write_ahead(numbers: F64, state: I64) -> None:
+    """Write to some pages that the longest steps will need, which have the old cliques and the new ones side by side.
+
+    For the first write to a page the system has to find and clear it, which it does here a few pages at a time.
+    """
+    end = state[tl.S_NUMBERS]
+    fresh = max(state[tl.S_FRESH], end)
+    goal = min(2 * (end - state[tl.S_IDLE]), numbers.size, fresh + AHEAD * PAGE)
+    while fresh < goal:
+        numbers[fresh] = 0.0
+        fresh += PAGE
+    state[tl.S_FRESH] = fresh
 
 
 @part
