@@ -3,14 +3,15 @@ hundreds of steps, and for that long there are two of it.
 """
 
 import mmap
+from contextlib import suppress
 
 import numpy as np
 
 from factorbus.solver.kernels._jit import F64
 
-_DOUBLE, _LINE, _HUGE_PAGE = 8, 64, 2 << 20  # bytes
+_DOUBLE, _LINE = 8, 64  # bytes
 _PRIVATE = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS  # pages that are shared cannot grow
-_HUGE = getattr(mmap, "MADV_HUGEPAGE", None)
+_SMALL = getattr(mmap, "MADV_NOHUGEPAGE", None)
 _NOTHING = np.empty(0)
 
 
@@ -45,13 +46,7 @@ def enlarge(owner: object, name: str, size: int) -> None:
 
 
 def _bytes(size: int) -> int:
-    """Of the pages for so many doubles: huge ones from the first size on that may have them.
-
-    Linux then puts them where huge pages can lie (from 6.7 on); with a line more they were moved to where they can't,
-    and fresh memory took five times as long: a third of the time of the longest steps of sphere2500.
-    """
-    size = _DOUBLE * size + _LINE
-    return size if size < _HUGE_PAGE else -(-size // _HUGE_PAGE) * _HUGE_PAGE
+    return _DOUBLE * size + _LINE
 
 
 def _pages_of(array: F64) -> mmap.mmap | None:
@@ -60,6 +55,8 @@ def _pages_of(array: F64) -> mmap.mmap | None:
 
 
 def _seen(pages: mmap.mmap, size: int) -> F64:
-    if _HUGE is not None:
-        pages.madvise(_HUGE)
+    """Small pages, which a step can write to a few of: `kernels/tree_store.py`."""
+    if _SMALL is not None:
+        with suppress(OSError):  # a system that has no huge ones
+            pages.madvise(_SMALL)
     return np.frombuffer(pages, np.float64, size)

@@ -17,7 +17,7 @@ from factorbus.solver.kernels.ascending import sort
 UNIT = 8  # doubles: a cache line
 FOLLOWING, SIZE = 0, 1  # entries of a free block
 PAGE = 512  # doubles in the smallest page that there is
-AHEAD = 64  # pages that are written to in a step before they are needed
+AHEAD = 64  # pages that a step writes to before they are needed, and one more for so many that are missing
 
 
 @inline_kernel
@@ -54,10 +54,11 @@ def write_ahead(numbers: F64, state: I64) -> None:
     """
     end = state[tl.S_NUMBERS]
     fresh = max(state[tl.S_FRESH], end)
-    goal = min(2 * (end - state[tl.S_IDLE]), numbers.size, fresh + AHEAD * PAGE)
-    while fresh < goal:
-        numbers[fresh] = 0.0
-        fresh += PAGE
+    missing = (min(2 * (end - state[tl.S_IDLE]), numbers.size) - fresh) // PAGE
+    if missing >= AHEAD:
+        for _ in range(min(missing, AHEAD + missing // AHEAD)):
+            numbers[fresh] = 0.0
+            fresh += PAGE
     state[tl.S_FRESH] = fresh
 
 
