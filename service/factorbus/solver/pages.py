@@ -9,9 +9,9 @@ import numpy as np
 
 from factorbus.solver.kernels._jit import F64
 
-_DOUBLE, _LINE = 8, 64  # bytes
+_DOUBLE, _LINE, _HUGE_PAGE, _LARGE = 8, 64, 2 << 20, 512 << 20  # bytes
 _PRIVATE = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS  # pages that are shared cannot grow
-_SMALL = getattr(mmap, "MADV_NOHUGEPAGE", None)
+_SMALL, _HUGE = getattr(mmap, "MADV_NOHUGEPAGE", None), getattr(mmap, "MADV_HUGEPAGE", None)
 _NOTHING = np.empty(0)
 
 
@@ -46,7 +46,9 @@ def enlarge(owner: object, name: str, size: int) -> None:
 
 
 def _bytes(size: int) -> int:
-    return _DOUBLE * size + _LINE
+    """Of the pages for so many doubles: whole huge ones where it has those, and Linux puts it where they can lie."""
+    size = _DOUBLE * size + _LINE
+    return size if size < _LARGE else -(-size // _HUGE_PAGE) * _HUGE_PAGE
 
 
 def _pages_of(array: F64) -> mmap.mmap | None:
@@ -55,8 +57,9 @@ def _pages_of(array: F64) -> mmap.mmap | None:
 
 
 def _seen(pages: mmap.mmap, size: int) -> F64:
-    """Small pages, which a step can write to a few of: `kernels/tree_store.py`."""
-    if _SMALL is not None:
+    """A step can write to a few small pages (`kernels/tree_store.py`); what is large is found sooner in huge ones."""
+    advice = _SMALL if len(pages) < _LARGE else _HUGE
+    if advice is not None:
         with suppress(OSError):  # a system that has no huge ones
-            pages.madvise(_SMALL)
+            pages.madvise(advice)
     return np.frombuffer(pages, np.float64, size)
