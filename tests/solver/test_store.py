@@ -4,10 +4,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_step import LIGHT
 from factorbus.solver.kernels.tree_store import (
     AHEAD,
     FOLLOWING,
@@ -154,3 +156,38 @@ def test_a_drive_has_its_pages_before_it_needs_them() -> None:
         solver.step()
     cliques = int(tree.state[tl.S_NUMBERS] - tree.state[tl.S_IDLE])
     assert tree.state[tl.S_FRESH] > min(2 * cliques, tree.numbers.size) - AHEAD * PAGE
+
+
+def test_a_step_of_many_flops_has_no_time_for_pages() -> None:
+    solver = Solver(Options())
+    assert solver._tree
+    state = solver._tree.tree.state
+    for step in manhattan(3000, 3):
+        solver.stage(step.batch)
+    assert solver.step(settle=True).flops >= LIGHT
+    assert state[tl.S_FRESH] == 0
+    solver.stage(known_pose(-1))
+    assert solver.step().flops < LIGHT
+    assert state[tl.S_FRESH] >= state[tl.S_NUMBERS]
+
+
+def test_what_only_the_original_has_written_to_is_written_to_again() -> None:
+    solver, copied = Solver(Options()), Solver(Options())
+    for step in manhattan(1500, 3):
+        solver.stage(step.batch)
+        solver.step()
+    copied.load(solver.dump())
+    assert copied._tree
+    tree = copied._tree.tree
+    had, pose = tree.numbers.size, 0
+    assert tree.state[tl.S_FRESH] > had + 2 * AHEAD * PAGE
+    while tree.numbers.size == had:
+        pose -= 1
+        copied.stage(known_pose(pose))
+        copied.step()
+    assert tree.state[tl.S_FRESH] < max(had, tree.state[tl.S_NUMBERS]) + 2 * AHEAD * PAGE
+
+
+def known_pose(key: int) -> Batch:
+    prior = Factors("prior_se2", np.array([[key]]), np.zeros((1, 3)), np.eye(3)[np.triu_indices(3)][None])
+    return Batch((Variables("se2", np.array([key]), np.zeros((1, 3))),), (prior,))

@@ -137,6 +137,11 @@ class Folder:
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 
+    def rehearse(self) -> None:
+        """Between folds, once what came of the last one is told: the next step finds in the caches what it needs."""
+        if not self._broken:
+            self._solver.rehearse()
+
     def fold_again(self, inserts: Sequence[Arrived], rebuilt: bool) -> Iterator[Judged | Stepped]:
         """Fold in what was folded in together before: no limit that has been set since refuses it.
 

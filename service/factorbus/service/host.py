@@ -224,6 +224,7 @@ class Host:
                 self._send_both(answered, events.answer, events.delta)
             else:
                 tell([Answer(answered, events.answer), Publish("delta", events.delta)])
+            self._folder.rehearse()
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:
@@ -239,6 +240,8 @@ class Host:
         """What comes of a Run, step by step."""
         effects: list[Effect] = []
         for event in events:
+            if isinstance(event, Folded):
+                self._folder.rehearse()
             with self._lock:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
@@ -265,6 +268,7 @@ class Host:
         if run.inserts and (keeper.wants_snapshot() or any(isinstance(e, Stepped) and e.rebuilt for e in events)):
             started = time.perf_counter()
             keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
+        self._folder.rehearse()
         with self._lock:
             effects = self.core.folded(folded)
         self._perform(effects)

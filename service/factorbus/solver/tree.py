@@ -18,6 +18,8 @@ from factorbus.solver.kernels.tree_step import tree_step
 from factorbus.solver.options import Options
 
 _FEW = 8  # new variables for which good first values are looked for
+# What tells of the blocks of `numbers`.
+_BLOCKS = np.array([tl.S_NUMBERS, tl.S_IDLE, tl.S_GIVEN, tl.S_LARGEST, *range(tl.S_FREE, tl.S_FREE + tl.CLASSES)])
 
 
 class Tree(Arenas):
@@ -80,6 +82,18 @@ class Tree(Arenas):
         while (status := tree_step(self._graph.places(), self.places())) == tl.NO_ROOM:
             self._make_room()
         return status
+
+    def rehearse(self) -> None:
+        """Go through a step for what is new in the graph, up to where the tree would change; the graph is to forget it.
+
+        Relinearises nothing, makes no room, and has its blocks behind all others, so that it leaves none in pieces.
+        """
+        state, blocks = self.state, self.state[_BLOCKS]
+        state[[tl.S_REHEARSES, tl.S_WAIT]] = 1
+        state[[tl.S_LARGEST, tl.S_GIVEN]] = -1, 0  # nothing is free, or worth joining
+        tree_step(self._graph.places(), self.places())
+        state[_BLOCKS] = blocks
+        state[[tl.S_REHEARSES, tl.S_WAIT]] = 0
 
     @property
     def failed(self) -> int:
