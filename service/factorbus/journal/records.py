@@ -32,7 +32,8 @@ class Fold(NamedTuple):
     """Inserts that went to the solver together, in this order, and the revision that came of it.
 
     number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
-    ever changed, up to here
+    ever changed, up to here   reordered: another solver took its place, made in a fresh order of what there was after
+    this fold, and given all since; with no inserts of its own.  None: not so
     """
 
     number: int
@@ -40,6 +41,7 @@ class Fold(NamedTuple):
     rebuilt: bool
     chain: bytes
     entries: tuple[Entry, ...]
+    reordered: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

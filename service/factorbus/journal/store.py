@@ -30,6 +30,7 @@ _SYNCHRONOUS = {"none": "OFF", "group": "FULL", "commit": "FULL"}
 _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
+-- rebuilt: 0, 1, or the negative of a fold: the solver was replaced by one that was ordered anew after that one
 CREATE TABLE fold (
     number INTEGER PRIMARY KEY, revision INTEGER NOT NULL, rebuilt INTEGER NOT NULL, chain BLOB NOT NULL
 );
@@ -111,9 +112,19 @@ class Store:
                     row = entries.fetchone()
                 if row is not None and row[0] < number:
                     raise JournalDamaged(self.path, f"an insert of fold {row[0]} is out of order")
-                yield Fold(number, revision, bool(rebuilt), digest, tuple(taken))
+                yield Fold(number, revision, rebuilt > 0, digest, tuple(taken), -rebuilt if rebuilt < 0 else None)
             if row is not None:
                 raise JournalDamaged(self.path, f"an insert belongs to fold {row[0]}, which is missing")
+
+    def reordered(self, after: int = 0) -> dict[int, int]:
+        """Of solvers that were ordered anew: the fold after which each was made, and the one that it took its place in.
+
+        after: of those that took it later.  Raises JournalDamaged.
+        """
+        with self._reading():
+            return dict(
+                self._db.execute("SELECT -rebuilt, number FROM fold WHERE rebuilt < 0 AND number > ?", (after,))
+            )
 
     def senders(self, first_fold: int, clients: int, entries: int) -> list[Sender]:
         """The `clients` heard last, each with up to `entries` of its last inserts.
@@ -145,7 +156,7 @@ class Store:
         """Write `folds` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
         with self._writing():
             self._db.executemany(
-                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, f.rebuilt, f.chain) for f in folds]
+                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, _replaced(f), f.chain) for f in folds]
             )
             self._db.executemany(
                 f"INSERT INTO entry (fold, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -329,6 +340,11 @@ def what_reading_failed_with(path: Path, error: sqlite3.Error) -> JournalDamaged
     if (getattr(error, "sqlite_errorcode", 0) & 0xFF) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
         return JournalDamaged(path, str(error))
     return JournalUnreadable(path, str(error))
+
+
+def _replaced(fold: Fold) -> int:
+    """As the table has it."""
+    return int(fold.rebuilt) if fold.reordered is None else -fold.reordered
 
 
 def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:

@@ -84,6 +84,8 @@ class Config:
     durability: str = "commit"  # what an answer promises of it: none, group or commit
     group_s: float = 0.05  # durability group: written no later than this after the answer
     snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
+    # A map is ordered anew beside the steps where R has so many times the numbers of a fresh order; 0: never.
+    reorder: float = 1.15
     standby: bool = False  # wait until whoever owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
@@ -113,6 +115,8 @@ def checked(config: Config) -> Config:
     for name in ("job_deadline_s", "stuck_s", "group_s", "snapshot_s"):
         if getattr(config, name) <= 0:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
+    if config.reorder < 0:
+        raise BadConfig(f"reorder is {config.reorder}; wanted 0, for never, or a share such as 1.15")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
     if config.durability not in DURABILITIES:

@@ -82,7 +82,8 @@ class Judged(NamedTuple):
 class Stepped(NamedTuple):
     """The solver made a step; the delta tells of it.
 
-    rebuilt: it brought back what had been accepted, in a new solver, after a fault.
+    rebuilt: it brought back what had been accepted, in a new solver, after a fault.  reordered: another solver took its
+    place, which was made of what there was after this fold, in a fresh order, and has been given all since.
     """
 
     revision: int
@@ -91,6 +92,7 @@ class Stepped(NamedTuple):
     chi2: float
     solver_ms: float
     rebuilt: bool = False
+    reordered: int | None = None
 
 
 class Folded(NamedTuple):

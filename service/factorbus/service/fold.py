@@ -125,7 +125,7 @@ class Folder:
 
     def _copied(self, room: int) -> Copied:
         """All of it, if another folder and what lies between them fit into so many bytes."""
-        size = _COPIES * self._solver.memory_bytes()
+        size = _COPIES * self.memory_bytes()
         return Copied(self.dump() if size <= room else None, size)
 
     def load(self, state: Mapping[str, Any] | None) -> None:
@@ -141,6 +141,55 @@ class Folder:
         """Between folds, once what came of the last one is told: the next step finds in the caches what it needs."""
         if not self._broken:
             self._solver.rehearse()
+
+    def content(self) -> dict[str, Any]:
+        """What a folder `beside` this one begins with, a copy.  Raises Broken."""
+        if self._broken:
+            raise Broken(self._broken)
+        return {"graph": self._solver.to_order_anew(), "revision": self._revision, "held": list(self._held)}
+
+    def beside(self, content: Mapping[str, Any]) -> "Folder":
+        """Another folder of the same map, where all of `content` is ordered anew; it is to be given what came since.
+
+        Takes as long as all of the map takes to eliminate, on any thread.  Raises SolverError.
+        """
+        made = Folder(self._make, self._epoch, self._limits, self._options)
+        made._account = made._solver.order_anew(content["graph"]).as_dict()
+        made._revision, made._held = int(content["revision"]), tuple(content["held"])
+        return made
+
+    def take_place(self, other: "Folder", after: int, because: str) -> Stepped:
+        """Go on with the solver of `other`, which has all that this one has: a step, whose delta has everything.
+
+        after: the fold that `other` began after.
+        """
+        started = time.perf_counter()
+        self._solver = other._solver
+        account = other._account | {
+            "strategy": "full", "because": because, "chi2": self.chi2(), "new_variables": 0, "new_factors": 0,
+            "changed": self._solver.variable_count,
+        }  # fmt: skip
+        everything = tuple(self._solver.estimate())
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(account)
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
+        told = account["strategy"], account["chi2"], account["solver_ms"]
+        return Stepped(self._revision, delta, *told, reordered=after)
+
+    @property
+    def nonzeros(self) -> int:
+        """Of R, as of the last step; 0: not known, or R is not kept from step to step."""
+        known = self._account.get("mode") == "tree" and not self._broken
+        return int(self._account.get("nnz_r", 0)) if known else 0
+
+    @property
+    def solver(self) -> Any:
+        """To see whether it was replaced."""
+        return self._solver
+
+    def memory_bytes(self) -> int:
+        """What its solver has in use."""
+        return int(self._solver.memory_bytes())
 
     def fold_again(self, inserts: Sequence[Arrived], rebuilt: bool) -> Iterator[Judged | Stepped]:
         """Fold in what was folded in together before: no limit that has been set since refuses it.

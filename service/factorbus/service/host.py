@@ -41,6 +41,7 @@ from factorbus.service.fold import Folder
 from factorbus.service.health import Pulse
 from factorbus.service.keeping import Events, Keeper, Keeping
 from factorbus.service.questions import Snapshot
+from factorbus.service.reordering import Reordering
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -68,8 +69,10 @@ class Host:
         seat: threading.Lock,
         send_both: SendBoth,
         keeping: Keeping | None = None,
+        reordering: Reordering | None = None,
     ) -> None:
         self.core = core
+        self._reordering = reordering
         self._keeper = keeping.keeper(self) if keeping else None
         self._keeping = keeping
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
@@ -217,14 +220,14 @@ class Host:
                 self._folder.fold_alone(run.inserts[0]) if len(run.inserts) == 1 else self._folder.fold(run.inserts)
             )
             if not isinstance(events, Alone):
-                self._tell(events, tell)
+                self._tell(run.inserts, events, tell)
                 return
             answered = events.insert.askers[0]
             if tell is self._send:
                 self._send_both(answered, events.answer, events.delta)
             else:
                 tell([Answer(answered, events.answer), Publish("delta", events.delta)])
-            self._folder.rehearse()
+            self._tidy(run.inserts, ())
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:
@@ -236,12 +239,15 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _tell(self, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
+    def _tell(self, inserts: Sequence[Arrived], events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
         """What comes of a Run, step by step."""
         effects: list[Effect] = []
+        came: list[Judged | Stepped] = []
         for event in events:
             if isinstance(event, Folded):
-                self._folder.rehearse()
+                self._tidy(inserts, came)
+            else:
+                came.append(event)
             with self._lock:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
@@ -265,13 +271,35 @@ class Host:
             with self._lock:
                 effects = self.core.kept(events, time.monotonic())
             tell(effects)
-        if run.inserts and (keeper.wants_snapshot() or any(isinstance(e, Stepped) and e.rebuilt for e in events)):
+        replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
+        replaced = self._tidy_kept(run.inserts, events, keeper) or replaced
+        busy = self._reordering is not None and self._reordering.busy
+        if replaced or (run.inserts and keeper.wants_snapshot() and not busy):
             started = time.perf_counter()
             keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
-        self._folder.rehearse()
         with self._lock:
             effects = self.core.folded(folded)
         self._perform(effects)
+
+    def _tidy(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped]) -> None:
+        """What is done when a Run is told and the solver is not free yet."""
+        if self._reordering is not None and (stepped := self._reordering.after(inserts, events, 0)) is not None:
+            with self._lock:
+                effects = self.core.stepped(stepped)
+            self._do(effects)
+        self._folder.rehearse()
+
+    def _tidy_kept(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], keeper: Keeper) -> bool:
+        """The same with a journal; gives whether another solver took the place."""
+        stepped = self._reordering.after(inserts, events, keeper.folds) if self._reordering is not None else None
+        if stepped is not None:
+            keeper.hand((), [stepped])
+            if not keeper.waits:
+                with self._lock:
+                    effects = self.core.kept([stepped], time.monotonic())
+                self._do(effects)
+        self._folder.rehearse()
+        return stepped is not None
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:

@@ -141,8 +141,8 @@ class Keeper:
         return problem
 
     def hand(self, inserts: Sequence[Arrived], events: Events) -> None:
-        """Write down that `inserts` were folded, and what came of it."""
-        if inserts:
+        """Write down that `inserts` were folded, and what came of it; of none, that another solver took the place."""
+        if inserts or events:
             self._number += 1
             self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
             self._items.put(_Folded(self._number, inserts, events))

@@ -27,6 +27,7 @@ from factorbus.service.lane import Lane
 from factorbus.service.library import Kept, Library, make_folder, restored
 from factorbus.service.memory import Memory, OutOfMemory
 from factorbus.service.questions import Copied, Question, Snapshot
+from factorbus.service.reordering import Reordering
 
 log = logging.getLogger(__name__)
 
@@ -192,7 +193,8 @@ class Maps:
             return {"options": options, **made.host.journal()}
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
-        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept)
+        reordering = Reordering(folder, self._config.reorder, self._memory.room, name)
+        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept, reordering)
         made = Owned(host, place, options)
         return made
 

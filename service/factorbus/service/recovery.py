@@ -2,10 +2,13 @@
 
 Folded again in the same groups by the same solver, the inserts give the same revisions to the bit; the chain of digests
 proves it.  A snapshot counts only for the solver that wrote it (`fingerprint`): another one begins at the beginning.
+
+A solver that was ordered anew beside the steps (`reordering.py`) is made again where it was, given the folds that it
+was given, and takes the place where it did.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from factorbus.journal import chain
@@ -35,8 +38,9 @@ def recover(store: Store, folder: Folder, fingerprint: str) -> Recovered:
     """Bring `folder` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
     begin = _from_snapshot(store, folder, fingerprint)
     last, same, folds = begin, True, 0
+    history = _History(store, folder, begin.fold)
     for fold in store.folds(begin.fold):
-        last = Last(fold.number, fold.revision, again(store, folder, fold, last.chain))
+        last = Last(fold.number, fold.revision, history.again(fold, last.chain))
         if same and last.chain != fold.chain:
             log.warning("%s: from revision %d on, values have other bits than they had", store.path, fold.revision)
             same = False
@@ -50,40 +54,66 @@ def verify(store: Store, folder: Folder) -> Iterator[tuple[Fold, bool]]:
     Raises JournalDamaged, JournalDiffers.
     """
     folder.load(None)
-    present = chain.START
+    present, history = chain.START, _History(store, folder, 0)
     for fold in store.folds():
-        present = again(store, folder, fold, present)
+        present = history.again(fold, present)
         yield fold, present == fold.chain
 
 
-def again(
-    store: Store, folder: Folder, fold: Fold, present: bytes, told: Callable[[Stepped], None] | None = None
-) -> bytes:
-    """Fold `fold` in again; gives the chain of digests after it.  told: gets every step.  Raises JournalDiffers."""
-    inserts = [_arrived(entry) for entry in fold.entries if entry.outcome != UNTRIED]
-    outcomes: dict[tuple[str, int], int] = {}
-    for event in folder.fold_again(inserts, fold.rebuilt):
-        if isinstance(event, Judged):
-            for outcome in event.outcomes:
-                done = ACCEPTED if isinstance(outcome.answer, bytes) else REFUSED
-                outcomes[outcome.insert.client, outcome.insert.sequence] = done
-                if not isinstance(outcome.answer, bytes):
-                    log.debug("refused again: %s", outcome.answer)
+class _History:
+    """What happened to a map, once more, to `folder`."""
+
+    def __init__(self, store: Store, folder: Folder, begin: int) -> None:
+        """begin: the fold that `folder` is at."""
+        self._store, self._folder = store, folder
+        self._reordered = store.reordered(begin)
+        self._beside: Folder | None = None
+
+    def again(self, fold: Fold, present: bytes) -> bytes:
+        """Fold `fold` in again; gives the chain of digests after it.  Raises JournalDiffers."""
+        store, folder = self._store, self._folder
+        if fold.reordered is not None:
+            present = chain.follow(present, self._reorder(fold, fold.reordered).delta)
         else:
-            present = chain.follow(present, event.delta)
-            if told is not None:
-                told(event)
-    for entry in fold.entries:
-        if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
-            was, now = ("accepted", "refused") if entry.outcome == ACCEPTED else ("refused", "accepted")
+            present = self._fold(fold, present)
+        if folder.revision != fold.revision:
             raise JournalDiffers(
-                store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
+                store.path, f"fold {fold.number} led to revision {fold.revision}, and leads to {folder.revision}"
             )
-    if folder.revision != fold.revision:
-        raise JournalDiffers(
-            store.path, f"fold {fold.number} led to revision {fold.revision}, and leads to {folder.revision}"
-        )
-    return present
+        if fold.number in self._reordered:
+            self._beside = folder.beside(folder.content())
+        return present
+
+    def _reorder(self, fold: Fold, after: int) -> Stepped:
+        if self._beside is None:
+            raise JournalDiffers(
+                self._store.path, f"fold {fold.number} was by a solver of fold {after}, which was not made again"
+            )
+        other, self._beside = self._beside, None
+        return self._folder.take_place(other, after, "replayed")
+
+    def _fold(self, fold: Fold, present: bytes) -> bytes:
+        inserts = [_arrived(entry) for entry in fold.entries if entry.outcome != UNTRIED]
+        outcomes: dict[tuple[str, int], int] = {}
+        for event in self._folder.fold_again(inserts, fold.rebuilt):
+            if isinstance(event, Judged):
+                for outcome in event.outcomes:
+                    done = ACCEPTED if isinstance(outcome.answer, bytes) else REFUSED
+                    outcomes[outcome.insert.client, outcome.insert.sequence] = done
+                    if not isinstance(outcome.answer, bytes):
+                        log.debug("refused again: %s", outcome.answer)
+            else:
+                present = chain.follow(present, event.delta)
+        for entry in fold.entries:
+            if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
+                was, now = ("accepted", "refused") if entry.outcome == ACCEPTED else ("refused", "accepted")
+                raise JournalDiffers(
+                    self._store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
+                )
+        if self._beside is not None:
+            for _ in self._beside.fold_again(inserts, rebuilt=False):
+                pass
+        return present
 
 
 def answers(sender: Sender, epoch: int) -> Iterator[tuple[int, int, object]]:
@@ -102,8 +132,11 @@ def _answer(entry: Entry, epoch: int) -> object:
 
 def _from_snapshot(store: Store, folder: Folder, fingerprint: str) -> Last:
     """Begin with the newest snapshot that can be used, or with nothing."""
+    reordered = store.reordered()
     for saved in store.snapshots():
         path = file_of(store.path.parent, saved.fold)
+        if any(made <= saved.fold < took for made, took in reordered.items()):
+            continue  # the other solver cannot be made again from it
         if saved.fingerprint != fingerprint:
             log.info("%s is of another solver or machine: not used", path)
             continue

@@ -13,7 +13,7 @@ from factorbus.solver.errors import SolverError
 
 def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last) -> Fold:
     """What is written down of a Run."""
-    present, revision, rebuilt = last.chain, last.revision, False
+    present, revision, rebuilt, reordered = last.chain, last.revision, False, None
     outcomes: dict[int, tuple[Outcome, Judged]] = {}
     for event in events:
         if isinstance(event, Judged):
@@ -21,9 +21,9 @@ def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | S
             revision = max(revision, event.revision)
         else:
             present, revision = chain.follow(present, event.delta), event.revision
-            rebuilt = rebuilt or event.rebuilt
+            rebuilt, reordered = rebuilt or event.rebuilt, event.reordered
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
-    return Fold(number, revision, rebuilt, present, entries)
+    return Fold(number, revision, rebuilt, present, entries, reordered)
 
 
 def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:

@@ -228,6 +228,18 @@ class Solver:
         self._graph.take(edited(other._graph, edits))
         return self.step()
 
+    def to_order_anew(self) -> State:
+        """What `order_anew` needs, a copy: all of the map as of the last step, but not R.  Nothing may be staged."""
+        return dump(self._graph)
+
+    def order_anew(self, content: Mapping[str, Any]) -> StepReport:
+        """The first step of a new solver, with the `content` of another: linearised at the estimate, in a fresh order.
+
+        That is a full elimination, for a thread of its own.  Raises as `step` does; this solver is of no use then.
+        """
+        load(self._graph, content, _VALUES)
+        return self.step()
+
     def asleep(self) -> list[tuple[int, str, str]]:
         """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
         return sights.asleep(self._graph)

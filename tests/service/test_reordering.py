@@ -1,0 +1,220 @@
+"""A map that is ordered anew beside its steps: another solver takes the place, with all that the first one has."""
+
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Batch, Change, Delta, Factors, Insert, Variables
+from factorbus.service import reordering
+from factorbus.service.arrival import read_insert
+from factorbus.service.config import Limits
+from factorbus.service.events import Arrived, Judged, Outcome, Stepped
+from factorbus.service.fold import Folder
+from factorbus.service.questions import Question
+from factorbus.service.reordering import Reordering
+from factorbus.simulate import manhattan
+from factorbus.solver import Options, Solver
+
+EPOCH, PATIENCE_S, PLENTY = 4, 120.0, 1 << 40
+ALWAYS = 0.01  # R has this share of fresh numbers, and more
+
+
+@pytest.fixture(autouse=True)
+def small_maps_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reordering, "LEAST", 100)
+
+
+class Driven:
+    """A folder, what goes on beside it, and the steps by which another solver took the place."""
+
+    def __init__(self, grown: float, room: int = PLENTY, **options: Any) -> None:
+        self.folder = Folder(lambda: Solver(Options(**options)), EPOCH, Limits())
+        self.beside = Reordering(self.folder, grown, lambda: room, "m")
+        self.replaced: list[Stepped] = []
+        self.outcomes: list[Outcome] = []
+        self.folds = 0
+
+    def insert(self, content: Batch | tuple[Change, ...]) -> None:
+        batch, changes = (content, ()) if isinstance(content, Batch) else (Batch(), content)
+        self.fold([arrived(Insert(len(self.outcomes) + 1, batch, changes=changes))])
+
+    def fold(self, inserts: Sequence[Arrived]) -> None:
+        events, _ = self.folder.fold_whole(inserts)
+        self.outcomes += [o for event in events if isinstance(event, Judged) for o in event.outcomes]
+        self.folds += 1
+        if (stepped := self.beside.after(inserts, events, self.folds)) is not None:
+            self.replaced.append(stepped)
+
+    def wait(self) -> None:
+        """Until the other solver is made."""
+        assert self.beside._beside is not None
+        self.beside._beside._thread.join(PATIENCE_S)
+        assert not self.beside._beside._thread.is_alive()
+
+    def values(self) -> dict[int, np.ndarray]:
+        taken = self.folder.snapshot([Question("estimate")])
+        return {int(key): row for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
+
+
+def arrived(insert: Insert) -> Arrived:
+    made = read_insert(None, "a", codec.encode_insert(insert), REQUEST_LIMITS, 0.0)
+    assert isinstance(made, Arrived)
+    return made._replace(askers=[])
+
+
+def shuffled(count: int) -> Iterator[Batch]:
+    """All odometry of a simulated drive at once, and then its loops, one at a time and in no order."""
+    steps = [step.batch for step in manhattan(count, 3)]
+    first, *others = (group for batch in steps for group in batch.variables)
+    poses = Variables("se2", np.concatenate([group.keys for group in others]))
+    factors = [group for batch in steps for group in batch.factors]
+    edges = [(f.keys[n : n + 1], f.measured[n : n + 1], f.information[n : n + 1])
+             for f in factors for n in range(len(f.keys))]  # fmt: skip
+    loops = [edge for edge in edges if abs(int(edge[0][0, 1] - edge[0][0, 0])) != 1]
+    assert len(loops) > len(poses.keys) // 4
+    drive = [edge for edge in edges if abs(int(edge[0][0, 1] - edge[0][0, 0])) == 1]
+    yield Batch((first, poses), (between(drive),))
+    for k in np.random.default_rng(1).permutation(len(loops)).tolist():
+        yield Batch((), (between([loops[k]]),))
+
+
+def between(edges: list[tuple[np.ndarray, ...]]) -> Factors:
+    return Factors("between_se2", *(np.concatenate(column) for column in zip(*edges, strict=True)))
+
+
+def read(stepped: Stepped) -> Delta:
+    return codec.decode_delta(stepped.delta)
+
+
+def unknown(like: Batch) -> Batch:
+    """A factor between poses that are not there."""
+    return Batch((), (Factors("between_se2", np.array([[-1, -2]]), np.zeros((1, 3)), like.factors[0].information[:1]),))
+
+
+def test_it_takes_the_place_with_what_came_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    leave, order_anew = threading.Event(), Solver.order_anew
+
+    def waiting(solver: Solver, content: Any) -> Any:
+        assert leave.wait(PATIENCE_S)
+        return order_anew(solver, content)
+
+    monkeypatch.setattr(Solver, "order_anew", waiting)
+    driven, plain = Driven(ALWAYS), Driven(0.0)
+    batches = [step.batch for step in manhattan(400, 1)]
+    n = 0
+    while not driven.replaced:
+        for one in (driven, plain):
+            one.insert(batches[n])
+            if n == 130:
+                one.insert(unknown(batches[1]))
+        if n == 150:
+            assert driven.beside.busy
+            leave.set()
+            driven.wait()
+        n += 1
+    assert n > 151, "what had been noted was not followed at once"
+    assert not driven.beside.busy
+    (stepped,) = driven.replaced
+    delta = read(stepped)
+    assert (delta.previous, delta.revision) == (0, driven.folder.revision)
+    assert driven.folder.revision == plain.folder.revision + 1
+    assert delta.report["strategy"] == "full"
+    assert "fresh order" in delta.report["because"]
+    assert driven.folder.size == plain.folder.size
+    there, known = driven.values(), plain.values()
+    told = {int(k): row for g in delta.variables for k, row in zip(g.keys, g.values, strict=True)}
+    assert {key: row.tobytes() for key, row in told.items()} == {key: row.tobytes() for key, row in there.items()}
+    assert there.keys() == known.keys()
+    assert max(np.abs(there[key] - known[key]).max() for key in there) < 1e-2
+    assert driven.folder.chi2() == pytest.approx(plain.folder.chi2(), rel=1e-3)
+    for batch in batches[n:]:
+        driven.insert(batch)
+        plain.insert(batch)
+    assert [isinstance(o.answer, bytes) for o in driven.outcomes] == [
+        isinstance(o.answer, bytes) for o in plain.outcomes
+    ]
+    assert driven.folder.chi2() == pytest.approx(plain.folder.chi2(), rel=1e-3)
+
+
+def test_where_loops_come_in_no_order_r_is_smaller_for_it() -> None:
+    driven, plain = Driven(1.05), Driven(0.0)
+    batches = shuffled(600)
+    while not driven.replaced:
+        batch = next(batches)
+        for one in (driven, plain):
+            one.insert(batch)
+        if driven.beside.busy:
+            driven.wait()
+    assert driven.folder.nonzeros < 0.97 * plain.folder.nonzeros
+    assert driven.folder.chi2() == pytest.approx(plain.folder.chi2(), rel=1e-3)
+
+
+def test_where_r_has_not_grown_nothing_takes_the_place() -> None:
+    driven = Driven(1.5)
+    for step in manhattan(300, 1):
+        driven.insert(step.batch)
+        if driven.beside.busy:
+            driven.wait()
+    assert not driven.replaced
+    assert driven.beside._looked > 20
+
+
+@pytest.mark.parametrize(
+    ("grown", "room", "options"), [(0.0, PLENTY, {}), (ALWAYS, 1000, {}), (ALWAYS, PLENTY, {"mode": "inc-l"})]
+)
+def test_it_is_not_begun(grown: float, room: int, options: dict[str, Any]) -> None:
+    """Where it is not wanted, there is no memory for it, or no R that is kept from step to step."""
+    driven = Driven(grown, room, **options)
+    for step in manhattan(150, 1):
+        driven.insert(step.batch)
+        assert not driven.beside.busy
+
+
+def test_a_change_of_the_map_lets_it_go() -> None:
+    driven = Driven(ALWAYS)
+    for step in manhattan(150, 1):
+        driven.insert(step.batch)
+        if driven.beside.busy:
+            break
+    driven.wait()
+    driven.insert((Change("weigh", np.array([0]), weight=np.array([0.5])),))
+    assert not driven.beside.busy
+    assert not driven.replaced
+
+
+def test_what_was_refused_for_a_limit_is_not_given_to_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven = Driven(ALWAYS)
+    batches = [step.batch for step in manhattan(150, 1)]
+    for batch in batches[:101]:
+        driven.insert(batch)
+    assert driven.beside.busy
+    driven.folder._limits = Limits(variables=driven.folder.size[0])
+    driven.insert(batches[101])
+    assert not isinstance(driven.outcomes[-1].answer, bytes)
+    driven.folder._limits = Limits()
+    driven.wait()
+    for batch in batches[101:]:
+        driven.insert(batch)
+    assert driven.replaced
+
+
+def test_a_solver_that_fails_beside_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(self: Solver, content: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Solver, "order_anew", failing)
+    driven = Driven(ALWAYS)
+    for step in manhattan(150, 1):
+        driven.insert(step.batch)
+        if driven.beside.busy:
+            driven.wait()
+    assert not driven.replaced
+    assert all(isinstance(outcome.answer, bytes) for outcome in driven.outcomes)
+    known_pose = Variables("se2", np.array([-5]), np.zeros((1, 3)), fixed=True)
+    driven.insert(Batch((known_pose,)))
+    assert isinstance(driven.outcomes[-1].answer, bytes)
