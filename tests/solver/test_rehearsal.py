@@ -70,7 +70,8 @@ def driven(poses: int = 60, **options: Any) -> Solver:
 def test_short_steps_are_not_followed_by_any(monkeypatch: pytest.MonkeyPatch) -> None:
     solver = driven()
     assert solver._tree
-    monkeypatch.setattr(tree_steps, "_LONG", int(solver._tree.tree.state[tl.S_CHANGED]))
+    state = solver._tree.tree.state
+    monkeypatch.setattr(tree_steps, "_LONG", int(state[tl.S_CHANGED] + state[tl.S_ELIMINATED]))
     stamp = eliminations(solver)
     solver.rehearse()
     assert eliminations(solver) == stamp

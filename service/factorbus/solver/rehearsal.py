@@ -18,7 +18,7 @@ from factorbus.solver.tree import Tree
 
 # The key of the pose that never comes.  In a map that has it nothing is rehearsed: admission refuses it.
 NOBODY = np.iinfo(np.int64).min + 1
-_BACK = 16  # variables among which a pose is looked for, from the newest on
+_BACK = 16  # the newest variables, among which a pose is looked for
 
 
 class Rehearsal:
@@ -26,7 +26,6 @@ class Rehearsal:
 
     def __init__(self, graph: Graph, tree: Tree, packing: Packing) -> None:
         self._graph, self._tree, self._packing = graph, tree, packing
-        self._newest: I64 = np.zeros(1, np.int64)
         self._ends: I64 = np.array([[0, NOBODY]])
         self._motions = {
             at.SE2: _motion("se2", self._ends, [0.0] * 3),
@@ -38,13 +37,13 @@ class Rehearsal:
         graph, v = self._graph, self._newest_pose()
         if v < 0:
             return
-        self._ends[0, 0], self._newest[0] = graph.keys[v], v
+        self._ends[0, 0] = graph.keys[v]
         packed = self._packing.pack(self._motions[graph.var.item(v, at.V_KIND)])
         mark = graph.mark()
         if packed and try_admit(graph, *packed) is not None:
             self._tree.rehearse()
             graph.forget(mark)
-            graph.variables(self._newest)
+            graph.variables(np.arange(max(v - _BACK, 0), v + 1))
 
     def _newest_pose(self) -> int:
         """−1: none among the newest variables."""

@@ -18,8 +18,6 @@ from factorbus.solver.kernels.tree_step import tree_step
 from factorbus.solver.options import Options
 
 _FEW = 8  # new variables for which good first values are looked for
-# What tells of the blocks of `numbers`.
-_BLOCKS = np.array([tl.S_NUMBERS, tl.S_IDLE, tl.S_GIVEN, tl.S_LARGEST, *range(tl.S_FREE, tl.S_FREE + tl.CLASSES)])
 
 
 class Tree(Arenas):
@@ -86,14 +84,11 @@ class Tree(Arenas):
     def rehearse(self) -> None:
         """Go through a step for what is new in the graph, up to where the tree would change; the graph is to forget it.
 
-        Relinearises nothing, makes no room, and has its blocks behind all others, so that it leaves none in pieces.
+        Relinearises nothing and makes no room.
         """
-        state, blocks = self.state, self.state[_BLOCKS]
-        state[[tl.S_REHEARSES, tl.S_WAIT]] = 1
-        state[[tl.S_LARGEST, tl.S_GIVEN]] = -1, 0  # nothing is free, or worth joining
+        self.state[[tl.S_REHEARSES, tl.S_WAIT]] = 1
         tree_step(self._graph.places(), self.places())
-        state[_BLOCKS] = blocks
-        state[[tl.S_REHEARSES, tl.S_WAIT]] = 0
+        self.state[[tl.S_REHEARSES, tl.S_WAIT]] = 0
 
     @property
     def failed(self) -> int:

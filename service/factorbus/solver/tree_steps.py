@@ -28,7 +28,7 @@ from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
-_LONG = 100  # variables: after a step that changed more the next one is rehearsed
+_LONG = 100  # variables; after a step that changed and eliminated more the next one is rehearsed
 _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
 
 
@@ -85,7 +85,8 @@ class TreeSteps:
     def rehearse(self) -> None:
         """As `Solver.rehearse`."""
         state, mark = self._tree.state, self._mark
-        if state.item(tl.S_CHANGED) > _LONG and self._graph.mark() == mark:
+        moved = state.item(tl.S_CHANGED) + state.item(tl.S_ELIMINATED)
+        if moved > _LONG and self._graph.mark() == mark:
             self._rehearsal.run()
             self._report(0.0, 0.0, _told(state), None, self._tree.account.item(tl.A_CHI2), "", mark)
 
