@@ -21,7 +21,6 @@ from factorbus.simulate import WORLDS
 
 from .problems import Problem
 
-
 _LENGTH = 8  # bytes that say how long a step is
 _AHEAD = 1000  # steps
 
