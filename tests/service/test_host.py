@@ -67,11 +67,6 @@ class Held(Solver):
         super().__init__(Options(clock=time.perf_counter))
         self.begun, self.leave = threading.Semaphore(0), threading.Event()
         self.leave.set()
-        self.on_rehearsal: Callable[[], None] = lambda: None
-
-    def rehearse(self) -> None:
-        self.on_rehearsal()
-        super().rehearse()
 
     def step(self, settle: bool = False) -> Any:
         self.begun.release()
@@ -156,18 +151,6 @@ def test_a_short_run_is_done_by_who_brought_it_and_others_by_the_maps_thread(set
     assert setup.told.threads() == ["solver m", here, "solver m", "solver m", here]
     assert not setup.seat.locked(), "given back"
     check(setup, 5)
-
-
-def test_a_step_is_rehearsed_when_the_one_before_is_told_and_the_solver_not_yet_free(setup: Setup) -> None:
-    seen: list[tuple[int, int]] = []
-    account = setup.host.core.stats
-    setup.solver.on_rehearsal = lambda: seen.append((len(setup.told.deltas()), account(0.0)["in_solver"]))
-    setup.until_short()
-    setup.host.insert(located(setup, pose(1)))  # in one piece
-    setup.insert(pose(2), settle=True)  # on the map's thread
-    setup.wait_until_free()
-    assert setup.told.threads()[1:] == [threading.current_thread().name, "solver m"]
-    assert seen == [(1, 1), (2, 1), (3, 1)]
 
 
 def test_without_the_seat_a_short_run_goes_to_the_maps_thread(setup: Setup) -> None:

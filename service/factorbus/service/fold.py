@@ -137,11 +137,6 @@ class Folder:
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 
-    def rehearse(self) -> None:
-        """Between folds, once what came of the last one is told: the next step finds in the caches what it needs."""
-        if not self._broken:
-            self._solver.rehearse()
-
     def content(self) -> dict[str, Any]:
         """What a folder `beside` this one begins with, a copy.  Raises Broken."""
         if self._broken:

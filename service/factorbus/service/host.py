@@ -287,7 +287,6 @@ class Host:
             with self._lock:
                 effects = self.core.stepped(stepped)
             self._do(effects)
-        self._folder.rehearse()
 
     def _tidy_kept(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], keeper: Keeper) -> bool:
         """The same with a journal; gives whether another solver took the place."""
@@ -298,7 +297,6 @@ class Host:
                 with self._lock:
                     effects = self.core.kept([stepped], time.monotonic())
                 self._do(effects)
-        self._folder.rehearse()
         return stepped is not None
 
     def _read(self, reads: Sequence[Read]) -> None:

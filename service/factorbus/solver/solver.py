@@ -74,9 +74,9 @@ class Solver:
         self._graph = Graph()
         self._mode = mode_named(self._options.mode)
         self._system = System(self._graph, Incremental(Elimination(self._options), self._options))
-        self._packing = Packing()
-        self._tree = TreeSteps(self._graph, self._options, self._packing) if self._mode.tree else None
+        self._tree = TreeSteps(self._graph, self._options) if self._mode.tree else None
         self._live = Live(self._graph, self._tree.tree) if self._tree else None
+        self._packing = Packing()
         self._changed: I64 = np.empty(0, np.int64)
         self._trust, self._moves = 1.0, 0
         self._done = _Done(self._graph.mark())
@@ -148,16 +148,6 @@ class Solver:
         report = self._report(course, added, self._told(plan, because, batch), watch)
         self._commit(course, added, solved=bool(because), batch=batch)
         return report
-
-    def rehearse(self) -> None:
-        """Have in the processor's caches what a step of a robot that drives on needs.  Changes nothing.
-
-        For when the results of a step are read and there is a moment before the next one.  After a step that changed
-        many variables the next short one takes half as long then; after others nothing is done, nor in other modes than
-        "tree", nor where something is staged.
-        """
-        if self._tree:
-            self._tree.rehearse()
 
     def estimate(self) -> list[Group]:
         """A copy of all values: per kind, in insertion order, fixed variables in groups of their own.

@@ -81,15 +81,6 @@ class Tree(Arenas):
             self._make_room()
         return status
 
-    def rehearse(self) -> None:
-        """Go through a step for what is new in the graph, up to where the tree would change; the graph is to forget it.
-
-        Relinearises nothing and makes no room.
-        """
-        self.state[[tl.S_REHEARSES, tl.S_WAIT]] = 1
-        tree_step(self._graph.places(), self.places())
-        self.state[[tl.S_REHEARSES, tl.S_WAIT]] = 0
-
     @property
     def failed(self) -> int:
         """The variable whose pivot made the last step fail."""

@@ -20,27 +20,23 @@ from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
 from factorbus.solver.kernels.move import differing
 from factorbus.solver.options import Options
-from factorbus.solver.packing import Packing
-from factorbus.solver.rehearsal import Rehearsal
 from factorbus.solver.report import Shares, StepReport, Stopwatch
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
-_LONG = 100  # variables; after a step that changed and eliminated more the next one is rehearsed
 _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
 
 
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
-    NOT_KEPT = ("_graph", "_options", "_rehearsal")
+    NOT_KEPT = ("_graph", "_options")
 
-    def __init__(self, graph: Graph, options: Options, packing: Packing) -> None:
+    def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = Tree(graph, options)
-        self._rehearsal = Rehearsal(graph, self._tree, packing)
         self._mark = graph.mark()
         self._first_new, self._batched = 0, False
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
@@ -79,16 +75,7 @@ class TreeSteps:
             course = self._batch(before, settle=False)
             because = "χ² would have risen: a batch from where the estimate stood"
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else account[tl.A_CHI2]
-        told = _told(tree.state)
-        return self._account(started, compiled, told, course, max(chi2, 0.0), because)
-
-    def rehearse(self) -> None:
-        """As `Solver.rehearse`."""
-        state, mark = self._tree.state, self._mark
-        moved = state.item(tl.S_CHANGED) + state.item(tl.S_ELIMINATED)
-        if moved > _LONG and self._graph.mark() == mark:
-            self._rehearsal.run()
-            self._report(0.0, 0.0, _told(state), None, self._tree.account.item(tl.A_CHI2), "", mark)
+        return self._account(started, compiled, course, max(chi2, 0.0), because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -167,18 +154,11 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(
-        self, started: float, compiled: float, told: list[int], course: Course | None, chi2: float, because: str
-    ) -> StepReport:
+    def _account(self, started: float, compiled: float, course: Course | None, chi2: float, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
-        self._first_new, self._batched = before[at.VARIABLES], course is not None
-        return self._report(started, compiled, told, course, chi2, because, before)
-
-    def _report(
-        self, started: float, compiled: float, told: list[int], course: Course | None, chi2: float, because: str,
-        before: Mark,
-    ) -> StepReport:  # fmt: skip
         now, clock = self._mark, self._options.clock
+        self._first_new, self._batched = before[at.VARIABLES], course is not None
+        told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
         nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
@@ -204,8 +184,3 @@ class TreeSteps:
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip
-
-
-def _told(state: I64) -> list[int]:
-    """The account of the last step."""
-    return state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()

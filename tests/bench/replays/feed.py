@@ -4,7 +4,7 @@ python -m bench.replays.feed NAME POSES SEED
 
 Each is read whole, and made of its bytes when it is asked for: as a message that has just come in it is in the caches.
 But many are read at a time, for to wait for one is to let the process that makes them have the core, if it is on the
-same one, and with it the caches: a step that only drives on then took half as long again.
+same one, and with it the caches: the median step then took a tenth to a quarter more.
 """
 
 import os

@@ -1,8 +1,7 @@
 """How a step's time and the memory grow with the map: a simulated drive of any length through one of our modes.
 
-What is on the clock is stage, step and `changed`, what a robot gets after every step, and `rehearse`, as a service does
-then: a copy of all variables would grow with the map whatever the solver does.  The world is made by another process,
-so its memory is not counted.
+What is on the clock is stage, step and `changed`, what a robot gets after every step: a copy of all variables would
+grow with the map whatever the solver does.  The world is made by another process, so its memory is not counted.
 """
 
 import gc
@@ -71,7 +70,6 @@ def _drive(
                 solver.stage(batch)
                 solver.step()
                 solver.changed()
-                solver.rehearse()
             except SolverError as problem_seen:
                 return k, f"step {k}: {problem_seen.code}: {problem_seen}"
             seconds[k] = time.process_time() - start

@@ -168,8 +168,7 @@ S_GIVEN = 49  # of those given back since they were joined,
 S_LARGEST = 50  # and no class above this one has any
 S_RELINEARISING = 51  # flops of the last elimination that relinearised
 S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of few flops
-S_REHEARSES = 53  # 1: the step under way is taken back before the tree changes, as one that fails is
-S_FREE = 54  # heads of free lists: numbers, then lists
+S_FREE = 53  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

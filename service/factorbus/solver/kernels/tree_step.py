@@ -54,7 +54,6 @@ from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factor
 FREE = 0
 LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
-REHEARSED = 64  # variables; a step that eliminates more is a long one itself
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
 
 
@@ -64,8 +63,8 @@ def tree_step(graph: I64, tree: I64) -> int:
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
-    or FAILED: the pivot of S_FAILED was not positive, or it was a rehearsal; or INFINITE: the χ² of a new factor is
-    beyond numbers.  After the last two the tree is as it was before the step.
+    or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
+    the last two the tree is as it was before the step.
     """
     began = cycles()
     counts, var, fac = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
@@ -112,9 +111,7 @@ def tree_step(graph: I64, tree: I64) -> int:
             scalars, stiff, turns, pending, changed, moved, marked, motions, state, account,
         )  # fmt: skip
         if status == tl.NO_ROOM:
-            if state[tl.S_REHEARSES] == 0:
-                return tl.NO_ROOM
-            status = tl.FAILED
+            return tl.NO_ROOM
         began = cycles()
         if status == tl.FAILED:
             if moving.size > 0:
@@ -210,8 +207,6 @@ def eliminate_again(
             affected[n] = v
             n += 1
     orphans = orphans[:hanging]
-    if state[tl.S_REHEARSES] != 0 and n > REHEARSED:
-        return 0.0, 0.0, tl.FAILED
     if n == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
         return 0.0, 0.0, tl.DONE
@@ -259,7 +254,7 @@ def eliminate_again(
         ids, records, order, affected, home, place, factors, orphans, lowest, update, var, fac, node, link, clique,
         lists, numbers, hessian, scalars, state,
     )  # fmt: skip
-    if failed >= 0 or state[tl.S_REHEARSES] != 0:
+    if failed >= 0:
         state[tl.S_FAILED] = failed
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
