@@ -62,11 +62,11 @@ class Reordering:
         beside = self._beside
         if beside is None:
             if self._is_due():
-                self._beside = _Beside(self._folder, fold, self._name)
+                self._beside = _Beside(self._folder, fold, self._grown, self._name)
             return None
         if inserts:
             beside.note(_tried(inserts, events))
-        stays, taken = beside.go_on(self._grown)
+        stays, taken = beside.go_on()
         if not stays:
             self._beside = None
         return taken
@@ -85,10 +85,10 @@ class Reordering:
 class _Beside:
     """One other solver, from the copy until it takes the place or is let go."""
 
-    def __init__(self, folder: Folder, fold: int, name: str) -> None:
-        self._folder, self._fold, self._name = folder, fold, name
+    def __init__(self, folder: Folder, fold: int, grown: float, name: str) -> None:
+        self._folder, self._fold, self._grown, self._name = folder, fold, grown, name
         self._solver, self._nonzeros = folder.solver, folder.nonzeros
-        self._other: Folder | None = None
+        self._other: Folder | None = None  # once it is made, if it is worth it
         self._fresh = 0  # numbers of R where all of the copy is in a fresh order
         self._noted: deque[_Noted] = deque()
         content = folder.content()
@@ -99,14 +99,14 @@ class _Beside:
         """These were folded in."""
         self._noted.append(_Noted(inserts, self._folder.size))
 
-    def go_on(self, grown: float) -> tuple[bool, Stepped | None]:
+    def go_on(self) -> tuple[bool, Stepped | None]:
         """(whether it goes on, the step by which it took the place)."""
         if self._folder.solver is not self._solver:
             return False, None
         if self._thread.is_alive():
             return True, None
         other = self._other
-        if other is None or self._nonzeros < grown * self._fresh:
+        if other is None:
             return False, None
         for _ in range(min(_FOLLOW, len(self._noted))):
             if not self._follow(other, self._noted.popleft()):
@@ -120,18 +120,21 @@ class _Beside:
     def _order(self, content: dict[str, Any]) -> None:
         try:
             other = self._folder.beside(content)
-            self._fresh, self._other = other.nonzeros, other
+            self._fresh = other.nonzeros
+            if self._nonzeros >= self._grown * self._fresh:
+                self._other = other
         except (SolverError, MemoryError) as problem:
             log.warning("map %s is not ordered anew: %s", self._name, problem)
         except Exception:
             log.exception("map %s is not ordered anew", self._name)
 
     def _follow(self, other: Folder, noted: _Noted) -> bool:
-        for _ in other.fold_again(noted.inserts, rebuilt=False):
-            pass
-        if other.size != noted.size:
-            log.info("map %s is not ordered anew: what it refuses depends on the order", self._name)
-        return other.size == noted.size
+        """Give `other` a fold; gives whether it is then as the map was, and by no way that a restart would not go."""
+        events = list(other.fold_again(noted.inserts, rebuilt=False))
+        agrees = other.size == noted.size and not any(isinstance(e, Stepped) and e.rebuilt for e in events)
+        if not agrees:
+            log.info("map %s is not ordered anew: the other solver refused something else, or failed", self._name)
+        return agrees
 
 
 def _tried(inserts: Sequence[Arrived], events: Sequence[Judged | Stepped]) -> Sequence[Arrived]:
