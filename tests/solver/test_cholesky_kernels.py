@@ -8,7 +8,7 @@ from naive.elimination import partial_cholesky
 
 from factorbus.solver.kernels import _jit, simd_plain
 from factorbus.solver.kernels.dense import DEPTH, factor_front
-from factorbus.solver.kernels.fronts import SCRATCH
+from factorbus.solver.kernels.fronts import GROUP, SCRATCH, padded, update_row, update_size
 from factorbus.solver.kernels.simd import LANES, add_run, six, solve_rows, tile, zero
 
 
@@ -99,17 +99,28 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
     """Put a front into an arena as `fronts` says, everything around it NaN, and factorise it."""
     n = len(front)
     m, lead = n - p, -p % LANES
-    ld, ldu = lead + p + m + -m % LANES, m + -m % LANES
-    arena = np.full(SCRATCH + p * ld + m * ldu + 8, np.nan)
-    rows = arena[SCRATCH : SCRATCH + p * ld].reshape(p, ld)
-    update = arena[SCRATCH + p * ld : SCRATCH + p * ld + m * ldu].reshape(m, ldu)
-    rows[:], update[:] = 0.0, 0.0
+    ld, width = lead + p + m + -m % LANES, padded(m)
+    start, size = SCRATCH + p * ld, update_size(m, width)
+    arena = np.full(start + size + 8, np.nan)
+    rows = arena[SCRATCH:start].reshape(p, ld)
+    rows[:], arena[start : start + size] = 0.0, 0.0
     rows[:, lead : lead + n] = np.triu(front)[:p]
-    update[:, :m] = np.triu(front[p:, p:])
+    # Row behind row, each from the column where its group begins.
+    update, put = [], start
+    for i in range(m):
+        first = i - i % GROUP
+        assert put == start + update_row(i, width) + first
+        update.append(arena[put : put + width - first])
+        update[i][: m - first] = front[p + i, p + first :]
+        put += width - first
+    assert put == start + size
     floors = np.zeros(p) if floors is None else floors
-    failed = factor_front(arena, SCRATCH + lead, ld, p, m, SCRATCH + p * ld, ldu, floors, 0)
+    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0)
     assert np.isnan(arena[-8:]).all()
-    return failed, rows[:, lead : lead + n], update[:, :m]
+    result = np.zeros((m, m))
+    for i, row in enumerate(update):
+        result[i, i:] = row[i % GROUP : i % GROUP + m - i]
+    return failed, rows[:, lead : lead + n], result
 
 
 @_jit.kernel

@@ -173,7 +173,7 @@ def test_a_step_of_many_flops_has_no_time_for_pages() -> None:
 
 def test_what_only_the_original_has_written_to_is_written_to_again() -> None:
     solver, copied = Solver(Options()), Solver(Options())
-    for step in manhattan(1500, 3):
+    for step in manhattan(2100, 3):
         solver.stage(step.batch)
         solver.step()
     copied.load(solver.dump())

@@ -86,7 +86,7 @@ def test_no_two_living_numbers_share_a_place(analysis):
         p, m = front[fr.PIVOTS], front[fr.BORDER]
         lead = fr.padded(p) - p
         rows = slice(front[fr.ROWS] - lead, front[fr.ROWS] - lead + p * front[fr.LD_ROWS])
-        update = slice(front[fr.UPDATE], front[fr.UPDATE] + m * front[fr.LD_UPDATE])
+        update = slice(front[fr.UPDATE], front[fr.UPDATE] + fr.update_size(m, front[fr.WIDTH_UPDATE]))
         assert rows.stop <= symbolic.stored <= update.start
         assert lead + p + fr.padded(m) <= front[fr.LD_ROWS]
         assert not taken[rows].any()
@@ -95,7 +95,7 @@ def test_no_two_living_numbers_share_a_place(analysis):
         c = front[fr.CHILD]
         while c >= 0:
             child = symbolic.fronts[c]
-            place = slice(child[fr.UPDATE], child[fr.UPDATE] + child[fr.BORDER] * child[fr.LD_UPDATE])
+            place = slice(child[fr.UPDATE], child[fr.UPDATE] + fr.update_size(child[fr.BORDER], child[fr.WIDTH_UPDATE]))
             assert taken[place].all()
             taken[place] = 0
             c = child[fr.SIBLING]

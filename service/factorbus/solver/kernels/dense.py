@@ -10,7 +10,7 @@ taken off it, so every number is loaded and stored once per panel.
 import math
 
 from factorbus.solver.kernels._jit import F64, inline_kernel, kernel
-from factorbus.solver.kernels.fronts import padded
+from factorbus.solver.kernels.fronts import padded, update_row, update_stride
 from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, at, put, solve_rows, tile
 
 DEPTH = 128  # rows of a panel: with WIDTH columns they fit the second level cache
@@ -25,10 +25,11 @@ PIVOT_TOLERANCE = 1e-13
 @kernel(
     "int64(float64[::1], int64, int64, int64, int64, int64, int64, float64[::1], int64)",
 )
-def factor_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int, floors: F64, k: int) -> int:
+def factor_front(a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, floors: F64, k: int) -> int:
     """Factorise a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1.
 
-    in   r, ld: its p rows over p + m columns   u, ldu: its m x m update matrix   floors[k + i]: pivot i must exceed it
+    in   r, ld: its p rows over p + m columns   u, width: its m x m update matrix
+         floors[k + i]: pivot i must exceed it
     out  rows: R and S   update matrix: U
     """
     for top in range(0, p, DEPTH):
@@ -48,7 +49,8 @@ def factor_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int, floo
             right = min(left + WIDTH, m)
             for i in range(0, right, TILE_ROWS):
                 rows = min(TILE_ROWS, m - i)
-                take_off(a, rows, u + i * ldu, ldu, r + top * ld + p, ld, i, max(i, left), right, 0, end - top)
+                row, stride = u + update_row(i, width), update_stride(i, width)
+                take_off(a, rows, row, stride, r + top * ld + p, ld, i, max(i, left), right, 0, end - top)
     return -1
 
 

@@ -2,9 +2,12 @@
 
 A front holds p pivot scalars and a border of m scalars, in elimination order.  Its rows of R are p rows over p + m
 columns, column j of row i at `ROWS + i·LD_ROWS + j`; its update matrix is m x m, upper triangle, column j of row i at
-`UPDATE + i·LD_UPDATE + j`.  Both start their border columns at a multiple of LANES doubles
+`UPDATE + update_row(i, WIDTH_UPDATE) + j`.  Both start their border columns at a multiple of LANES doubles
 and pad rows to one, so that whole vectors cover them and none lies across a cache line; what a row of R has before
 its first column, and behind its last, belongs to nobody.
+
+Of an update matrix GROUP rows at a time begin with the same column, the first that the diagonal of any is in, so the
+rows of a group have a common stride and little is kept below the diagonal.
 """
 
 from factorbus.solver.kernels._jit import inline_kernel, vector_lanes
@@ -15,7 +18,7 @@ BORDER = 2  # m
 ROWS = 3
 LD_ROWS = 4
 UPDATE = 5
-LD_UPDATE = 6
+WIDTH_UPDATE = 6  # of its first rows
 PARENT = 7  # -1: a root
 CHILD = 8  # first child, -1: none
 SIBLING = 9  # next child of the same parent
@@ -38,6 +41,7 @@ STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 SCRATCH = 16  # the first doubles of an arena: room for a 4 x 4 triangle
 
 LANES = vector_lanes()
+GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time
 
 
 @inline_kernel
@@ -51,3 +55,22 @@ def row_stride(count: int) -> int:
     """Padded, and not a multiple of a large power of two, whose rows would share a few sets of the cache."""
     stride = padded(count)
     return stride + 8 if stride >= 128 and stride % 16 == 0 else stride
+
+
+@inline_kernel
+def update_row(i: int, width: int) -> int:
+    """Where column 0 of row i of an update matrix would be, counted from its start."""
+    first = i & ~(GROUP - 1)
+    return first * width - first * (first - GROUP) // 2 + (i - first) * (width - first) - first
+
+
+@inline_kernel
+def update_stride(i: int, width: int) -> int:
+    """From row i to the next one of its group."""
+    return width - (i & ~(GROUP - 1))
+
+
+@inline_kernel
+def update_size(m: int, width: int) -> int:
+    """Doubles of an update matrix of m rows."""
+    return update_row(m - 1, width) + width if m > 0 else 0

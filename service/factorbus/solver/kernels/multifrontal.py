@@ -20,8 +20,8 @@ def factorize(
     for f in range(fronts.shape[0]):
         front = fronts[f]
         r, ld, p, column = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.COLUMN]
-        m, u, ldu = front[fr.BORDER], front[fr.UPDATE], front[fr.LD_UPDATE]
-        clear_front(arena, r, ld, p, m, u, ldu)
+        m, u, width = front[fr.BORDER], front[fr.UPDATE], front[fr.WIDTH_UPDATE]
+        clear_front(arena, r, ld, p, m, u, width)
         for b in range(front[fr.BLOCKS], front[fr.BLOCKS_END]):
             put_block(arena, blocks, b, ld, values, offsets[blocks[b, 0]], 1.0 + damping)
         for i in range(p):
@@ -29,23 +29,19 @@ def factorize(
         c = front[fr.CHILD]
         while c >= 0:
             child = fronts[c]
-            extend_add(arena, child[fr.UPDATE], child[fr.LD_UPDATE], runs, child[fr.RUNS], child[fr.RUNS_END], front)
+            extend_add(arena, child[fr.UPDATE], child[fr.WIDTH_UPDATE], runs, child[fr.RUNS], child[fr.RUNS_END], front)
             c = child[fr.SIBLING]
-        failed = factor_front(arena, r, ld, p, m, u, ldu, floors, column)
+        failed = factor_front(arena, r, ld, p, m, u, width, floors, column)
         if failed >= 0:
             return column + failed
     return -1
 
 
 @inline_kernel
-def clear_front(a: F64, r: int, ld: int, p: int, m: int, u: int, ldu: int) -> None:
-    """Zero the rows of R, their padding too, and the update matrix on and above the diagonal."""
+def clear_front(a: F64, r: int, ld: int, p: int, m: int, u: int, width: int) -> None:
+    """Zero the rows of R, their padding too, and the update matrix."""
     zero(a, r - (fr.padded(p) - p), p * ld)
-    if m <= 64:
-        zero(a, u, m * ldu)
-    else:
-        for i in range(m):
-            zero(a, u + i * ldu + (i & ~7), ldu - (i & ~7))
+    zero(a, u, fr.update_size(m, width))
 
 
 @inline_kernel
@@ -64,16 +60,14 @@ def put_block(a: F64, blocks: I64, b: int, ld: int, values: F64, source: int, on
 
 
 @inline_kernel
-def extend_add(a: F64, child: int, ld_child: int, runs: I64, run: int, run_end: int, front: I64) -> None:
+def extend_add(a: F64, child: int, width: int, runs: I64, run: int, run_end: int, front: I64) -> None:
     """Add the update matrix at `child` into the front above it, run by run."""
-    p, r, ld, u, ldu = front[fr.PIVOTS], front[fr.ROWS], front[fr.LD_ROWS], front[fr.UPDATE], front[fr.LD_UPDATE]
+    p, r, ld, u, wide = front[fr.PIVOTS], front[fr.ROWS], front[fr.LD_ROWS], front[fr.UPDATE], front[fr.WIDTH_UPDATE]
     for s in range(run, run_end):
         first, count, into = runs[s, 0], runs[s, 1], runs[s, 2]
-        target, stride = (r + into * ld, ld) if into < p else (u + (into - p) * ldu - p, ldu)
-        source = child + first * ld_child
         for i in range(count):
-            add_run(a, target + into + i, source + first + i, count - i)
+            c, source = into + i, child + fr.update_row(first + i, width)
+            target = r + c * ld if into < p else u + fr.update_row(c - p, wide) - p
+            add_run(a, target + c, source + first + i, count - i)
             for t in range(s + 1, run_end):
                 add_run(a, target + runs[t, 2], source + runs[t, 0], runs[t, 1])
-            target += stride
-            source += ld_child

@@ -219,13 +219,13 @@ def _place(records: I64) -> I64:
     for f in range(fronts):
         front = records[f]
         p, m = front[fr.PIVOTS], front[fr.BORDER]
-        front[fr.LD_ROWS], front[fr.LD_UPDATE] = fr.row_stride(fr.padded(p) + m), fr.row_stride(m)
+        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded(p) + m), fr.padded(m)
         front[fr.ROWS] = end + fr.padded(p) - p
         end += p * front[fr.LD_ROWS]
         if front[fr.CHILD] != NONE:
             top[1 - depth[f]] = records[front[fr.CHILD], fr.UPDATE]
         front[fr.UPDATE] = top[depth[f]]
-        top[depth[f]] += m * front[fr.LD_UPDATE]
+        top[depth[f]] += fr.update_size(m, front[fr.WIDTH_UPDATE])
         peak[depth[f]] = max(peak[depth[f]], top[depth[f]])
     for f in range(fronts):
         records[f, fr.UPDATE] += end + (peak[0] if depth[f] == 1 else 0)

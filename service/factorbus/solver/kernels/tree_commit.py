@@ -90,7 +90,7 @@ def keep_leading(c: int, update: I64, var: I64, clique: I64, lists: I64, numbers
     row[tl.C_SEPARATORS] += lost
     row[tl.C_PIVOTS], row[tl.C_BORDER] = p, m
     give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
-    row[tl.C_UPDATE], row[tl.C_LDU], row[tl.C_UPDATE_BLOCK_SIZE] = update[0], update[1], update[2]
+    row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = update[0], update[1], update[2]
     child, row[tl.C_CHILD] = row[tl.C_CHILD], -1
     while child >= 0:
         following = clique[child, tl.C_NEXT]

@@ -85,9 +85,9 @@ def row_layout(p: int, m: int) -> tuple:
 
 @inline_kernel
 def update_layout(m: int) -> tuple:
-    """(stride, size) of an update matrix."""
-    stride = fr.row_stride(m + 1)
-    return stride, (m + 1) * stride + fr.LANES
+    """(width of the first rows, size) of an update matrix, the right-hand side with it."""
+    width = fr.padded(m + 1)
+    return width, fr.update_size(m + 1, width)
 
 
 @part
@@ -120,7 +120,7 @@ def place_fronts(
         lead, row[tl.C_LD], used, size = row_layout(p, m)
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used
-        row[tl.C_LDU], size = update_layout(m)
+        row[tl.C_WIDTH_UPDATE], size = update_layout(m)
         row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_PARENT] = row[tl.C_CHILD] = row[tl.C_NEXT] = -1
         row[tl.C_ABOVE] = 0

@@ -100,8 +100,8 @@ C_MOVES = 10  # 1: it has moved as a whole since it was solved
 C_BORDER = 11  # m
 C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
 C_LD = 13
-C_UPDATE = 14  # column j of row i of U is at UPDATE + i · LDU + j
-C_LDU = 15
+C_UPDATE = 14  # column j of row i of U is at UPDATE + update_row(i, WIDTH_UPDATE) + j, see `fronts`
+C_WIDTH_UPDATE = 15
 # and the rest.
 C_ABOVE = 16  # place in the parent's list of the first separator variable to be eliminated
 C_MARK = 17  # the last elimination that touched it

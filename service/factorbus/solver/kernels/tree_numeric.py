@@ -28,7 +28,7 @@ def eliminate_fronts(
 ) -> int:  # fmt: skip
     """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
 
-    update (orphans, 2): where the update matrix of each orphan is, and its stride
+    update (orphans, 2): where the update matrix of each orphan is, and its width
     """
     count, n, stamp = ids.size, order.size, state[tl.S_STAMP]
     first_factor, factor_of = _by_front(count, factors, home, place, var, fac, node)
@@ -51,7 +51,7 @@ def eliminate_fronts(
         row = clique[ids[f]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
         number_columns(row, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
+        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
             anchored |= int(not is_relative(factor_of[q], var, fac))
@@ -61,7 +61,7 @@ def eliminate_fronts(
             other = clique[ids[child]]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
             k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
-            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_LDU], runs, k, row)
+            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, k, row)
             anchored |= other[tl.C_ANCHORED]
             child = records[child, fr.SIBLING]
         e = orphan_of[f]
@@ -74,7 +74,7 @@ def eliminate_fronts(
             e = after[e]
         row[tl.C_ANCHORED] = anchored
         failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU], floors, 0
+            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0
         )
         if failed >= 0:
             return variable_at(failed, row, var, lists)
@@ -142,7 +142,7 @@ def row_of(c: int, row: I64) -> int:
     p = row[tl.C_PIVOTS]
     if c < p:
         return row[tl.C_ROWS] + c * row[tl.C_LD]
-    return row[tl.C_UPDATE] + (c - p) * row[tl.C_LDU] - p
+    return row[tl.C_UPDATE] + fr.update_row(c - p, row[tl.C_WIDTH_UPDATE]) - p
 
 
 @part
@@ -222,12 +222,12 @@ def list_runs(start: int, end: int, column: I64, p: int, m: int, var: I64, node:
 
 
 @part
-def extend_add(a: F64, child: int, ld_child: int, runs: I64, count: int, row: I64) -> None:
+def extend_add(a: F64, child: int, width: int, runs: I64, count: int, row: I64) -> None:
     """Add the update matrix at `child` into a front, run by run; a pair of runs in another order there is turned."""
     for s in range(count):
         first, length, into = runs[s, 0], runs[s, 1], runs[s, 2]
         for i in range(length):
-            source, target = child + (first + i) * ld_child, row_of(into + i, row)
+            source, target = child + fr.update_row(first + i, width), row_of(into + i, row)
             add_few(a, target + into + i, source + first + i, length - i)
             for t in range(s + 1, count):
                 other = runs[t, 2]
@@ -256,12 +256,12 @@ def update_orphans(
 ) -> bool:  # fmt: skip
     """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
 
-    update (orphans, 3): its place, its stride, and the size of its block where it was made here (else 0)
+    update (orphans, 3): its place, its width, and the size of its block where it was made here (else 0)
     """
     stamp, need = state[tl.S_STAMP], state[tl.S_NUMBERS]
     for e in range(orphans.size):
         c = orphans[e]
-        update[e, 0], update[e, 1], update[e, 2] = clique[c, tl.C_UPDATE], clique[c, tl.C_LDU], 0
+        update[e, 0], update[e, 1], update[e, 2] = clique[c, tl.C_UPDATE], clique[c, tl.C_WIDTH_UPDATE], 0
         if clique[c, tl.C_MARK] == stamp:
             need += size_class(update_layout(split_sizes(c, var, clique, lists)[1])[1])[1]
     if need > numbers.size:
@@ -271,10 +271,10 @@ def update_orphans(
         c = orphans[e]
         if clique[c, tl.C_MARK] == stamp:
             p, m = split_sizes(c, var, clique, lists)
-            ldu, size = update_layout(m)
+            width, size = update_layout(m)
             u, size = take_numbers(size, numbers, state)
-            update[e, 0], update[e, 1], update[e, 2] = u, ldu, size
-            split_update(c, p, m, u, ldu, var, fac, node, link, clique, lists, numbers, hessian)
+            update[e, 0], update[e, 1], update[e, 2] = u, width, size
+            split_update(c, p, m, u, width, var, fac, node, link, clique, lists, numbers, hessian)
     return True
 
 
@@ -297,7 +297,7 @@ def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
 
 @part
 def split_update(
-    c: int, p: int, m: int, u: int, ldu: int,
+    c: int, p: int, m: int, u: int, wide: int,
     var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
 ) -> None:  # fmt: skip
     """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)"""
@@ -307,32 +307,33 @@ def split_update(
     for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
         node[lists[s], tl.N_COLUMN] = width - p
         width += dim_of_variable(var, lists[s])
-    zero(numbers, u, (m + 1) * ldu)
+    zero(numbers, u, fr.update_size(m + 1, wide))
     for s in range(start, start + kept):
         f = node[lists[s], tl.N_OWN]
         while f >= 0:
-            _add_far_end(f, lists[s], m, u, ldu, var, fac, node, link, hessian, numbers)
+            _add_far_end(f, lists[s], m, u, wide, var, fac, node, link, hessian, numbers)
             f = link[f, tl.L_OWN]
     child = row[tl.C_CHILD]
     while child >= 0:
         if clique[child, tl.C_ABOVE] < kept:
-            _add_child(child, m, u, ldu, var, node, clique, lists, numbers)
+            _add_child(child, m, u, wide, var, node, clique, lists, numbers)
         child = clique[child, tl.C_NEXT]
     for i in range(0, m + 1, TILE_ROWS):
         rows = min(TILE_ROWS, m + 1 - i)
-        take_off(numbers, rows, u + i * ldu, ldu, row[tl.C_ROWS] + p, row[tl.C_LD], i, i, m + 1, 0, p)
+        line, stride = u + fr.update_row(i, wide), fr.update_stride(i, wide)
+        take_off(numbers, rows, line, stride, row[tl.C_ROWS] + p, row[tl.C_LD], i, i, m + 1, 0, p)
 
 
 @inline_kernel
 def _add_far_end(
-    f: int, v: int, m: int, u: int, ldu: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
+    f: int, v: int, m: int, u: int, wide: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
 ) -> None:
     """What a factor owned by v adds to its other end, if that is not kept, and to the corner."""
     i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
     di = dim_of_variable(var, i)
     dj = dim_of_variable(var, j) if j >= 0 else 0
     g = h + di * di + di * dj + dj * dj
-    corner = u + m * ldu + m
+    corner = u + fr.update_row(m, wide) + m
     put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
     other = j if i == v else i
     if other < 0 or var[other, at.V_COLUMN] < 0 or node[other, tl.N_COLUMN] < 0:
@@ -342,7 +343,7 @@ def _add_far_end(
         h += di * di + di * dj
         g += di
     for a in range(d):
-        target = u + (c + a) * ldu
+        target = u + fr.update_row(c + a, wide)
         for b in range(a, d):
             put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
         put(numbers, target + m, load(numbers, target + m) + load(hessian, g + a))
@@ -350,35 +351,35 @@ def _add_far_end(
 
 @inline_kernel
 def _add_child(
-    child: int, m: int, u: int, ldu: int, var: I64, node: I64, clique: I64, lists: I64, numbers: F64
+    child: int, m: int, u: int, wide: int, var: I64, node: I64, clique: I64, lists: I64, numbers: F64
 ) -> None:
     """Add what a child's update matrix has in the columns of the separator and the right-hand side."""
     start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
-    end, source, stride = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_UPDATE], clique[child, tl.C_LDU]
-    last = clique[child, tl.C_BORDER]
+    end, last = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_BORDER]
+    source, width = clique[child, tl.C_UPDATE], clique[child, tl.C_WIDTH_UPDATE]
     x = 0
     for s in range(start, end):
         v = lists[s]
         dim, into = dim_of_variable(var, v), node[v, tl.N_COLUMN]
         if into >= 0:
             for a in range(dim):
-                line, target = source + (x + a) * stride, u + (into + a) * ldu
+                line, target = source + fr.update_row(x + a, width), u + fr.update_row(into + a, wide)
                 for b in range(a, dim):
                     put(numbers, target + into + b, load(numbers, target + into + b) + load(numbers, line + x + b))
                 put(numbers, target + m, load(numbers, target + m) + load(numbers, line + last))
             y = x + dim
             for t in range(s + 1, end):
                 w = lists[t]
-                wide, across = dim_of_variable(var, w), node[w, tl.N_COLUMN]
+                dims, across = dim_of_variable(var, w), node[w, tl.N_COLUMN]
                 if across >= 0:
                     for a in range(dim):
-                        line = source + (x + a) * stride + y
-                        for b in range(wide):
-                            target = u + (into + a) * ldu + across + b
+                        line = source + fr.update_row(x + a, width) + y
+                        for b in range(dims):
+                            target = u + fr.update_row(into + a, wide) + across + b
                             if across < into:
-                                target = u + (across + b) * ldu + into + a
+                                target = u + fr.update_row(across + b, wide) + into + a
                             put(numbers, target, load(numbers, target) + load(numbers, line + b))
-                y += wide
+                y += dims
         x += dim
-    corner = u + m * ldu + m
-    put(numbers, corner, load(numbers, corner) + load(numbers, source + last * stride + last))
+    corner = u + fr.update_row(m, wide) + m
+    put(numbers, corner, load(numbers, corner) + load(numbers, source + fr.update_row(last, width) + last))

@@ -114,7 +114,7 @@ def renew(
         row = clique[renewed[k]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
         number_columns(row, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU])
+        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
             while f >= 0:
@@ -125,10 +125,10 @@ def renew(
             other = clique[child]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
             count = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
-            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_LDU], runs, count, row)
+            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, count, row)
             child = other[tl.C_NEXT]
         failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_LDU], floors, 0
+            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0
         )
         if failed >= 0:
             state[tl.S_FAILED] = variable_at(failed, row, var, lists)
@@ -152,11 +152,11 @@ def take_blocks(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64) -
         row = clique[renewed[k]]
         old[k, 0], old[k, 1], old[k, 2] = row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], row[tl.C_ROWS]
         old[k, 3], old[k, 4], old[k, 5] = row[tl.C_LD], row[tl.C_USED], row[tl.C_UPDATE]
-        old[k, 6], old[k, 7] = row[tl.C_LDU], row[tl.C_UPDATE_BLOCK_SIZE]
+        old[k, 6], old[k, 7] = row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE]
         lead, row[tl.C_LD], used, size = row_layout(row[tl.C_PIVOTS], row[tl.C_BORDER])
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used
-        row[tl.C_LDU], size = update_layout(row[tl.C_BORDER])
+        row[tl.C_WIDTH_UPDATE], size = update_layout(row[tl.C_BORDER])
         row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = take_numbers(size, numbers, state)
     return True
 
@@ -170,7 +170,7 @@ def give_back_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: 
         give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], row[tl.C_ROWS] = old[k, 0], old[k, 1], old[k, 2]
         row[tl.C_LD], row[tl.C_USED], row[tl.C_UPDATE] = old[k, 3], old[k, 4], old[k, 5]
-        row[tl.C_LDU], row[tl.C_UPDATE_BLOCK_SIZE] = old[k, 6], old[k, 7]
+        row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = old[k, 6], old[k, 7]
         row[tl.C_MARK] = state[tl.S_STAMP]
 
 
