@@ -96,14 +96,20 @@ def unknown(like: Batch) -> Batch:
     return Batch((), (Factors("between_se2", np.array([[-1, -2]]), np.zeros((1, 3)), like.factors[0].information[:1]),))
 
 
-def test_it_takes_the_place_with_what_came_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
-    leave, order_anew = threading.Event(), Solver.order_anew
+@pytest.fixture
+def leave(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """The other solver is not made before this is set."""
+    given, order_anew = threading.Event(), Solver.order_anew
 
     def waiting(solver: Solver, content: Any) -> Any:
-        assert leave.wait(PATIENCE_S)
+        assert given.wait(PATIENCE_S)
         return order_anew(solver, content)
 
     monkeypatch.setattr(Solver, "order_anew", waiting)
+    return given
+
+
+def test_it_takes_the_place_with_what_came_meanwhile(leave: threading.Event) -> None:
     driven, plain = Driven(ALWAYS), Driven(0.0)
     batches = [step.batch for step in manhattan(400, 1)]
     n = 0
@@ -187,7 +193,7 @@ def test_a_change_of_the_map_lets_it_go() -> None:
     assert not driven.replaced
 
 
-def test_what_was_refused_for_a_limit_is_not_given_to_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_refused_for_a_limit_is_not_given_to_the_other(leave: threading.Event) -> None:
     driven = Driven(ALWAYS)
     batches = [step.batch for step in manhattan(150, 1)]
     for batch in batches[:101]:
@@ -197,6 +203,7 @@ def test_what_was_refused_for_a_limit_is_not_given_to_the_other(monkeypatch: pyt
     driven.insert(batches[101])
     assert not isinstance(driven.outcomes[-1].answer, bytes)
     driven.folder._limits = Limits()
+    leave.set()
     driven.wait()
     for batch in batches[101:]:
         driven.insert(batch)
