@@ -1,5 +1,6 @@
 """A map that is ordered anew beside its steps: another solver takes the place, with all that the first one has."""
 
+import queue
 import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -13,8 +14,10 @@ from factorbus.proto.messages import Batch, Change, Delta, Factors, Insert, Vari
 from factorbus.service import reordering
 from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Arrived, Judged, Outcome, Stepped
+from factorbus.service.core import MapCore
+from factorbus.service.events import Arrived, Effect, Judged, Outcome, Publish, Stepped
 from factorbus.service.fold import Folder
+from factorbus.service.host import Host
 from factorbus.service.questions import Question
 from factorbus.service.reordering import Reordering
 from factorbus.simulate import manhattan
@@ -179,6 +182,33 @@ def test_it_is_not_begun(grown: float, room: int, options: dict[str, Any]) -> No
     for step in manhattan(150, 1):
         driven.insert(step.batch)
         assert not driven.beside.busy
+
+
+def test_a_map_to_which_nothing_comes_any_more_has_it_with_the_next_tick() -> None:
+    deltas: queue.SimpleQueue[Delta] = queue.SimpleQueue()
+
+    def perform(effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Publish) and effect.channel == "delta":
+                deltas.put(codec.decode_delta(effect.message))
+
+    folder = Folder(lambda: Solver(Options()), EPOCH, Limits())
+    beside, core = Reordering(folder, ALWAYS, lambda: PLENTY, "m"), MapCore("m", "auto", EPOCH, Limits(), 0.0)
+    host = Host(
+        core, folder, perform, perform, lambda reads, taken: None, threading.Lock(),
+        lambda asker, answer, delta: deltas.put(codec.decode_delta(delta)), None, beside,
+    )  # fmt: skip
+    drive, *loops = shuffled(400)
+    everything = Batch(drive.variables, (*drive.factors, *(factors for loop in loops for factors in loop.factors)))
+    try:
+        host.insert(arrived(Insert(1, everything))._replace(askers=["first"]))
+        assert deltas.get(timeout=PATIENCE_S).revision == 1
+        while deltas.empty():
+            host.tick()
+        assert "fresh order" in deltas.get().report["because"]
+        assert not beside.busy
+    finally:
+        host.end()
 
 
 def test_a_change_of_the_map_lets_it_go() -> None:

@@ -66,7 +66,7 @@ class MapCore:
         self._reads: deque[Read] = deque()
         self._running: Run | None = None
         self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
-        self._must_reload = False
+        self._must_reload = self._must_tidy = False
         self._started = self._ended = 0.0
         self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
         self._closing: Problem | None = None
@@ -232,6 +232,11 @@ class MapCore:
         self._account.count()
         return self._admission.expire(now)
 
+    def tidy(self, now: float) -> list[Effect]:
+        """Something waits for the end of a Run: there is to be one, with nothing in it if nothing comes."""
+        self._must_tidy = self._closing is None
+        return self._go_on([], now)
+
     def stop(self, now: float) -> list[Effect]:
         """Take nothing new; Drained comes when everything accepted is answered."""
         self._closing = ShuttingDown()
@@ -281,11 +286,11 @@ class MapCore:
             return effects
         limits = self._limits
         room = self._has_room()
-        if self._reads or self._must_reload or (self._admission.ready and room):
+        if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room):
             reads, inserts = tuple(self._reads), self._admission.take(limits.fold) if room else ()
             self._running = Run(reads, inserts, self._is_short(reads, inserts, now), self._must_reload)
             self._reads.clear()
-            self._must_reload = False
+            self._must_reload = self._must_tidy = False
             self._unjudged += len(inserts)
             self._unjudged_bytes += sum([insert.size for insert in inserts])
             self._started = now

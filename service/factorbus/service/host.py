@@ -119,6 +119,8 @@ class Host:
         """Time went by."""
         with self._lock:
             effects = self.core.tick(time.monotonic())
+            if self._reordering is not None and self._reordering.waits:
+                effects += self.core.tidy(time.monotonic())
         self._perform(effects)
 
     def account(self) -> dict[str, Any]:

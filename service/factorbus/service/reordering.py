@@ -54,6 +54,12 @@ class Reordering:
         """Whether another solver is on its way, which no restart could make again from a snapshot taken now."""
         return self._beside is not None
 
+    @property
+    def waits(self) -> bool:
+        """Whether it goes on with the end of the next Run, on whatever thread this is asked."""
+        beside = self._beside
+        return beside is not None and not beside.orders
+
     def after(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], fold: int) -> Stepped | None:
         """A Run has ended; gives the step by which another solver took the place of the map's.
 
@@ -95,6 +101,11 @@ class _Beside:
         self._thread = threading.Thread(target=self._order, args=(content,), name=f"order {name}", daemon=True)
         self._thread.start()
 
+    @property
+    def orders(self) -> bool:
+        """Whether the other solver is still being made."""
+        return self._thread.is_alive()
+
     def note(self, inserts: Sequence[Arrived]) -> None:
         """These were folded in."""
         self._noted.append(_Noted(inserts, self._folder.size))
@@ -103,7 +114,7 @@ class _Beside:
         """(whether it goes on, the step by which it took the place)."""
         if self._folder.solver is not self._solver:
             return False, None
-        if self._thread.is_alive():
+        if self.orders:
             return True, None
         other = self._other
         if other is None:
