@@ -133,17 +133,23 @@ def test_every_data_set_has_bars_and_the_mean_wants_them_all() -> None:
 def drive(last: dict[str, float], **more: Any) -> list[Verdict]:
     windows = [{"from": 1_000, "to": 2_000, "p50": 1.0, "p99": 2.0}, {"from": 90_000, "to": 100_000, **last}]
     memory = [
-        {"poses": n, "resident": 7, "used": int(1_000 * n * f)} for n, f in ((500, 9), (1_000, 1), (100_000, 1.19))
+        {"poses": n, "resident": 7, "used": int(1_000 * n * f), "nonzeros": 50 * n}
+        for n, f in ((500, 9), (1_000, 1), (100_000, 1.19))
     ]
     found = {"status": "done", "reason": "", "poses": 100_000, "windows": windows, "memory": memory, **more}
     return peer_targets.judge_growth(found)
 
 
 def test_growth_is_held_between_the_first_and_the_last_window() -> None:
-    assert [v.verdict for v in drive({"p50": 1.49, "p99": 7.9})] == [MET] * 3
-    assert [v.verdict for v in drive({"p50": 1.51, "p99": 8.1})] == [MISSED, MISSED, MET]
-    coarse = [{"poses": n, "resident": int(1_000 * n * f)} for n, f in ((1_000, 9), (10_000, 1), (100_000, 1.21))]
-    assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=coarse)] == [MET, MET, MISSED]
+    assert [v.verdict for v in drive({"p50": 1.49, "p99": 7.9})] == [MET] * 4
+    assert [v.verdict for v in drive({"p50": 1.51, "p99": 8.1})] == [MISSED, MISSED, MET, MET]
+    coarse = [
+        {"poses": n, "resident": int(1_000 * n * f), "nonzeros": 0}
+        for n, f in ((1_000, 9), (10_000, 1), (100_000, 1.21))
+    ]
+    assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=coarse)] == [MET, MET, MISSED, NOT_MEASURED]
+    denser = [{"poses": n, "used": 1_000 * n * f, "nonzeros": 50 * n * f} for n, f in ((1_000, 1), (100_000, 9))]
+    assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=denser)] == [MET, MET, MISSED, MET]
     assert {v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, poses=50_000)} == {NOT_MEASURED}
     assert {v.verdict for v in drive({}, status="failed", reason="step 3: x")} == {MISSED}
     assert peer_targets.judge_growth(None) == []
@@ -158,6 +164,7 @@ def test_growth_of_a_short_drive() -> None:
     assert all(0 < w["p50"] <= w["p99"] <= w["max"] for w in found["windows"])
     assert [each["poses"] for each in found["memory"]] == [500, 1000, 1200]
     assert found["memory"][-1]["resident"] > 0
+    assert all(10 < row["used"] / row["nonzeros"] < 200 for row in found["memory"])
     assert seen == list(range(1, 1201))
     ended = growth.growth({"limit_s": 1e-9, "mode": "inc-l"}, world, SILENT)
     assert (ended["status"], ended["poses"]) == ("limit", 1)

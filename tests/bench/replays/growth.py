@@ -26,9 +26,9 @@ _TOUCH = 1e-9  # any number but 0: memory counts when it has been written to
 
 
 def growth(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """windows: {from, to, p50, p95, p99, max, mean (ms)}; memory: by number of poses."""
+    """windows: {from, to, p50, p95, p99, max, mean (ms)}; memory: by number of poses, with the nonzeros of R."""
     warm()
-    _drive(Solver(Options(mode=job["mode"])), problem.shortened(_WARM), np.full(_WARM, _TOUCH), lambda _: None, np.inf)
+    _drive(Solver(Options(mode=job["mode"])), problem.shortened(_WARM), np.full(_WARM, _TOUCH), lambda *_: None, np.inf)
     seconds, memory = np.full(problem.poses, _TOUCH), []
     solver = Solver(Options(mode=job["mode"]))
     gc.collect()
@@ -36,9 +36,10 @@ def growth(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]
     gc.disable()
     before = resident_bytes()
 
-    def look(done: int) -> None:
+    def look(done: int, nonzeros: int) -> None:
         if done in EDGES or done == problem.poses:
-            memory.append({"poses": done, "resident": resident_bytes() - before, **_offered(solver)})
+            sizes = {"resident": resident_bytes() - before, **_offered(solver)}
+            memory.append({"poses": done, "nonzeros": nonzeros, **sizes})
         tell({"done": done, "cpu_s": round(float(seconds[:done].sum()), 2)})
 
     try:
@@ -59,7 +60,7 @@ def growth(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]
 
 
 def _drive(
-    solver: Solver, problem: Problem, seconds: np.ndarray, look: Callable[[int], None], limit_s: float
+    solver: Solver, problem: Problem, seconds: np.ndarray, look: Callable[[int, int], None], limit_s: float
 ) -> tuple[int, str]:
     """(steps done, why it went no further); fills `seconds`."""
     spent = 0.0
@@ -68,13 +69,13 @@ def _drive(
             start = time.process_time()
             try:
                 solver.stage(batch)
-                solver.step()
+                report = solver.step()
                 solver.changed()
             except SolverError as problem_seen:
                 return k, f"step {k}: {problem_seen.code}: {problem_seen}"
             seconds[k] = time.process_time() - start
             spent += seconds[k]
-            look(k + 1)
+            look(k + 1, report.nnz_r)
             if spent > limit_s:
                 return k + 1, ""
     return problem.poses, ""
