@@ -148,8 +148,12 @@ def test_growth_is_held_between_the_first_and_the_last_window() -> None:
         for n, f in ((1_000, 9), (10_000, 1), (100_000, 1.21))
     ]
     assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=coarse)] == [MET, MET, MISSED, NOT_MEASURED]
-    denser = [{"poses": n, "used": 1_000 * n * f, "nonzeros": 50 * n * f} for n, f in ((1_000, 1), (100_000, 9))]
-    assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=denser)] == [MET, MET, MISSED, MET]
+    for denser, verdict in ((9, MET), (7, MISSED), (20, MET)):
+        memory = [
+            {"poses": n, "used": 1_000 * n * f, "nonzeros": 50 * n * g}
+            for n, f, g in ((1_000, 1, 1), (100_000, 9, denser))
+        ]
+        assert [v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, memory=memory)] == [MET, MET, MISSED, verdict]
     assert {v.verdict for v in drive({"p50": 1.0, "p99": 2.0}, poses=50_000)} == {NOT_MEASURED}
     assert {v.verdict for v in drive({}, status="failed", reason="step 3: x")} == {MISSED}
     assert peer_targets.judge_growth(None) == []

@@ -73,7 +73,7 @@ def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
         f"{GROWN_FROM} to {GROWN_TO} poses: median step time grows by less than {GROWN_P50} x",
         f"{GROWN_FROM} to {GROWN_TO} poses: p99 step time grows by less than {GROWN_P99} x",
         f"memory per pose is constant within {GROWN_MEMORY - 1:.0%}",
-        f"memory per nonzero of R is constant within {GROWN_MEMORY - 1:.0%}",
+        f"memory per nonzero of R grows by no more than {GROWN_MEMORY - 1:.0%}",
     )
     if found is None:
         return []
@@ -89,18 +89,15 @@ def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
         verdicts.append(_verdict(what, f"{grown:.2f} x ({first[name]:.3f} to {last[name]:.3f} ms)", grown < limit))
     each = bytes_per_pose(found["memory"])
     kilobytes = ", ".join(f"{poses}: {size / 1024:.2f} KiB" for poses, size in each)
-    verdicts.append(_constant(words[2], [size for _, size in each], kilobytes))
+    spread = max(size for _, size in each) / min(size for _, size in each)
+    verdicts.append(_verdict(words[2], f"{spread:.2f} x ({kilobytes})", spread <= GROWN_MEMORY))
     nonzeros = {row["poses"]: row["nonzeros"] for row in found["memory"]}
     each = [(poses, size * poses / nonzeros[poses]) for poses, size in each if nonzeros[poses]]
     if not each:
         return [*verdicts, Verdict(words[3], "R is not kept", NOT_MEASURED)]
     sizes = ", ".join(f"{poses}: {size:.1f} bytes" for poses, size in each)
-    return [*verdicts, _constant(words[3], [size for _, size in each], sizes)]
-
-
-def _constant(what: str, sizes: list[float], seen: str) -> Verdict:
-    spread = max(sizes) / min(sizes)
-    return _verdict(what, f"{spread:.2f} x ({seen})", spread <= GROWN_MEMORY)
+    grown = max(size for _, size in each) / each[0][1]
+    return [*verdicts, _verdict(words[3], f"{grown:.2f} x ({sizes})", grown <= GROWN_MEMORY)]
 
 
 def judge_passes(found: dict[str, dict[str, Any]]) -> list[Verdict]:
