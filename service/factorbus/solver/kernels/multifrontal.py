@@ -61,7 +61,7 @@ def put_block(a: F64, blocks: I64, b: int, ld: int, values: F64, source: int, on
 
 @inline_kernel
 def extend_add(a: F64, child: int, width: int, runs: I64, run: int, run_end: int, front: I64) -> None:
-    """Add the update matrix at `child` into the front above it, run by run."""
+    """Add the update matrix at `child`, its first rows `width` wide, into the front above it, run by run."""
     p, r, ld, u, wide = front[fr.PIVOTS], front[fr.ROWS], front[fr.LD_ROWS], front[fr.UPDATE], front[fr.WIDTH_UPDATE]
     for s in range(run, run_end):
         first, count, into = runs[s, 0], runs[s, 1], runs[s, 2]

@@ -223,7 +223,10 @@ def list_runs(start: int, end: int, column: I64, p: int, m: int, var: I64, node:
 
 @part
 def extend_add(a: F64, child: int, width: int, runs: I64, count: int, row: I64) -> None:
-    """Add the update matrix at `child` into a front, run by run; a pair of runs in another order there is turned."""
+    """Add the update matrix at `child`, its first rows `width` wide, into a front, run by run.
+
+    A pair of runs in another order there is turned.
+    """
     for s in range(count):
         first, length, into = runs[s, 0], runs[s, 1], runs[s, 2]
         for i in range(length):
@@ -300,7 +303,10 @@ def split_update(
     c: int, p: int, m: int, u: int, wide: int,
     var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
 ) -> None:  # fmt: skip
-    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)"""
+    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)
+
+    u, wide: where it goes, and the width of its first rows
+    """
     row = clique[c]
     start, kept = row[tl.C_LIST], row[tl.C_FIRST]
     width = 0
