@@ -178,8 +178,12 @@ def test_what_waits_for_the_end_of_a_run_gets_one(core: MapCore) -> None:
     assert (run.inserts, run.reads, run.short) == ((), (), False)
     assert solved(core, run) == [], "and no more than one"
     run = run_of(core.insert(insert("a", 1)))
-    assert core.tidy(0.0) == []
-    assert run_of(solved(core, run)).inserts == ()
+    assert core.tidy(0.0) == [], "there is one"
+    assert not any(isinstance(effect, Run) for effect in solved(core, run))
+    core.block(Internal("x"), 0.0)
+    assert core.tidy(0.0) == [], "nothing can be kept"
+    core.unblock()
+    assert run_of(core.tidy(0.0)).inserts == ()
     core = MapCore("m", "auto", 5, Limits(), now=0.0)
     core.stop(0.0)
     assert core.tidy(0.0) == [], "a map that is drained has none"

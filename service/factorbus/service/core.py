@@ -233,8 +233,8 @@ class MapCore:
         return self._admission.expire(now)
 
     def tidy(self, now: float) -> list[Effect]:
-        """Something waits for the end of a Run: there is to be one, with nothing in it if nothing comes."""
-        self._must_tidy = self._closing is None
+        """Something waits for the end of a Run: where there is none, one with nothing in it, if it can be kept."""
+        self._must_tidy = self._running is None and self._closing is None and not self._admission.blocked
         return self._go_on([], now)
 
     def stop(self, now: float) -> list[Effect]:
