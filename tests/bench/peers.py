@@ -5,6 +5,7 @@
     replays    pose by pose, all eleven data sets: CPU time of `auto`, all variables read after every step, against that
                of iSAM2's `update()` alone; long steps; χ²/χ²_batch at every hundredth step and the last
     growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
+    cores      what a second core brings for the longest steps of 20,000 poses, by the clock
     full-pass  relinearise, order, analyse, factorise and solve each final system, against CHOLMOD with OpenBLAS
     overhead   what Python adds to the compiled calls of a step; the start of a process; compiling from nothing
 
@@ -12,15 +13,16 @@ Every run is a process of its own on one core, three repetitions, medians, and i
 (out/bench/peers): a second call goes on where the first was stopped and measures only what is new or changed.
 --quick takes two minutes, and does not judge what it shortens.  Without data sets it replays simulated worlds.
 
-NAME is a part (replays, growth, full-pass, overhead), a data set (intel, w10000, ...) or a solver: auto, isam2-0.1, and
-when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop) or another of our
-modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code is 1 when a target is missed.
+NAME is a part (replays, growth, cores, full-pass, overhead), a data set (intel, w10000, ...) or a solver: auto,
+isam2-0.1, and when asked for isam2-0.01, gn-loop (one Gauss-Newton step on a fresh block Cholesky at every loop) or
+another of our modes (all-batch, inc-l, ...); --judge holds that against the targets.  The exit code is 1 when a target
+is missed.
 """
 
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -34,7 +36,9 @@ from bench.replays.contestants import ENTRIES, OURS, PEER, STAND_IN, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
 
-PARTS = ("replays", "growth", "full-pass", "overhead")
+from factorbus.service.cores import core_count
+
+PARTS = ("replays", "growth", "cores", "full-pass", "overhead")
 OUR_MODES = tuple(name for name, entry in ENTRIES.items() if entry.solver == OURS)
 SOLVERS = {
     **{name: name for name in (*OUR_MODES, "gn-loop")},
@@ -42,6 +46,7 @@ SOLVERS = {
 }
 GROWTH = Problem("manhattan", "Manhattan", poses=100_000, seed=1)
 _QUICK_GROWTH = 2_000
+_CORES_POSES = 20_000
 _OVERHEAD_POSES = 1_000
 _PASSES, _QUICK_PASSES = 15, 5
 
@@ -63,7 +68,7 @@ class Plan:
         replays = len(self.chosen) * len(self.entries) * self.repetitions if "replays" in self.parts else 0
         growth = self.repetitions if "growth" in self.parts else 0
         passes = len(self.chosen) if "full-pass" in self.parts else 0
-        return references + replays + growth + passes + ("overhead" in self.parts)
+        return references + replays + growth + passes + ("cores" in self.parts) + ("overhead" in self.parts)
 
 
 def main() -> None:
@@ -89,8 +94,9 @@ def main() -> None:
 
 
 def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, Any]:
-    """references and runs by data set; growth, full_pass and overhead where they are in the plan."""
-    found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}, "overhead": None}
+    """references and runs by data set; growth, cores, full_pass and overhead where they are in the plan."""
+    found: dict[str, Any] = {"references": {}, "runs": {}, "growth": [], "full_pass": {}}
+    found |= {"cores": None, "overhead": None}
     if {"replays", "full-pass"} & set(plan.parts):
         for problem in plan.chosen:
             begin(f"{problem.key}: optima", problem.steps)
@@ -103,6 +109,11 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
             begin(f"growth to {world.poses}", world.poses)
             more = {"limit_s": settings.limit_s, "mode": plan.judged}
             found["growth"].append(_measured(settings, world, "growth", more, progress, repetition))
+    if "cores" in plan.parts:
+        world = GROWTH.shortened(_QUICK_GROWTH if plan.quick else _CORES_POSES)
+        begin(f"cores to {world.poses}", world.poses)
+        more = {"mode": plan.judged, "cores": core_count()}
+        found["cores"] = _measured(replace(settings, core=None), world, "cores", more, progress)
     if "full-pass" in plan.parts:
         count = _QUICK_PASSES if plan.quick else _PASSES
         for problem in plan.chosen:
@@ -152,6 +163,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
     verdicts = [
         *peer_targets.judge(rows, ends, plan.judged),
         *peer_targets.judge_growth(growth),
+        *peer_targets.judge_cores(found["cores"], _CORES_POSES),
         *peer_targets.judge_passes(found["full_pass"]),
         *peer_targets.judge_overhead(overhead),
     ]
@@ -161,6 +173,7 @@ def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[d
         "judged": plan.judged,
         "rows": rows,
         "growth": growth,
+        "cores": found["cores"],
         "full_pass": found["full_pass"],
         "overhead": overhead,
         "targets": [{"what": v.what, "seen": v.seen, "verdict": v.verdict} for v in verdicts],

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench.replays import full_pass, growth, overhead, peer_summary, peer_table, peer_targets
+from bench.replays import cores, full_pass, growth, overhead, peer_summary, peer_table, peer_targets
 from bench.replays.columns import columns_of
 from bench.replays.contestants import ENTRIES, PEER, STAND_IN
 from bench.replays.peer_targets import BARS
@@ -176,6 +176,26 @@ def test_growth_of_a_short_drive() -> None:
     assert "| 1000 to 1200 |" in text
 
 
+def test_a_second_core_is_judged_by_the_longest_steps() -> None:
+    found = {"status": "done", "poses": 900, "same_bits": True}
+    found["longest"] = {"steps": 9, "alone": 10.0, "together": 8.9}
+    assert [v.verdict for v in peer_targets.judge_cores(found, 900)] == [MET, MET]
+    assert [v.verdict for v in peer_targets.judge_cores(found, 901)] == [NOT_MEASURED, MET]
+    found |= {"same_bits": False, "longest": {"steps": 9, "alone": 10.0, "together": 9.1}}
+    assert [v.verdict for v in peer_targets.judge_cores(found, 900)] == [MISSED, MISSED]
+    one = cores.cores({"mode": "auto", "cores": 1}, Problem("manhattan", "Manhattan", poses=9), SILENT)
+    assert {v.verdict for v in peer_targets.judge_cores(one, 9)} == {NOT_MEASURED}
+    assert "one core" in peer_table.cores_table(one)
+    assert peer_targets.judge_cores(None, 9) == []
+
+
+def test_a_short_drive_on_one_core_and_on_two() -> None:
+    found = cores.cores({"mode": "auto", "cores": 2}, Problem("manhattan", "Manhattan", poses=450, seed=3), SILENT)
+    assert (found["status"], found["poses"], found["longest"]["steps"]) == ("done", 450, 4)
+    assert found["same_bits"]
+    assert "| two cores |" in peer_table.cores_table(found)
+
+
 def factors_of(problem: Problem) -> int:
     return sum(batch.factor_count for batch in load(problem))
 
@@ -288,6 +308,7 @@ def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
     assert by_name["auto"]["work"]["options"]["mode"] == "auto"
     assert document["full_pass"]["city_trees-600"]["residual"]["ours"] < 1e-14
     assert document["growth"] is None
+    assert document["cores"] is None
     assert document["overhead"] is None
     assert [Path(path).name for path in document["figures"]] == [f"peers_{n}.png" for n in ("steps", "time", "ratios")]
     assert all(Path(path).stat().st_size > 10_000 for path in document["figures"])
@@ -302,4 +323,4 @@ def test_an_unknown_name_is_refused_with_those_there_are() -> None:
         [sys.executable, str(PEERS), "--only", "intle"], capture_output=True, text=True, timeout=60, check=False
     )
     assert ran.returncode == 1
-    assert "--only intle: none of the parts (replays, growth, full-pass, overhead)" in ran.stderr
+    assert "--only intle: none of the parts (replays, growth, cores, full-pass, overhead)" in ran.stderr

@@ -38,6 +38,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ("listen = []", "nothing to listen on"),
         ('maps = "a/*"', "wanted a map name"),
         ("job_deadline_s = -1", "wanted more than 0"),
+        ("cores = 0", "cores is 0; wanted 1"),
         ("mode = ", "not TOML"),
     ],
 )

@@ -61,7 +61,7 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
         return popen([sys.executable, "-c", f"from factorbus.service import warm\n{telling}"], **how)
 
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
-    monkeypatch.setattr(together, "_cores", lambda: 2)
+    monkeypatch.setattr(together, "core_count", lambda: 2)
     before, told = together.compiled_seconds(), []
     together.warm(told.append)
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
@@ -73,7 +73,7 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
 def test_memory_is_spent_to_save_time_where_each_process_has_plenty(
     monkeypatch: pytest.MonkeyPatch, gigabytes: int, collects: bool
 ) -> None:
-    monkeypatch.setattr(together, "_cores", lambda: 2)
+    monkeypatch.setattr(together, "core_count", lambda: 2)
     monkeypatch.setattr(together, "available", lambda: gigabytes << 30)
     before = gc.get_threshold()
     try:

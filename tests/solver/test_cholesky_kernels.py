@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from naive.elimination import partial_cholesky
 
 from factorbus.solver.kernels import _jit, simd_plain
-from factorbus.solver.kernels.dense import DEPTH, factor_front
+from factorbus.solver.kernels.dense import factor_front
 from factorbus.solver.kernels.fronts import GROUP, SCRATCH, padded, update_row, update_size
+from factorbus.solver.kernels.panels import DEPTH
 from factorbus.solver.kernels.simd import LANES, add_run, six, solve_rows, tile, zero
+from factorbus.solver.lending import BOARD
 
 
 @given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))
@@ -115,7 +117,7 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
         put += width - first
     assert put == start + size
     floors = np.zeros(p) if floors is None else floors
-    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0)
+    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0, 0, BOARD)
     assert np.isnan(arena[-8:]).all()
     result = np.zeros((m, m))
     for i, row in enumerate(update):

@@ -34,7 +34,8 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
-               growth to 100,000 poses, full passes against CHOLMOD, Python's share; hours; --quick: two minutes
+               growth to 100,000 poses, a second core, full passes against CHOLMOD, Python's share; hours;
+               --quick: two minutes
     fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
     journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;

@@ -9,6 +9,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
           answers 0..3     answers to questions, which can be large
           in-place <kind>  jobs when there is no worker
           features         questions of filters: small ones done, large ones cut up and put together
+          core 1..         what lends its core to eliminations that take long
 """
 
 import logging
@@ -27,6 +28,7 @@ from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.arrival import read_insert
 from factorbus.service.bus import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
 from factorbus.service.config import BadConfig, Config, checked
+from factorbus.service.cores import LentCores
 from factorbus.service.delivery import Delivery
 from factorbus.service.events import Asked, Asker, Refuse
 from factorbus.service.features import Features
@@ -69,7 +71,11 @@ def serve(
         if config.standby:
             library = open_library(config, log_owner, stop)
         if not stop.is_set():
-            _serve(config, library, on_ready, stop, on_look)
+            cores = LentCores(config.cores)
+            try:
+                _serve(config, library, cores, on_ready, stop, on_look)
+            finally:
+                cores.close()
     finally:
         if library is not None:
             library.close()
@@ -78,6 +84,7 @@ def serve(
 def _serve(
     config: Config,
     library: Library | None,
+    cores: LentCores,
     on_ready: Callable[[list[str]], None],
     stop: threading.Event,
     on_look: Callable[[Health], None],
@@ -85,6 +92,7 @@ def _serve(
     bus = open_bus(config)
     try:
         shell = Shell(bus, config, library)
+        shell.vitals.chapters["cores"] = cores.account
         try:
             for name in config.create:
                 shell.maps.create(name, None)

@@ -82,6 +82,9 @@ def families(account: Mapping[str, Any]) -> Iterator[Family]:
     yield _by(
         "silent_seconds", "gauge", "How long a thread has not come to its next work", "thread", account["silent_s"]
     )
+    cores = account.get("cores", {"used": 1, "pieces": 0})
+    yield _one("cores", "gauge", "Cores that one elimination may be at work on", cores["used"])
+    yield _one("pieces", "counter", "Pieces of eliminations made on other cores than the map's own", cores["pieces"])
     yield from _of_workers(account.get("workers", ()))
     yield from _of_maps(account["maps"])
     yield from _extra("journal", "", {"": account.get("journal", {})})

@@ -22,6 +22,7 @@ from factorbus import solver
 from factorbus.idp import kernels as idp_kernels
 from factorbus.idp import warm as warm_idp
 from factorbus.service import kernels
+from factorbus.service.cores import core_count
 from factorbus.service.memory import available
 from factorbus.service.shares import Shares, functions_of
 from factorbus.solver.warm import iter_compile, list_missing
@@ -41,7 +42,7 @@ def warm(progress: Callable[[str], None] | None = None) -> float:
     """
     started = time.monotonic()
     if missing := _list_missing():
-        _share_out(min(_cores(), _MOST, -(-len(missing) // _FEW)), progress)
+        _share_out(min(core_count(), _MOST, -(-len(missing) // _FEW)), progress)
         _apart.append(time.monotonic() - started)
     solver.warm()
     warm_idp()
@@ -86,7 +87,7 @@ def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
 def _look_less() -> None:
     """To look for what the compiler has dropped takes a tenth of the time; done rarely, half of that.  Where there is
     memory for all of it, it is not done."""
-    if available() >= _PLENTY * min(_cores(), _MOST):
+    if available() >= _PLENTY * min(core_count(), _MOST):
         gc.disable()
     else:
         gc.set_threshold(20_000, 20, 1000)
@@ -105,11 +106,6 @@ def _end(process: subprocess.Popen) -> None:
     """At once, if it has not ended: whoever started it is going away."""
     process.kill()
     process.wait()
-
-
-def _cores() -> int:
-    """That this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.backsub import into_elimination_order, into_insertion_order, solve_lower, solve_upper
 from factorbus.solver.kernels.multifrontal import factorize
+from factorbus.solver.lending import BOARD
 from factorbus.solver.ordering import integers
 from factorbus.solver.symbolic import Symbolic
 
@@ -39,8 +40,9 @@ class Cholesky:
         _check_blocks(symbolic, data, offsets)
         self._reserve(symbolic)
         failed = factorize(
-            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors
-        )
+            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors,
+            BOARD,
+        )  # fmt: skip
         if failed >= 0:
             return symbolic.variable_at(failed)
         self._symbolic = symbolic

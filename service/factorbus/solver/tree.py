@@ -15,6 +15,7 @@ from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.tree_begin import HESSIAN
 from factorbus.solver.kernels.tree_moved import exchange, list_moved
 from factorbus.solver.kernels.tree_step import tree_step
+from factorbus.solver.lending import BOARD
 from factorbus.solver.options import Options
 
 _FEW = 8  # new variables for which good first values are looked for
@@ -77,7 +78,7 @@ class Tree(Arenas):
         """
         if sure:
             self.state[tl.S_CHECKED] = 1
-        while (status := tree_step(self._graph.places(), self.places())) == tl.NO_ROOM:
+        while (status := tree_step(self._graph.places(), self.places(), BOARD)) == tl.NO_ROOM:
             self._make_room()
         return status
 

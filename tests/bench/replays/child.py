@@ -133,7 +133,7 @@ _JOBS: dict[str, Job] = {
     "replay": replay,
     "reference": reference,
     "fill": fill,
-    **{kind: _measure(kind) for kind in ("growth", "full_pass", "overhead")},
+    **{kind: _measure(kind) for kind in ("growth", "cores", "full_pass", "overhead")},
 }
 
 

@@ -25,6 +25,8 @@ def report(document: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
             parts += [f"- {row['name']}: {row['note']}" for row in mine if row["status"] != "done"]
     if document["growth"]:
         parts += ["## Growth", growth_table(document["growth"])]
+    if document["cores"]:
+        parts += ["## A second core", cores_table(document["cores"])]
     if document["full_pass"]:
         parts += ["## A full batch pass", pass_table(document["full_pass"]), _PASS_LEGEND]
     if document["overhead"]:
@@ -67,6 +69,17 @@ def growth_table(found: dict[str, Any]) -> str:
     said = f"\n\n{found['factors']} factors, {found['cpu_s']:.1f} s in all."
     said += f" KiB a pose: {sizes}." if sizes else ""
     return "\n".join(lines) + said + (f" {found['reason']}" if found["reason"] else "")
+
+
+def cores_table(found: dict[str, Any]) -> str:
+    """Steps by the clock, on one core and with another one lent."""
+    if found["status"] == "failed":
+        return found["reason"]
+    names = ("p50", "p95", "p99", "max")
+    lines = [line([f"{found['poses']} poses, ms", *names]), line(["---", *["---:"] * len(names)])]
+    for name, words in (("alone", "one core"), ("together", "two cores")):
+        lines.append(line([words, *(f"{found[name][each]:.4f}" for each in names)]))
+    return "\n".join(lines)
 
 
 def pass_table(found: dict[str, dict[str, Any]]) -> str:

@@ -39,6 +39,7 @@ SETTLED = 1e-6
 SAME = 1e-6  # two ratios that differ by less are the same
 SOLVED = 1e-12
 GROWN_P50, GROWN_P99, GROWN_MEMORY = 1.5, 4.0, 1.2
+LENT = 0.9  # of the time that a long step takes alone
 GROWN_FROM, GROWN_TO = 1_000, 100_000
 OVERHEAD_US, ODOMETRY_US, START_S, COLD_S = 15.0, 10.0, 1.5, 60.0
 
@@ -98,6 +99,27 @@ def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
     sizes = ", ".join(f"{poses}: {size:.1f} bytes" for poses, size in each)
     grown = max(size for _, size in each) / each[0][1]
     return [*verdicts, _verdict(words[3], f"{grown:.2f} x ({sizes})", grown <= GROWN_MEMORY)]
+
+
+def judge_cores(found: dict[str, Any] | None, poses: int) -> list[Verdict]:
+    """A second core for the longest steps of a drive of so many poses."""
+    if found is None:
+        return []
+    words = (
+        f"with a second core the longest steps of {poses} poses take less than {LENT:g} of the time by the clock",
+        "the estimate is the same to the bit, with a second core and without",
+    )
+    if found["status"] == "failed":
+        return [Verdict(what, found["reason"], NOT_MEASURED) for what in words]
+    longest = found["longest"]
+    share = longest["together"] / longest["alone"]
+    seen = f"{share:.2f} ({longest['alone']:.1f} to {longest['together']:.1f} ms, the mean of {longest['steps']})"
+    return [
+        _verdict(words[0], seen, share < LENT)
+        if found["poses"] >= poses
+        else Verdict(words[0], f"{seen}, of {found['poses']} poses", NOT_MEASURED),
+        _verdict(words[1], "yes" if found["same_bits"] else "no", found["same_bits"]),
+    ]
 
 
 def judge_passes(found: dict[str, dict[str, Any]]) -> list[Verdict]:

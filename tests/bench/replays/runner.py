@@ -26,7 +26,12 @@ _HERE = Path(__file__).parent
 _MACHINERY = ("child", "chi2", "clock", "columns", "compose", "contestants", "samples")
 _REFERENCE = ("reference", "chi2", "columns", "samples")
 _FILL = ("fill", "columns")
-_MEASURES = {"growth": ("growth", "memory"), "full_pass": ("full_pass",), "overhead": ("overhead",)}
+_MEASURES = {
+    "growth": ("growth", "memory"),
+    "cores": ("cores",),
+    "full_pass": ("full_pass",),
+    "overhead": ("overhead",),
+}
 _GRACE_S = 600  # wall seconds on top of twice the limit, before a run that does not answer is ended
 Progress = Callable[[int, str], None]
 

@@ -38,7 +38,10 @@ RUN = 3
 BLOCK = 5
 STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 
-SCRATCH = 16  # the first doubles of an arena: room for a 4 x 4 triangle
+# The first doubles of an arena: room for a 4 x 4 triangle, for each thread that may be at it.
+LENDERS = 7  # threads besides the one whose arena it is
+SCRATCH_OF_ONE = 16
+SCRATCH = SCRATCH_OF_ONE * (1 + LENDERS)
 
 LANES = vector_lanes()
 GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time

@@ -7,14 +7,15 @@ from factorbus.solver.kernels.simd import add_run, at, put, zero
 
 
 @kernel(
-    "int64(int64[:,::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1], float64, float64[::1], float64[::1])"
+    "int64(int64[:,::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1], float64, float64[::1], float64[::1], "
+    "int64[::1])"
 )
 def factorize(
-    fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, floors: F64
+    fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, floors: F64, board: I64
 ) -> int:
     """Factorise Λ with its diagonal multiplied by 1 + damping.  Gives the scalar whose pivot failed, or -1.
 
-    in   values: blocks of Λ, block b row-major at offsets[b]
+    in   values: blocks of Λ, block b row-major at offsets[b]   board: where cores are lent, see `lent_cores`
     out  arena: rows of R   floors (n,): least pivot allowed;  scalars count in elimination order
     """
     for f in range(fronts.shape[0]):
@@ -31,7 +32,7 @@ def factorize(
             child = fronts[c]
             extend_add(arena, child[fr.UPDATE], child[fr.WIDTH_UPDATE], runs, child[fr.RUNS], child[fr.RUNS_END], front)
             c = child[fr.SIBLING]
-        failed = factor_front(arena, r, ld, p, m, u, width, floors, column)
+        failed = factor_front(arena, r, ld, p, m, u, width, floors, column, 0, board)
         if failed >= 0:
             return column + failed
     return -1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import DISABLED, intrinsic, ir, types
+from factorbus.solver.kernels._jit import DISABLED, inline_kernel, intrinsic, ir, types
 
 WIDTH = 3
 _WORD = 8
@@ -18,8 +18,13 @@ ints: Any
 floats: Any
 int_rows: Any
 float_rows: Any
+address_of: Any
 
 if DISABLED:
+
+    def _first_entry(array: Any) -> int:
+        """Where it is."""
+        return int(array.ctypes.data)
 
     def _plain(kind: type, dimensions: int) -> Any:
         def found(table: Any, entry: int) -> Any:
@@ -29,10 +34,21 @@ if DISABLED:
 
         return found
 
+    address_of = _first_entry
     ints, int_rows = _plain(np.int64, 1), _plain(np.int64, 2)
     floats, float_rows = _plain(np.float64, 1), _plain(np.float64, 2)
 
 else:
+
+    @intrinsic
+    def _entry(_typing: Any, array: Any) -> Any:
+        """Where the first entry of the array is."""
+
+        def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            data = context.make_array(signature.args[0])(context, builder, args[0]).data
+            return builder.ptrtoint(data, ir.IntType(64))
+
+        return types.int64(array), emit
 
     def _compiled(kind: Any, dimensions: int) -> Any:
         made = types.Array(kind, dimensions, "C")
@@ -74,5 +90,12 @@ else:
             made = builder.insert_value(made, value, k)
         return made
 
+    address_of = _entry
     ints, int_rows = _compiled(types.int64, 1), _compiled(types.int64, 2)
     floats, float_rows = _compiled(types.float64, 1), _compiled(types.float64, 2)
+
+
+@inline_kernel
+def put_place(table: Any, entry: int, address: int, rows: int, columns: int) -> None:
+    """Have the table tell of an array, for as long as that is there."""
+    table[WIDTH * entry], table[WIDTH * entry + 1], table[WIDTH * entry + 2] = address, rows, columns

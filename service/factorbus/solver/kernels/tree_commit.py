@@ -7,10 +7,11 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.tree_eliminate import first_end
 from factorbus.solver.kernels.tree_fronts import free_clique
 from factorbus.solver.kernels.tree_hessian import hessian_size
 from factorbus.solver.kernels.tree_mark import dim_of_variable, has_free
-from factorbus.solver.kernels.tree_numeric import first_end, split_sizes
+from factorbus.solver.kernels.tree_numeric import split_sizes
 from factorbus.solver.kernels.tree_store import give_numbers
 
 

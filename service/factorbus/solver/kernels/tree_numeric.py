@@ -1,86 +1,19 @@
-"""Eliminating the affected variables: fronts from the leaves to the roots.  MATH §9.5.
+"""The numbers of fronts: what factors and update matrices of children bring, and those of cliques that are split.
 
-A front takes in the factors that its pivots own and the update matrices of its children, which may be fronts of this
-step or orphans of earlier ones, whose separators may now be eliminated in another order than their columns have.
+MATH §9.5, and §9.3 for what is split.
 """
-
-import numpy as np
 
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.dense import PIVOT_TOLERANCE, factor_front, take_off
-from factorbus.solver.kernels.multifrontal import clear_front
+from factorbus.solver.kernels.dense import PIVOT_TOLERANCE
+from factorbus.solver.kernels.panels import take_off
 from factorbus.solver.kernels.simd import TILE_ROWS, add_run, put, zero
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.tree_fronts import update_layout
-from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
-from factorbus.solver.kernels.tree_rigid import is_relative
+from factorbus.solver.kernels.tree_mark import dim_of_variable
 from factorbus.solver.kernels.tree_store import give_numbers, size_class, take_numbers
-
-
-@part
-def eliminate_fronts(
-    ids: I64, records: I64, order: I64, affected: I64, home: I64, place: I64, factors: I64, orphans: I64, lowest: I64,
-    update: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
-    scalars: F64, state: I64,
-) -> int:  # fmt: skip
-    """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
-
-    update (orphans, 2): where the update matrix of each orphan is, and its width
-    """
-    count, n, stamp = ids.size, order.size, state[tl.S_STAMP]
-    first_factor, factor_of = _by_front(count, factors, home, place, var, fac, node)
-    orphan_of = np.full(count, -1)
-    after = np.empty(orphans.size, np.int64)
-    for e in range(orphans.size - 1, -1, -1):
-        f = home[place[lowest[e]]]
-        after[e], orphan_of[f] = orphan_of[f], e
-    column = np.empty(n, np.int64)
-    widest, most = 0, 0
-    for f in range(count):
-        widest = max(widest, records[f, fr.PIVOTS])
-        most = max(most, clique[ids[f], tl.C_SEPARATORS])
-    for e in range(orphans.size):
-        first, end = separators_of(orphans[e], stamp, clique)
-        most = max(most, end - first)
-    floors, runs = np.empty(widest), np.empty((most + 1, fr.RUN), np.int64)
-    flops = 0
-    for f in range(count):
-        row = clique[ids[f]]
-        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-        number_columns(row, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
-        anchored = 0
-        for q in range(first_factor[f], first_factor[f + 1]):
-            anchored |= int(not is_relative(factor_of[q], var, fac))
-            add_hessian(factor_of[q], row, column, var, fac, node, link, hessian, numbers)
-        child = records[f, fr.CHILD]
-        while child >= 0:
-            other = clique[ids[child]]
-            start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
-            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, k, row)
-            anchored |= other[tl.C_ANCHORED]
-            child = records[child, fr.SIBLING]
-        e = orphan_of[f]
-        while e >= 0:
-            start = clique[orphans[e], tl.C_LIST]
-            first, end = separators_of(orphans[e], stamp, clique)
-            k = list_runs(start + first, start + end, column, p, m, var, node, lists, runs)
-            extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
-            anchored |= clique[orphans[e], tl.C_ANCHORED]
-            e = after[e]
-        row[tl.C_ANCHORED] = anchored
-        failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0
-        )
-        if failed >= 0:
-            return variable_at(failed, row, var, lists)
-        flops += p * (p + m + 1) * (p + m + 1)
-    state[tl.S_FLOPS] += flops
-    return -1
 
 
 @inline_kernel
@@ -96,33 +29,6 @@ def number_columns(row: I64, var: I64, node: I64, lists: I64, scalars: F64, colu
             for a in range(dim):
                 floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
         width += dim
-
-
-@part
-def _by_front(count: int, factors: I64, home: I64, place: I64, var: I64, fac: I64, node: I64) -> tuple[I64, I64]:
-    """The factors sorted by the front that takes them in."""
-    begin, front = np.zeros(count + 2, np.int64), np.empty(factors.size, np.int64)
-    for q in range(factors.size):
-        front[q] = home[first_end(factors[q], place, var, fac, node)]
-        begin[front[q] + 2] += 1
-    for f in range(count):
-        begin[f + 2] += begin[f + 1]
-    out = np.empty(factors.size, np.int64)
-    for q in range(factors.size):
-        out[begin[front[q] + 1]] = factors[q]
-        begin[front[q] + 1] += 1
-    return begin, out
-
-
-@inline_kernel
-def first_end(f: int, place: I64, var: I64, fac: I64, node: I64) -> int:
-    """The place in the order of the first end of factor f that is eliminated."""
-    i, j = fac[f, at.F_I], fac[f, at.F_J]
-    if j < 0 or var[j, at.V_COLUMN] < 0:
-        return int(place[node[i, tl.N_LOCAL]])
-    if var[i, at.V_COLUMN] < 0:
-        return int(place[node[j, tl.N_LOCAL]])
-    return int(min(place[node[i, tl.N_LOCAL]], place[node[j, tl.N_LOCAL]]))
 
 
 @inline_kernel

@@ -90,11 +90,12 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 @part
 def renew(
     renewed: I64, n: int, old: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64,
-    hessian: F64, scalars: F64, state: I64,
+    hessian: F64, scalars: F64, state: I64, board: I64,
 ) -> int:  # fmt: skip
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
-    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.
+    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  board: see
+    `lent_cores`.
     """
     if not take_blocks(renewed, old, clique, numbers, state):
         return tl.NO_ROOM
@@ -128,7 +129,17 @@ def renew(
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, count, row)
             child = other[tl.C_NEXT]
         failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0
+            numbers,
+            row[tl.C_ROWS],
+            row[tl.C_LD],
+            p,
+            m + 1,
+            row[tl.C_UPDATE],
+            row[tl.C_WIDTH_UPDATE],
+            floors,
+            0,
+            0,
+            board,
         )
         if failed >= 0:
             state[tl.S_FAILED] = variable_at(failed, row, var, lists)

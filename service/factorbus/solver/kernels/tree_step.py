@@ -24,6 +24,7 @@ from factorbus.solver.kernels.cycles import cycles
 from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
+from factorbus.solver.kernels.tree_eliminate import eliminate_fronts
 from factorbus.solver.kernels.tree_fronts import (
     analyze_affected,
     give_back_fronts,
@@ -35,7 +36,7 @@ from factorbus.solver.kernels.tree_look import find_bent, is_alarming, is_time_t
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
-from factorbus.solver.kernels.tree_numeric import eliminate_fronts, give_back_updates, update_orphans
+from factorbus.solver.kernels.tree_numeric import give_back_updates, update_orphans
 from factorbus.solver.kernels.tree_order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.tree_relinearise import go_back, relinearise
 from factorbus.solver.kernels.tree_renew import (
@@ -57,9 +58,10 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
 
 
-@kernel("int64(int64[::1], int64[::1])")
-def tree_step(graph: I64, tree: I64) -> int:
-    """Take in what is new in the graph, and solve.  graph, tree: tables of their arenas (`places`).
+@kernel("int64(int64[::1], int64[::1], int64[::1])")
+def tree_step(graph: I64, tree: I64, board: I64) -> int:
+    """Take in what is new in the graph, and solve.  graph, tree: tables of their arenas (`places`); board: where cores
+    are lent (`lent_cores`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
@@ -108,7 +110,7 @@ def tree_step(graph: I64, tree: I64) -> int:
         lap(began, tl.LINEARISE, state)
         bow, pull, status = eliminate_again(
             v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, turns, pending, changed, moved, marked, motions, state, account,
+            scalars, stiff, turns, pending, changed, moved, marked, motions, state, account, graph, tree, board,
         )  # fmt: skip
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
@@ -171,7 +173,8 @@ def count_due(state: I64) -> int:
 def eliminate_again(
     v0: int, v1: int, f1: int, moving: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
-    pending: I64, changed: I64, moved: I64, marked: I64, motions: F64, state: I64, account: F64,
+    pending: I64, changed: I64, moved: I64, marked: I64, motions: F64, state: I64, account: F64, graph: I64,
+    tree: I64, board: I64,
 ) -> tuple[float, float, int]:  # fmt: skip
     """Steps 3 to 8; gives the largest bend of what moved, what waits, as `find_bent` has them, and the status."""
     # 3
@@ -214,7 +217,7 @@ def eliminate_again(
     old = np.empty((renewed.size, OLD), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
-        status = renew(renewed, n, old, var, fac, node, link, clique, lists, numbers, hessian, scalars, state)
+        status = renew(renewed, n, old, var, fac, node, link, clique, lists, numbers, hessian, scalars, state, board)
         if status != tl.DONE:
             return 0.0, 0.0, status
     now = lap(now, tl.ELIMINATE, state)
@@ -251,9 +254,8 @@ def eliminate_again(
     # 6
     flops = state[tl.S_FLOPS]
     failed = eliminate_fronts(
-        ids, records, order, affected, home, place, factors, orphans, lowest, update, var, fac, node, link, clique,
-        lists, numbers, hessian, scalars, state,
-    )  # fmt: skip
+        ids, records, order.size, home, place, factors, orphans, lowest, update, graph, tree, board
+    )
     if failed >= 0:
         state[tl.S_FAILED] = failed
         give_back_fronts(ids, clique, lists, numbers, state)

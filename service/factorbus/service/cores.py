@@ -1,0 +1,37 @@
+"""Threads that lend their cores to the eliminations of all maps, which are long in large ones.  MATH §9.5."""
+
+import os
+import threading
+from typing import Any
+
+from factorbus.solver.lending import Lender, count_free
+
+
+def core_count() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class LentCores:
+    """From now on, until it is closed, an elimination may be at work on `cores` of those that there are at once."""
+
+    def __init__(self, cores: int) -> None:
+        more = min(cores, core_count()) - 1
+        self._lenders = [Lender() for _ in range(min(more, count_free()))]
+        self._threads = [
+            threading.Thread(target=lender.lend, name=f"core {n}", daemon=True)
+            for n, lender in enumerate(self._lenders, 1)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def account(self) -> dict[str, Any]:
+        """How many that is, with the one that a map's own thread has; pieces of eliminations that the others made."""
+        return {"used": 1 + len(self._threads), "pieces": sum(lender.made for lender in self._lenders)}
+
+    def close(self) -> None:
+        """Eliminations go on alone; returns when the threads have ended."""
+        for lender in self._lenders:
+            lender.leave()
+        for thread in self._threads:
+            thread.join()

@@ -1,0 +1,21 @@
+"""What a thread does that lends its core to eliminations of this process."""
+
+from factorbus.solver.kernels._jit import I64, kernel
+from factorbus.solver.kernels.lent_cores import MADE, PANEL, TASK, lends, say_done, scratch_of, take_chunk
+from factorbus.solver.kernels.shared_panels import make_panel_chunk
+from factorbus.solver.kernels.tree_eliminate import make_subtree
+
+
+@kernel("void(int64[::1], int64)")
+def lend(board: I64, lender: int) -> None:
+    """Make chunks of whatever the board has, until the word `lender` of it says that this thread is to leave."""
+    while lends(board, lender):
+        chunk = take_chunk(board)
+        while chunk >= 0:
+            if board[TASK] == PANEL:
+                make_panel_chunk(board, chunk)
+            else:
+                make_subtree(board, chunk, scratch_of(lender))
+            board[lender + MADE] += 1
+            say_done(board)
+            chunk = take_chunk(board)

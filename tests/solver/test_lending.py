@@ -1,0 +1,202 @@
+"""Threads that lend their cores: what an elimination comes to does not depend on them, nor does it wait for them."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive.tree_records import tree_of
+
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.simulate import manhattan
+from factorbus.simulate.step import POSE
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.kernels import fronts as fr
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.dense import factor_front
+from factorbus.solver.kernels.lent_cores import MOST
+from factorbus.solver.kernels.tree_eliminate import ASSEMBLY, BOOKKEEPING, END, FIRST, LONG, PIECES, cut_subtrees
+from factorbus.solver.lending import BOARD, Lender, count_free
+
+pytestmark = pytest.mark.skipif(
+    count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"
+)
+
+POSES = 1500
+
+
+@contextmanager
+def lent(count: int = 1) -> Iterator[list[Lender]]:
+    """So many threads lend their cores meanwhile."""
+    lenders = [Lender() for _ in range(count)]
+    threads = [threading.Thread(target=lender.lend) for lender in lenders]
+    for thread in threads:
+        thread.start()
+    try:
+        yield lenders
+    finally:
+        for lender in lenders:
+            lender.leave()
+        for thread in threads:
+            thread.join()
+
+
+@pytest.fixture(scope="module")
+def content() -> dict:
+    """Of a map that takes long to eliminate as a whole."""
+    solver = Solver(Options())
+    for step in manhattan(POSES, 5):
+        solver.stage(step.batch)
+        solver.step()
+    return solver.to_order_anew()
+
+
+def numbers(solver: Solver) -> list[bytes]:
+    """All that an elimination fills in."""
+    tree = tree_of(solver)
+    used = {"numbers": int(tree.state[tl.S_NUMBERS]), "clique": int(tree.state[tl.S_CLIQUES])}
+    arrays = [tree.numbers[fr.SCRATCH : used["numbers"]], tree.clique[: used["clique"]], tree.scalars]
+    return [np.ascontiguousarray(array).tobytes() for array in arrays]
+
+
+def eliminated(content: dict) -> tuple[list[bytes], int]:
+    """The numbers of a new solver, and flops."""
+    solver = Solver(Options())
+    flops = solver.order_anew(content).flops
+    return numbers(solver), flops
+
+
+@pytest.mark.parametrize(("p", "m"), [(70, 420), (130, 401), (300, 300), (700, 3), (500, 0)])
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_front_has_the_same_bits(p: int, m: int, count: int) -> None:
+    expected = factorised(p, m)
+    with lent(count) as lenders:
+        while not any(lender.made for lender in lenders):
+            assert factorised(p, m) == expected
+    assert factorised(p, m) == expected
+
+
+def factorised(p: int, m: int) -> bytes:
+    """A front, zeros between what is its own."""
+    rng, lead, ld, width = np.random.default_rng(p), -p % fr.LANES, fr.padded(p) + fr.padded(m), fr.padded(m)
+    start = fr.SCRATCH + p * ld
+    arena = np.zeros(start + fr.update_size(m, width) + fr.LANES)
+    rows = arena[fr.SCRATCH : start].reshape(p, ld)[:, lead : lead + p + m]
+    rows[:] = rng.normal(size=(p, p + m))
+    rows[:, :p] = np.triu(rows[:, :p] @ rows[:, :p].T + (p + m) * np.eye(p))
+    at = fr.SCRATCH + lead
+    assert factor_front(arena, at, ld, p, m, start, width, np.zeros(p), 0, 0, BOARD) == -1
+    return arena[fr.SCRATCH :].tobytes()
+
+
+@pytest.mark.parametrize("count", [1, MOST])
+def test_a_whole_map_has_the_same_bits(content: dict, count: int) -> None:
+    alone = eliminated(content)
+    with lent(count) as lenders:
+        while not any(lender.made for lender in lenders):
+            assert eliminated(content) == alone
+    assert eliminated(content) == alone
+
+
+def test_a_drive_has_the_same_bits() -> None:
+    def drive() -> tuple[list[bytes], list[int]]:
+        solver, flops = Solver(Options()), []
+        for step in manhattan(2 * POSES, 7):
+            solver.stage(step.batch)
+            flops.append(solver.step().flops)
+        solver.step(settle=True)
+        return numbers(solver), flops
+
+    alone = drive()
+    with lent() as (lender,):
+        while not lender.made:
+            assert drive() == alone
+
+
+def test_maps_that_are_eliminated_at_once_share_the_cores(content: dict) -> None:
+    alone, found = eliminated(content), []
+    with lent() as (lender,):
+        while not lender.made:
+            threads = [threading.Thread(target=lambda: found.append(eliminated(content))) for _ in range(3)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+    assert len(found) >= 3
+    assert all(each == alone for each in found)
+
+
+def loose(ends: list[int]) -> Batch:
+    """At each of these poses hang two new ones, tied to each other 10¹⁶ times as well as to it: as far as doubles can
+    tell nothing holds them."""
+    first = np.array([-100 - 2 * n for n in range(len(ends))])
+    keys = np.concatenate([np.column_stack([ends, first]), np.column_stack([first, first - 1])])
+    information = np.repeat([1.0, 1e16], len(ends))[:, None] * [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]
+    return Batch(
+        (Variables("se2", np.concatenate([first, first - 1])),),
+        (Factors("between_se2", keys, np.tile([1.0, 0.0, 0.5], (len(keys), 1)), information),),
+    )
+
+
+def test_of_several_pivots_that_fail_the_same_one_is_named() -> None:
+    def refused() -> int:
+        solver = Solver(Options())
+        for step in manhattan(POSES, 5):
+            solver.stage(step.batch)
+        solver.stage(loose([POSE + 200 * n for n in range(7)]))
+        with pytest.raises(errors.Underconstrained) as caught:
+            solver.step()
+        assert solver.variable_count == 0
+        return caught.value.detail["key"]
+
+    alone = refused()
+    with lent() as (lender,):
+        while not lender.made:
+            assert refused() == alone
+
+
+def test_who_leaves_is_no_longer_there_and_makes_room_for_others(content: dict) -> None:
+    alone, free = eliminated(content), count_free()
+    for _ in range(2 * MOST):
+        with lent(2) as lenders:
+            assert count_free() == free - 2
+        assert count_free() == free
+    made = [lender.made for lender in lenders]
+    assert eliminated(content) == alone
+    assert [lender.made for lender in lenders] == made
+
+
+def test_there_is_room_for_so_many_and_no_more() -> None:
+    with lent(count_free()), pytest.raises(ValueError, match=f"{MOST} threads lend their cores"):
+        Lender()
+
+
+@given(st.lists(st.tuples(st.integers(1, 300), st.integers(0, 600)), max_size=60), st.data(), st.integers(0, 3))
+def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: st.DataObject, lenders: int) -> None:
+    records = np.zeros((len(sizes), fr.FRONT), np.int64)
+    records[:, fr.PARENT] = -1
+    # Postorder: who comes next takes some of the last roots as children.
+    roots: list[int] = []
+    for f, (p, m) in enumerate(sizes):
+        records[f, fr.PIVOTS], records[f, fr.BORDER] = p, m
+        for _ in range(data.draw(st.integers(0, min(len(roots), 3)))):
+            records[roots.pop(), fr.PARENT] = f
+        roots.append(f)
+    cut = cut_subtrees(records, lenders)
+    takes = [(p + ASSEMBLY) * (p + m + 1) ** 2 + BOOKKEEPING for p, m in sizes]
+    if lenders == 0 or sum(takes) < LONG:
+        assert len(cut) == 0
+        return
+    most, above = sum(takes) / (PIECES * (1 + lenders)), records[:, fr.PARENT]
+    inside = np.full(len(sizes), -1)
+    for k, (first, end) in enumerate(cut[:, [FIRST, END]]):
+        assert (inside[first:end] == -1).all()
+        inside[first:end] = k
+        assert sum(takes[first:end]) <= most
+    for f, parent in enumerate(above):
+        if parent >= 0:
+            assert inside[f] == inside[parent] or inside[parent] == -1
+    assert (np.diff(cut[:, FIRST]) > 0).all()
