@@ -18,7 +18,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.dense import factor_front
 from factorbus.solver.kernels.lent_cores import MOST
-from factorbus.solver.kernels.tree_eliminate import ASSEMBLY, BOOKKEEPING, END, FIRST, LONG, PIECES, cut_subtrees
+from factorbus.solver.kernels.tree_eliminate import ASSEMBLY, BOOKKEEPING, END, FIRST, LONG, PIECES, TURN, cut_subtrees
 from factorbus.solver.lending import BOARD, Lender, count_free
 
 pytestmark = pytest.mark.skipif(
@@ -200,3 +200,6 @@ def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: s
         if parent >= 0:
             assert inside[f] == inside[parent] or inside[parent] == -1
     assert (np.diff(cut[:, FIRST]) > 0).all()
+    turns = [sum(takes[first:end]) for first, end in cut[cut[:, TURN]][:, [FIRST, END]]]
+    assert turns == sorted(turns, reverse=True)
+    assert sorted(cut[:, TURN]) == list(range(len(cut)))

@@ -43,8 +43,10 @@ PLAN = 12
 
 # Columns of a subtree, fronts FIRST .. END: when it is eliminated the variable whose pivot failed, or −1, and flops.
 FIRST, END, FAILED, FLOPS = 0, 1, 2, 3
+TURN = 4  # of the row k: the subtree that is eliminated as the k-th one; those that take longest come first
+SUBTREE = 5
 
-PIECES = 8  # for each thread, so that all of them end at about the same time
+PIECES = 3  # for each thread; with more of them more is left above, where there is less to share
 # What a front takes besides the flops of its pivots, in those: to assemble it, by scalars², and as such.  Measured.
 ASSEMBLY, BOOKKEEPING = 150, 80_000
 LONG = 30_000_000  # an elimination that is worth sharing, half a millisecond
@@ -124,7 +126,7 @@ def cut_subtrees(records: I64, lenders: int) -> I64:
     """Subtrees of neighbours in postorder that take a small share of the whole; none where it is not worth it."""
     count = len(records)
     if lenders == 0:
-        return np.empty((0, 4), np.int64)
+        return np.empty((0, SUBTREE), np.int64)
     takes, first = np.zeros(count), np.arange(count)  # with all below
     total = 0.0
     for f in range(count):
@@ -136,21 +138,26 @@ def cut_subtrees(records: I64, lenders: int) -> I64:
         if above >= 0:
             takes[above] += takes[f]
             first[above] = min(first[above], first[f])
-    cut, pieces = np.empty((count, 4), np.int64), 0
-    most, taken = total / (PIECES * (1 + lenders)), 0.0
     if total < LONG:
-        return cut[:0]
+        return np.empty((0, SUBTREE), np.int64)
+    cut, size, pieces = np.empty((count, SUBTREE), np.int64), np.empty(count), 0
+    most = total / (PIECES * (1 + lenders))
     for f in range(count):
         above = records[f, fr.PARENT]
         if takes[f] > most or (above >= 0 and takes[above] <= most):
             continue
-        if pieces > 0 and cut[pieces - 1, END] == first[f] and taken + takes[f] <= most:
-            taken += takes[f]
+        if pieces > 0 and cut[pieces - 1, END] == first[f] and size[pieces - 1] + takes[f] <= most:
+            size[pieces - 1] += takes[f]
         else:
-            taken = takes[f]
-            cut[pieces, FIRST] = first[f]
+            cut[pieces, FIRST], size[pieces] = first[f], takes[f]
             pieces += 1
         cut[pieces - 1, END] = f + 1
+    for turn in range(pieces):
+        largest = 0
+        for k in range(1, pieces):
+            if size[k] > size[largest]:
+                largest = k
+        cut[turn, TURN], size[largest] = largest, -1.0
     return cut[:pieces]
 
 
@@ -171,7 +178,8 @@ def _eliminate_together(plan: I64, subtrees: int, board: I64) -> None:
 def make_subtree(board: I64, chunk: int, t: int) -> None:
     """Eliminate a subtree of the plan that the board has, with the scratch at t."""
     plan = ints(board, AT)
-    subtree = int_rows(plan, CUT)[chunk]
+    subtrees = int_rows(plan, CUT)
+    subtree = subtrees[subtrees[chunk, TURN]]
     subtree[FAILED], subtree[FLOPS] = eliminate_range(plan, subtree[FIRST], subtree[END], t, board)
 
 
