@@ -4,12 +4,25 @@ import os
 import threading
 from typing import Any
 
+from factorbus.service.control_groups import limit_files
 from factorbus.solver.lending import Lender, count_free
 
 
 def core_count() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may run on, and has the time of: of its control groups, or of the machine."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    shares = [float(there)]
+    for path in limit_files("cpu", "cpu.cfs_quota_us", "cpu.max"):
+        try:
+            text = path.read_text()
+            if path.name != "cpu.max":  # version 1 has the period in a file of its own
+                text += path.with_name("cpu.cfs_period_us").read_text()
+            quota, period = map(int, text.split())
+        except (OSError, ValueError):  # not there, or "max"
+            continue
+        if quota > 0:
+            shares.append(quota / period)
+    return max(int(min(shares)), 1)
 
 
 class LentCores:

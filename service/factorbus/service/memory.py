@@ -5,9 +5,9 @@ grow is refused, and who is refused is told why; questions, jobs and dropping ma
 """
 
 import os
-from pathlib import Path, PurePosixPath
 
 from factorbus.proto.problems import Problem
+from factorbus.service.control_groups import limit_files
 
 # Of what the machine or the container has; the rest is for steps under way, answers, and other processes.
 _SHARE = 0.8
@@ -73,27 +73,9 @@ class Memory:
 def available() -> int:
     """Bytes that this process may have before the kernel ends it: of its control groups, or of the machine."""
     limits = [os.sysconf("SC_PHYS_PAGES") * _PAGE]
-    for path in _limit_files():
+    for path in limit_files("memory", "memory.limit_in_bytes", "memory.max"):
         try:
             limits.append(int(path.read_text()))
         except (OSError, ValueError):  # not there, or "max"
             continue
     return min(limits)
-
-
-def _limit_files() -> list[Path]:
-    """Where limits of this process may be written: its control group and those above, of either version.
-
-    In a container its own group is the root of what it sees.
-    """
-    files = []
-    groups = Path("/proc/self/cgroup")
-    for line in groups.read_text().splitlines() if groups.is_file() else ():
-        _, controllers, path = line.split(":", 2)
-        if controllers not in ("", "memory"):
-            continue
-        root = Path("/sys/fs/cgroup", controllers)
-        name = "memory.limit_in_bytes" if controllers else "memory.max"
-        own = PurePosixPath(path.lstrip("/"))
-        files += [root / each / name for each in (own, *own.parents)]
-    return files

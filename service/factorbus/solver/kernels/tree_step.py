@@ -7,7 +7,7 @@
    renew          what is below these and only has relinearised factors is eliminated again as it is
 4  order          the affected variables, constrained approximate minimum degree
 5  fronts         elimination tree, amalgamation, memory
-6  eliminate      front by front; orphans lend their update matrices
+6  eliminate      front by front, on several cores where that takes long; orphans bring their update matrices
 7  commit         new cliques and numbers take the place of the old ones
 8  substitute     back down from the new roots, as far as anything changes
 9  again from 2   while something has bent so far that it cannot wait
