@@ -11,10 +11,11 @@ import numpy as np
 from factorbus.solver.arenas import lines
 from factorbus.solver.kernels import lent_cores as at
 from factorbus.solver.kernels._jit import I64
-from factorbus.solver.kernels.lend import lend
 from factorbus.solver.kernels.shared_words import CAN_SLEEP
+from factorbus.solver.kernels.tree_step import tree_step
 
 BOARD: I64 = lines(at.WORDS, np.int64)  # see `kernels/lent_cores.py`
+_NOTHING: I64 = np.empty(0, np.int64)
 
 # Words of lenders that nobody has; none where threads cannot sleep in a kernel.
 _free = list(range(at.LENDERS, at.WORDS, 8)) if CAN_SLEEP else []
@@ -47,7 +48,7 @@ class Lender:
 
     def lend(self) -> None:
         """Returns after `leave`.  Once, on the thread whose core it is."""
-        lend(BOARD, self._word)
+        tree_step(_NOTHING, _NOTHING, BOARD, self._word)
         self._line[0] = at.AWAY
         self._line = self._line.copy()
         _free.append(self._word)

@@ -12,6 +12,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.lent_cores import NOBODY
 from factorbus.solver.kernels.tree_begin import HESSIAN
 from factorbus.solver.kernels.tree_moved import exchange, list_moved
 from factorbus.solver.kernels.tree_step import tree_step
@@ -78,7 +79,7 @@ class Tree(Arenas):
         """
         if sure:
             self.state[tl.S_CHECKED] = 1
-        while (status := tree_step(self._graph.places(), self.places(), BOARD)) == tl.NO_ROOM:
+        while (status := tree_step(self._graph.places(), self.places(), BOARD, NOBODY)) == tl.NO_ROOM:
             self._make_room()
         return status
 

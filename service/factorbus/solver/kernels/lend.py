@@ -1,12 +1,15 @@
-"""What a thread does that lends its core to eliminations of this process."""
+"""What a thread does that lends its core to eliminations of this process.
 
-from factorbus.solver.kernels._jit import I64, kernel
+It has the elimination in it, and to compile that once more would take two seconds: so it is called by `tree_step`.
+"""
+
+from factorbus.solver.kernels._jit import I64, part
 from factorbus.solver.kernels.lent_cores import MADE, PANEL, TASK, lends, say_done, scratch_of, take_chunk
 from factorbus.solver.kernels.shared_panels import make_panel_chunk
 from factorbus.solver.kernels.tree_eliminate import make_subtree
 
 
-@kernel("void(int64[::1], int64)")
+@part
 def lend(board: I64, lender: int) -> None:
     """Make chunks of whatever the board has, until the word `lender` of it says that this thread is to leave."""
     while lends(board, lender):

@@ -23,6 +23,7 @@ LEFT = 16  # chunks that nobody took; below 1: there are none
 DONE = 24
 TAKEN = 32  # 1: the board has a task
 LENDERS = 40  # a cache line for each: what it does, chunks that it made, and the semaphore where it sleeps
+NOBODY = -1
 AWAY, LENDS, LEAVES = 0, 1, 2
 MADE, ASLEEP = 1, 8 - SEMAPHORE
 WORDS = LENDERS + 8 * MOST

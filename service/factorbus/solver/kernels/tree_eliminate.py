@@ -37,9 +37,12 @@ IDS, RECORDS = 2, 3  # the clique and the record of each front
 FIRST_FACTOR, FACTORS = 4, 5  # those of front f are FACTORS[FIRST_FACTOR[f] : FIRST_FACTOR[f + 1]]
 FIRST_ORPHAN, NEXT_ORPHAN = 6, 7  # of each front, and of each orphan the next one of the same front; −1: none
 ORPHANS, UPDATE = 8, 9  # the cliques, and where their update matrices are and how wide
-SIZES = 10  # affected variables; the most pivots of a front; the most separator variables of what is taken in
-CUT = 11  # the subtrees, a row each
-PLAN = 12
+CUT = 10  # the subtrees, a row each
+# And words of it behind those: affected variables, the most pivots of a front, the most separator variables of what is
+# taken in.
+N = WIDTH * (CUT + 1)
+MOST_PIVOTS, MOST_SEPARATORS = N + 1, N + 2
+PLAN = MOST_SEPARATORS + 1
 
 # Columns of a subtree, fronts FIRST .. END: when it is eliminated the variable whose pivot failed, or −1, and flops.
 FIRST, END, FAILED, FLOPS = 0, 1, 2, 3
@@ -70,27 +73,29 @@ def eliminate_fronts(
     for e in range(orphans.size - 1, -1, -1):
         f = home[place[lowest[e]]]
         next_orphan[e], first_orphan[f] = first_orphan[f], e
-    sizes = np.array([n, 0, 0])
+    pivots, separators = 0, 0
     for f in range(count):
-        sizes[1] = max(sizes[1], records[f, fr.PIVOTS])
-        sizes[2] = max(sizes[2], clique[ids[f], tl.C_SEPARATORS])
+        pivots = max(pivots, records[f, fr.PIVOTS])
+        separators = max(separators, clique[ids[f], tl.C_SEPARATORS])
     for e in range(orphans.size):
         first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)
-        sizes[2] = max(sizes[2], end - first)
-    # What a plan tells of has to be there for as long: these are, while the next one runs.
-    return _eliminate_sorted(
-        ids, records, first_factor, factor_of, first_orphan, next_orphan, orphans, update, sizes, graph, tree, board
+        separators = max(separators, end - first)
+    plan = np.empty(PLAN, np.int64)
+    plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = n, pivots, separators
+    # 2, 3.  What a plan tells of has to be there for as long: these are, while the next one runs.
+    failed, flops = _eliminate_sorted(
+        plan, ids, records, first_factor, factor_of, first_orphan, next_orphan, orphans, update, graph, tree, board
     )
+    if failed < 0:
+        state[tl.S_FLOPS] += flops
+    return failed
 
 
 @part
 def _eliminate_sorted(
-    ids: I64, records: I64, first_factor: I64, factor_of: I64, first_orphan: I64, next_orphan: I64, orphans: I64,
-    update: I64, sizes: I64, graph: I64, tree: I64, board: I64,
-) -> int:  # fmt: skip
-    # 2
-    cut = cut_subtrees(records, count_lenders(board))
-    plan = np.empty(WIDTH * PLAN, np.int64)
+    plan: I64, ids: I64, records: I64, first_factor: I64, factor_of: I64, first_orphan: I64, next_orphan: I64,
+    orphans: I64, update: I64, graph: I64, tree: I64, board: I64,
+) -> tuple[int, int]:  # fmt: skip
     put_place(plan, GRAPH, address_of(graph), graph.size, 1)
     put_place(plan, TREE, address_of(tree), tree.size, 1)
     put_place(plan, IDS, address_of(ids), ids.size, 1)
@@ -101,32 +106,39 @@ def _eliminate_sorted(
     put_place(plan, NEXT_ORPHAN, address_of(next_orphan), next_orphan.size, 1)
     put_place(plan, ORPHANS, address_of(orphans), orphans.size, 1)
     put_place(plan, UPDATE, address_of(update), len(update), update.shape[1])
-    put_place(plan, SIZES, address_of(sizes), sizes.size, 1)
-    put_place(plan, CUT, address_of(cut), len(cut), cut.shape[1])
-    # 3
-    if len(cut) > 0 and take_board(board):
-        _eliminate_together(plan, len(cut), board)
+    lenders = count_lenders(board)
+    if lenders > 0:
+        return _eliminate_in_pieces(plan, records, lenders, board)
+    return eliminate_range(plan, 0, ids.size, 0, board)
+
+
+@part
+def _eliminate_in_pieces(plan: I64, records: I64, lenders: int, board: I64) -> tuple[int, int]:
+    """Subtrees on several cores, if it is worth it, and then what is above them; what fails first is what counts."""
+    cut = cut_subtrees(records, lenders)
+    pieces = len(cut)
+    if pieces > 0 and take_board(board):
+        put_place(plan, CUT, address_of(cut), pieces, SUBTREE)
+        _eliminate_together(plan, pieces, board)
     else:
-        cut = cut[:0]
+        pieces = 0
     f, flops = 0, 0
-    for k in range(len(cut) + 1):
-        failed, spent = eliminate_range(plan, f, cut[k, FIRST] if k < len(cut) else ids.size, 0, board)
-        flops += spent
-        if failed < 0 and k < len(cut):
-            f, failed = cut[k, END], cut[k, FAILED]
-            flops += cut[k, FLOPS]
+    for k in range(pieces):
+        failed, spent = eliminate_range(plan, f, cut[k, FIRST], 0, board)
+        if failed < 0:
+            failed = cut[k, FAILED]
         if failed >= 0:
-            return failed
-    ints(tree, tl.T_STATE)[tl.S_FLOPS] += flops
-    return -1
+            return failed, 0
+        f = cut[k, END]
+        flops += spent + cut[k, FLOPS]
+    failed, spent = eliminate_range(plan, f, len(records), 0, board)
+    return failed, flops + spent
 
 
 @part
 def cut_subtrees(records: I64, lenders: int) -> I64:
     """Subtrees of neighbours in postorder that take a small share of the whole; none where it is not worth it."""
     count = len(records)
-    if lenders == 0:
-        return np.empty((0, SUBTREE), np.int64)
     takes, first = np.zeros(count), np.arange(count)  # with all below
     total = 0.0
     for f in range(count):
@@ -191,16 +203,12 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
     node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
     lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
     scalars, stamp = float_rows(tree, tl.T_SCALARS), ints(tree, tl.T_STATE)[tl.S_STAMP]
-    ids, records, orphans, update = (
-        ints(plan, IDS),
-        int_rows(plan, RECORDS),
-        ints(plan, ORPHANS),
-        int_rows(plan, UPDATE),
-    )
+    ids, records = ints(plan, IDS), int_rows(plan, RECORDS)
+    orphans, update = ints(plan, ORPHANS), int_rows(plan, UPDATE)
     first_factor, factor_of = ints(plan, FIRST_FACTOR), ints(plan, FACTORS)
     first_orphan, next_orphan = ints(plan, FIRST_ORPHAN), ints(plan, NEXT_ORPHAN)
-    sizes = ints(plan, SIZES)
-    column, floors, runs = np.empty(sizes[0], np.int64), np.empty(sizes[1]), np.empty((sizes[2] + 1, fr.RUN), np.int64)
+    column, floors = np.empty(plan[N], np.int64), np.empty(plan[MOST_PIVOTS])
+    runs = np.empty((plan[MOST_SEPARATORS] + 1, fr.RUN), np.int64)
     flops = 0
     for f in range(begin, end):
         row = clique[ids[f]]

@@ -21,6 +21,8 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.cycles import cycles
+from factorbus.solver.kernels.lend import lend
+from factorbus.solver.kernels.lent_cores import NOBODY
 from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
@@ -58,16 +60,19 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
 
 
-@kernel("int64(int64[::1], int64[::1], int64[::1])")
-def tree_step(graph: I64, tree: I64, board: I64) -> int:
+@kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
+def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
     """Take in what is new in the graph, and solve.  graph, tree: tables of their arenas (`places`); board: where cores
-    are lent (`lent_cores`).
+    are lent (`lent_cores`); lender: NOBODY, or this is no step, but a thread that lends its core (`lend`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
     or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
     the last two the tree is as it was before the step.
     """
+    if lender != NOBODY:
+        lend(board, lender)
+        return tl.DONE
     began = cycles()
     counts, var, fac = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
     values, payload, settings = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD), floats(tree, tl.T_SETTINGS)
