@@ -1,6 +1,6 @@
 """What a panel of R, rows top .. end of a front, takes off the rows behind it: most of what a large front takes."""
 
-from factorbus.solver.kernels._jit import F64, inline_kernel, part
+from factorbus.solver.kernels._jit import F64, inline_kernel
 from factorbus.solver.kernels.fronts import padded, update_row, update_stride
 from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, tile
 
@@ -8,7 +8,7 @@ DEPTH = 128  # rows of a panel: with WIDTH columns they fit the second level cac
 WIDTH = 192
 
 
-@part
+@inline_kernel
 def take_panel_off(
     a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, top: int, end: int, low: int, high: int
 ) -> None:
