@@ -23,7 +23,7 @@ class Two(Arenas):
 
 
 def rows(thing: Arenas) -> list[tuple[int, ...]]:
-    return [tuple(row) for row in thing.places().reshape(-1, WIDTH).tolist()]
+    return [tuple(row) for row in thing.places.reshape(-1, WIDTH).tolist()]
 
 
 def of(array: np.ndarray) -> tuple[int, ...]:
@@ -33,14 +33,14 @@ def of(array: np.ndarray) -> tuple[int, ...]:
 def test_it_has_address_and_shape_of_each() -> None:
     two = Two()
     assert rows(two) == [of(two.first), of(two.second)]
-    assert two.places() is two.places()
+    assert two.places is two.places
 
 
 def test_it_follows_an_assignment() -> None:
     two = Two()
-    table = two.places()
+    table = two.places
     two.other = np.zeros(5)
-    assert two.places() is table
+    assert two.places is table
     two.second = np.ones((8, 2))
     assert rows(two) == [of(two.first), of(two.second)]
 
@@ -48,7 +48,6 @@ def test_it_follows_an_assignment() -> None:
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda two: pickle.loads(pickle.dumps(two))])
 def test_a_copy_has_one_of_its_own(again) -> None:
     two = Two()
-    two.places()
     other = again(two)
     assert rows(other) == [of(other.first), of(other.second)]
     other.first = np.zeros(9)
@@ -58,9 +57,10 @@ def test_a_copy_has_one_of_its_own(again) -> None:
 @pytest.mark.parametrize("wrong", [np.zeros((4, 4))[:, 1], np.zeros(3, np.float32), np.zeros((2, 2, 2)), np.array(1.0)])
 def test_what_no_kernel_could_work_on_is_refused(wrong: np.ndarray) -> None:
     two = Two()
-    two.first = wrong
+    before = rows(two)
     with pytest.raises(TypeError, match="first is"):
-        two.places()
+        two.first = wrong
+    assert rows(two) == before == [of(two.first), of(two.second)]
 
 
 def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:

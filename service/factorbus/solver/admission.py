@@ -14,7 +14,6 @@ from factorbus.solver.joints import SINGLE, check_joints
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
-from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.reach import reach
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
@@ -53,15 +52,6 @@ def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
         sights.check(graph, first_factor)
     if any(negative):
         check_joints(graph, first_factor)
-
-
-def try_admit(graph: Graph, raw: bytes, groups: I64) -> int | None:
-    """As `admit` for a small batch whose columns lie in `raw` where `groups` says; gives the id of its first factor.
-
-    None where anything is wrong, or where there is no room: nothing has changed then, and `admit` says or makes it.
-    """
-    first = admit_bytes(raw, groups, graph.places())
-    return None if first < 0 else first
 
 
 def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:

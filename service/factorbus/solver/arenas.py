@@ -22,38 +22,31 @@ def lines(shape: int | tuple[int, ...], kind: type[np.generic] | np.dtype[Any]) 
 
 
 class Arenas:
-    """What has arrays as attributes, `ARENAS` in the order of its table.
+    """What has arrays as attributes, `ARENAS` in the order of its table, and the table: `places`, for kernels.
 
     Inherited, since every assignment to one of them has to be seen: a table must not tell of an array that is gone.
     """
 
     ARENAS: ClassVar[tuple[str, ...]] = ()
-    _places: I64 | None = None
-    _stale: tuple[str, ...] = ()  # assigned since the table was brought up to date
+    places: I64
 
     def __setattr__(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
+        """Raises TypeError for an arena that no kernel can work on in place."""
         if name in self.ARENAS:
-            object.__setattr__(self, "_stale", (*self._stale, name))
+            row = _placed(name, value)
+            if "places" not in vars(self):
+                object.__setattr__(self, "places", np.zeros(WIDTH * len(self.ARENAS), np.int64))
+            first = WIDTH * self.ARENAS.index(name)
+            self.places[first : first + WIDTH] = row
+        object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "places"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """For copies: what has other arrays needs another table."""
-        return {name: value for name, value in vars(self).items() if name not in ("_places", "_stale")}
-
-    def places(self) -> I64:
-        """The table, as `kernels.places` reads it; it is of use until an array is assigned.  Raises TypeError."""
-        table = self._places
-        return self._brought_up() if table is None or self._stale else table
-
-    def _brought_up(self) -> I64:
-        table, names = self._places, self._stale
-        if table is None:
-            table, names = np.empty(WIDTH * len(self.ARENAS), np.int64), self.ARENAS
-        for name in names:  # those that changed, and no others: a row takes 3 µs, and maps grow while they are small
-            first = WIDTH * self.ARENAS.index(name)
-            table[first : first + WIDTH] = _placed(name, getattr(self, name))
-        self._places, self._stale = table, ()
-        return table
+        for name, value in state.items():
+            setattr(self, name, value)
 
 
 def _placed(name: str, array: np.ndarray) -> tuple[int, ...]:

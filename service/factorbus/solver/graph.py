@@ -34,7 +34,7 @@ class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = at.ARENAS
-    NOT_KEPT = ("_rows", "_places", "_stale")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "places")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -146,7 +146,7 @@ class Graph(Arenas):
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
             keys, values = self.keys, self.values
             return [span.group(keys, values) if span.together else self._scattered(span) for span in spans]
-        if (label := label_of(picked, self.places())) >= 0:
+        if (label := label_of(picked, self.places)) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
@@ -154,14 +154,14 @@ class Graph(Arenas):
 
     def _scattered(self, span: Span) -> Group:
         values = np.empty((span.count, span.size))
-        gather(span.rows(), self.places(), _NO_KEYS, values)
+        gather(span.rows(), self.places, _NO_KEYS, values)
         values.flags.writeable = not span.fixed  # as where they are together
         return Group(span.kind, span.keys_apart(self.keys), values, span.fixed)
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
         keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
-        gather(rows, self.places(), keys, values)
+        gather(rows, self.places, keys, values)
         return Group(kind.name, keys, values, fixed=bool(label % 2))
 
     def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:

@@ -31,7 +31,7 @@ class Packing:
         self._known: dict[tuple, I64 | None] = {}
 
     def pack(self, batch: BatchLike) -> tuple[bytes, I64] | None:
-        """Bytes and where in them the columns lie, as `try_admit` wants it.
+        """Bytes and where in them the columns lie, as `admit_bytes` wants it.
 
         None: the batch is not small, or there is something about its columns that admission has to look at.
         """

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.solver import errors, sights
-from factorbus.solver.admission import admit, try_admit
+from factorbus.solver.admission import admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.changes import ChangeLike, collect, unchanged
 from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
@@ -23,6 +23,7 @@ from factorbus.solver.incremental import Incremental, Where
 from factorbus.solver.joints import check_joints, find_apart
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.admit_bytes import admit_bytes
 from factorbus.solver.kernels.settle_new import settle_new
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
@@ -98,9 +99,9 @@ class Solver:
         """
         packed = self._packing.pack(batch)
         if packed:
-            first = try_admit(self._graph, *packed)
+            first = self.try_stage(*packed)
             if first is not None:
-                return first + self._graph.id_shift
+                return first
         mark = self._graph.mark()
         try:
             admit(self._graph, batch)
@@ -115,8 +116,8 @@ class Solver:
         groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
         caller's word: they are not checked again.
         """
-        first = try_admit(self._graph, raw, groups)
-        return None if first is None else first + self._graph.id_shift
+        first = admit_bytes(raw, groups, self._graph.places)
+        return None if first < 0 else first + self._graph.id_shift
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.

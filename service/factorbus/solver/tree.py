@@ -26,7 +26,7 @@ class Tree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = tl.ARENAS
-    NOT_KEPT = ("_graph", "settings", "marked", "_places", "_stale")
+    NOT_KEPT = ("_graph", "settings", "marked", "places")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph = graph
@@ -79,7 +79,7 @@ class Tree(Arenas):
         """
         if sure:
             self.state[tl.S_CHECKED] = 1
-        while (status := tree_step(self._graph.places(), self.places(), BOARD, NOBODY)) == tl.NO_ROOM:
+        while (status := tree_step(self._graph.places, self.places, BOARD, NOBODY)) == tl.NO_ROOM:
             self._make_room()
         return status
 
@@ -101,7 +101,7 @@ class Tree(Arenas):
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
         graph = self._graph
         found = np.empty(self.state.item(tl.S_CHANGED) + graph.counts.item(at.VARIABLES) - first_new, np.int64)
-        return found[: list_moved(first_new, graph.places(), self.places(), found)]
+        return found[: list_moved(first_new, graph.places, self.places, found)]
 
     def exchange(self) -> None:
         """Exchange the estimate and the one from before the last step, of the variables that it changed."""

@@ -27,6 +27,8 @@ from factorbus.solver.tree import Tree
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
 _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
+_NONE_BENT = "0 variables bent too far"
+_new = tuple.__new__
 
 
 class TreeSteps:
@@ -163,10 +165,10 @@ class TreeSteps:
         compiled_ms = 1e3 * (compiled - started)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
-        return StepReport._make((
+        return _new(StepReport, (
             "tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
-            because or f"{relinearised} variables bent too far",
+            because or (f"{relinearised} variables bent too far" if relinearised else _NONE_BENT),
             course.iterations if course else rounds,
             chi2,  # chi2
             chi2,  # chi2_before

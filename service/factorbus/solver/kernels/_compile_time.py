@@ -3,6 +3,7 @@
 import functools
 from typing import Any
 
+import llvmlite.binding
 from llvmlite.ir import instructions
 from numba.core import base, ir, types
 from numba.core.compiler import Flags
@@ -111,3 +112,6 @@ def _take_number(self: Any, name: str) -> None:
 
 
 instructions.Instruction._set_name = _take_number
+
+# While a function is being compiled each call of LLVM, and of all that are being compiled around it, would be timed.
+llvmlite.binding.ffi.lib._lock._cblist.clear()

@@ -26,17 +26,11 @@ def order_affected(
     Last go those that are near, ring by ring, then variables with a factor in the last `recent` steps, then the
     variable `last`; −1: none does.
     """
-    dims, group = np.empty(n, np.int64), np.zeros(n, np.int64)
-    since, stamp, m = state[tl.S_STEP] - recent, state[tl.S_STAMP], orphans.size
+    dims, group = np.empty(n, np.int64), np.empty(n, np.int64)
+    stamp, m = state[tl.S_STAMP], orphans.size
     for k in range(n):
-        v = affected[k]
-        dims[k] = dim_of_variable(var, v)
-        if v == last:
-            group[k] = NEWEST
-        elif node[v, tl.N_SEEN] > since:
-            group[k] = NEWEST - 1
-        elif node[v, tl.N_NEAR] == stamp:
-            group[k] = 1 + node[v, tl.N_RING]
+        dims[k] = dim_of_variable(var, affected[k])
+        group[k] = group_of(affected[k], recent, last, node, state)
     length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
     for e in range(m):
         start = clique[orphans[e], tl.C_LIST]
@@ -48,7 +42,7 @@ def order_affected(
             elements[k] += 1
             length[k] += 1
     for q in range(factors.size):
-        i, j = _ends(factors[q], var, fac, node)
+        i, j = ends_of(factors[q], var, fac, node)
         if j >= 0:
             length[i] += 1
             length[j] += 1
@@ -71,12 +65,22 @@ def order_affected(
             at_element += 1
             put_element[k] += 1
     for q in range(factors.size):
-        i, j = _ends(factors[q], var, fac, node)
+        i, j = ends_of(factors[q], var, fac, node)
         if j >= 0:
             near[put[i]], near[put[j]] = j, i
             put[i] += 1
             put[j] += 1
     return eliminate(n, dims, begin, length, elements, kind, near, total, degree, group)
+
+
+@inline_kernel
+def group_of(v: int, recent: int, last: int, node: I64, state: I64) -> int:
+    """Its group in the order, as `order_affected` says."""
+    if v == last:
+        return NEWEST
+    if node[v, tl.N_SEEN] > state[tl.S_STEP] - recent:
+        return NEWEST - 1
+    return 1 + node[v, tl.N_RING] if node[v, tl.N_NEAR] == state[tl.S_STAMP] else 0
 
 
 @inline_kernel
@@ -118,7 +122,7 @@ def list_pairs(
         count += end - first
     rows, cols, put = np.empty(count + factors.size, np.int64), np.empty(count + factors.size, np.int64), 0
     for q in range(factors.size):
-        i, j = _ends(factors[q], var, fac, node)
+        i, j = ends_of(factors[q], var, fac, node)
         if j >= 0:
             rows[put], cols[put] = i, j
             put += 1
@@ -134,7 +138,7 @@ def list_pairs(
 
 
 @inline_kernel
-def _ends(f: int, var: I64, fac: I64, node: I64) -> tuple:
+def ends_of(f: int, var: I64, fac: I64, node: I64) -> tuple:
     """Local indices of the two ends of a factor between free variables; (-1, -1) of any other."""
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     if j < 0 or var[i, at.V_COLUMN] < 0 or var[j, at.V_COLUMN] < 0:

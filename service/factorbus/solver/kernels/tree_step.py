@@ -20,6 +20,7 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.bits import MOST
 from factorbus.solver.kernels.cycles import cycles
 from factorbus.solver.kernels.lend import lend
 from factorbus.solver.kernels.lent_cores import NOBODY
@@ -27,6 +28,7 @@ from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
 from factorbus.solver.kernels.tree_eliminate import eliminate_fronts
+from factorbus.solver.kernels.tree_few import analyze_few, join_few, order_few
 from factorbus.solver.kernels.tree_fronts import (
     analyze_affected,
     give_back_fronts,
@@ -193,9 +195,9 @@ def eliminate_again(
     if reorders:
         renewed = renewed[:0]
         count = touch_around(moving, fac, node, link, clique, state, marked, count)
-    near = count_near(marked[:count], reorders, settings, clique, state)
-    if near > 0:
-        count = touch_near(near, f1, settings, var, fac, node, link, clique, state, marked, count)
+    around = count_near(marked[:count], reorders, settings, clique, state)
+    if around > 0:
+        count = touch_near(around, f1, settings, var, fac, node, link, clique, state, marked, count)
         renewed = still_renewed(renewed, clique, state)
     listed, marked = marked, marked[:count]
     room = v1 - v0
@@ -236,16 +238,23 @@ def eliminate_again(
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
         drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0
         last = find_newest(v1, var) if drives_on else -1
-        perm = order_affected(
-            n, affected, factors, orphans, int(settings[tl.P_RECENT]), last, var, fac, node, clique, lists, state
-        )
-        label = np.empty(n, np.int64)
-        for k in range(n):
-            label[perm[k]] = k
-        now = lap(now, tl.ORDER, state)
-        lowest = find_lowest(label, orphans, node, clique, lists, state)
-        rows, cols = list_pairs(lowest, factors, orphans, var, fac, node, clique, lists, state)
-        order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
+        recent = int(settings[tl.P_RECENT])
+        if n <= MOST:
+            near, hung = join_few(n, factors, orphans, var, fac, node, clique, lists, state)
+            perm, row, planes = order_few(n, near, affected, recent, last, var, node, state)
+            now = lap(now, tl.ORDER, state)
+            order, place, home, records, border_at, border_of, lowest = analyze_few(
+                n, perm, row, planes, hung, affected, var
+            )
+        else:
+            perm = order_affected(n, affected, factors, orphans, recent, last, var, fac, node, clique, lists, state)
+            label = np.empty(n, np.int64)
+            for k in range(n):
+                label[perm[k]] = k
+            now = lap(now, tl.ORDER, state)
+            lowest = find_lowest(label, orphans, node, clique, lists, state)
+            rows, cols = list_pairs(lowest, factors, orphans, var, fac, node, clique, lists, state)
+            order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
     update = np.empty((orphans.size, 3), np.int64)
     if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
         give_back_renewed(renewed, old, clique, numbers, state)
@@ -267,7 +276,7 @@ def eliminate_again(
         give_back_updates(update, numbers, state)
         give_back_renewed(renewed, old, clique, numbers, state)
         return 0.0, 0.0, tl.FAILED
-    account_for(state[tl.S_FLOPS] - flops, near > 0, state)
+    account_for(state[tl.S_FLOPS] - flops, around > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(
