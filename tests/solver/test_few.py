@@ -10,9 +10,10 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64, part
 from factorbus.solver.kernels.bits import MOST, count_bits, highest_bit, lowest_bit
-from factorbus.solver.kernels.tree_few import analyze_few, join_few, order_few
+from factorbus.solver.kernels.tree_few import PLANES, analyze_few, join_few, order_few
 from factorbus.solver.kernels.tree_fronts import analyze_affected
 from factorbus.solver.kernels.tree_order import NEWEST, find_lowest, list_pairs, order_affected
+from factorbus.solver.variables import VARIABLE_KINDS
 
 STAMP, STEP, RECENT, FIRST = 7, 20, 5, 3  # variables of the map before the first that is affected
 KINDS = {at.POINT2: 2, at.SE2: 3, at.SE3: 6}
@@ -27,6 +28,10 @@ def look_at_bits(word: int) -> tuple[int, int, int]:
 @given(st.sets(st.integers(0, MOST - 1), min_size=1))
 def test_bits(found: set[int]) -> None:
     assert look_at_bits(sum(1 << k for k in found)) == (len(found), min(found), max(found))
+
+
+def test_there_are_planes_for_all_kinds() -> None:
+    assert all(kind.dim < 1 << PLANES for kind in VARIABLE_KINDS.values())
 
 
 @dataclass(frozen=True)
@@ -106,18 +111,21 @@ def ordered(few: Affected, last: int = -1) -> tuple[I64, I64, I64, I64, dict[str
 
 
 @given(affected(), st.booleans())
-def test_pivots_have_the_least_degree_of_their_group(few: Affected, drives_on: bool) -> None:
+def test_pivots_have_the_least_degree_of_their_group_and_are_the_last_beside_the_last_one(
+    few: Affected, drives_on: bool
+) -> None:
     last = len(few.kinds) - 1 if drives_on else -1
     perm, row, _, hung, _ = ordered(few, FIRST + last if drives_on else -1)
     groups = [NEWEST if k == last else group for k, group in enumerate(few.groups)]
-    graph, left = few.neighbours(), set(range(len(few.kinds)))
+    graph, left, beside = few.neighbours(), set(range(len(few.kinds))), set[int]()
     assert [members(word) for word in hung.tolist()] == [set(separator) for separator in few.hung]
     for k, me in enumerate(perm.tolist()):
         group = min(groups[i] for i in left)
         degree = {i: sum(few.dims[j] for j in graph[i]) for i in left if groups[i] == group}
-        assert me in degree
-        assert degree[me] == min(degree.values())
+        least = {i for i in degree if degree[i] == min(degree.values())}
+        assert me == max(least & beside or least)
         assert members(int(row[k])) == graph[me]
+        beside = set(graph[me])
         for i in graph[me]:
             graph[i] = (graph[i] | graph[me]) - {i, me}
         left.remove(me)

@@ -4,8 +4,9 @@ import functools
 from typing import Any
 
 import llvmlite.binding
-from llvmlite.ir import instructions
-from numba.core import base, ir, types
+from llvmlite.ir import Constant, instructions
+from llvmlite.ir import types as types_of_llvm
+from numba.core import base, errors, ir, lowering, typeinfer, types
 from numba.core.compiler import Flags
 from numba.core.compiler_machinery import PassManager
 from numba.np import arrayobj
@@ -80,14 +81,15 @@ arrayobj.make_array = _array_struct
 
 def _list_variables(self: Any, val: Any) -> list[ir.Var]:
     """The variables in an instruction of Numba's, in their order, which it lists again in each of its passes."""
-    if isinstance(val, ir.Var):
-        return [val]
-    if isinstance(val, ir.Inst):
-        return val.list_vars()
-    if not isinstance(val, dict | list | tuple):
-        return []
+    kind = val.__class__
+    if kind is dict or isinstance(val, dict):
+        val = val.values()
+    elif not isinstance(val, tuple | list):
+        if isinstance(val, ir.Var):
+            return [val]
+        return val.list_vars() if isinstance(val, ir.Inst) else []
     found = []
-    for one in val.values() if isinstance(val, dict) else val:
+    for one in val:
         kind = one.__class__
         if kind is ir.Var:
             found.append(one)
@@ -96,7 +98,7 @@ def _list_variables(self: Any, val: Any) -> list[ir.Var]:
     return found
 
 
-_WITHOUT_VARIABLES = {ir.Loc, str, int, type(None)}
+_WITHOUT_VARIABLES = {ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, str, int, bool, type(None)}
 ir.Inst._rec_list_vars = _list_variables
 
 # Whether a function takes a `loc` is asked anew for each use of it.
@@ -112,6 +114,34 @@ def _take_number(self: Any, name: str) -> None:
 
 
 instructions.Instruction._set_name = _take_number
+
+
+class _Context:
+    """What an error of Numba's adds of where it came up, if one does.  Numba makes a generator for each."""
+
+    __slots__ = ("_args", "_form", "_words")
+
+    def __init__(self, form: str, *args: Any, **words: Any) -> None:
+        self._form, self._args, self._words = form, args, words
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, problem: object, _trace: object) -> None:
+        if isinstance(problem, errors.NumbaError):
+            problem.add_context(self._form.format(*self._args, **self._words))
+
+
+for _module in (errors, lowering, typeinfer):
+    setattr(_module, "new_error_context", _Context)  # noqa: B010
+
+
+def _constant(self: Any, value: Any) -> Constant:
+    """A constant of a type.  llvmlite imports what that is in every call."""
+    return Constant(self, value)
+
+
+setattr(types_of_llvm.Type, "__call__", _constant)  # noqa: B010  (it is typed as what it was)
 
 # While a function is being compiled each call of LLVM, and of all that are being compiled around it, would be timed.
 llvmlite.binding.ffi.lib._lock._cblist.clear()

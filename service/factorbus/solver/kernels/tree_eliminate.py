@@ -96,6 +96,7 @@ def _eliminate_sorted(
     plan: I64, ids: I64, records: I64, first_factor: I64, factor_of: I64, first_orphan: I64, next_orphan: I64,
     orphans: I64, update: I64, graph: I64, tree: I64, board: I64,
 ) -> tuple[int, int]:  # fmt: skip
+    """Write the plan, and go by it; gives the variable whose pivot failed, or −1, and flops."""
     put_place(plan, GRAPH, address_of(graph), graph.size, 1)
     put_place(plan, TREE, address_of(tree), tree.size, 1)
     put_place(plan, IDS, address_of(ids), ids.size, 1)
