@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba.core import errors
 from numba.core.runtime import _nrt_python, rtsys
 
 from factorbus.solver.kernels import _compile_time, _jit, _lowering
@@ -378,3 +379,13 @@ def test_first_calls_from_many_threads():
 def test_compiling_ahead_names_each_kernel():
     assert list(_jit.iter_compile(first_of)) == ["first_of"]
     assert first_of(np.ones(1)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("form", "words", "told"),
+    [("typing of {what}", {"what": "x"}, "typing of x"), ("of {braces}", {}, "of {braces}")],
+)
+def test_an_error_of_the_compiler_says_where_it_came_up(form, words, told):
+    with pytest.raises(errors.TypingError, match="what is wrong") as caught, errors.new_error_context(form, **words):
+        raise errors.TypingError("what is wrong")
+    assert told in str(caught.value)

@@ -81,8 +81,7 @@ arrayobj.make_array = _array_struct
 
 def _list_variables(self: Any, val: Any) -> list[ir.Var]:
     """The variables in an instruction of Numba's, in their order, which it lists again in each of its passes."""
-    kind = val.__class__
-    if kind is dict or isinstance(val, dict):
+    if isinstance(val, dict):
         val = val.values()
     elif not isinstance(val, tuple | list):
         if isinstance(val, ir.Var):
@@ -129,7 +128,10 @@ class _Context:
 
     def __exit__(self, _kind: object, problem: object, _trace: object) -> None:
         if isinstance(problem, errors.NumbaError):
-            problem.add_context(self._form.format(*self._args, **self._words))
+            words = self._form  # which may have braces of its own
+            if self._args or self._words:
+                words = words.format(*self._args, **self._words)
+            problem.add_context(words)
 
 
 for _module in (errors, lowering, typeinfer):

@@ -14,7 +14,7 @@ import numpy as np
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64, inline_kernel, part
 from factorbus.solver.kernels.bits import count_bits, highest_bit, lowest_bit
-from factorbus.solver.kernels.symbolic import arrange_fronts, join_columns, make_records
+from factorbus.solver.kernels.tree_fronts import join_fronts
 from factorbus.solver.kernels.tree_mark import dim_of_variable, separators_of
 from factorbus.solver.kernels.tree_order import ends_of, group_of
 
@@ -128,14 +128,7 @@ def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I
     for k in range(n):
         border[k] = scalars_in(row[k], planes)
         parent[k] = label[first_to_go(row[k], label)] if row[k] != 0 else NONE
-    top_of, pivots = join_columns(n, parent, dim, border)
-    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
-    first_scalar = np.empty(n + 1, np.int64)
-    first_scalar[0] = 0
-    for k in range(n):
-        label[order[k]] = k
-        first_scalar[k + 1] = first_scalar[k] + dim_of_variable(var, affected[order[k]])
-    records = make_records(tops, home, parent, front_of, pivots, border, first_scalar)
+    order, home, tops, records = join_fronts(n, perm, parent, dim, border, affected, var, label)
     border_at, border_of = list_few_borders(tops, row, label)
     lowest = np.empty(hung.size, np.int64)
     for e in range(hung.size):

@@ -39,6 +39,18 @@ def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols
     begin, earlier = by_later(n, label, rows, cols)
     parent = elimination_tree(n, begin, earlier)
     variables, scalars = count_rows(n, begin, earlier, parent, dim)
+    order, home, tops, records = join_fronts(n, perm, parent, dim, scalars, affected, var, label)
+    begin, earlier = by_later(n, label, rows, cols)
+    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
+    return order, label, home, records, border_at, border_of
+
+
+@part
+def join_fronts(n: int, perm: I64, parent: I64, dim: I64, scalars: I64, affected: I64, var: I64, label: I64) -> tuple:
+    """order, home, tops as `arrange_fronts` gives them, and the records; label becomes the place of each variable.
+
+    dim, scalars (n,): of row k of R, on its diagonal and off it
+    """
     top_of, pivots = join_columns(n, parent, dim, scalars)
     order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
     first_scalar = np.empty(n + 1, np.int64)
@@ -46,10 +58,7 @@ def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols
     for k in range(n):
         label[order[k]] = k
         first_scalar[k + 1] = first_scalar[k] + dim_of_variable(var, affected[order[k]])
-    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
-    begin, earlier = by_later(n, label, rows, cols)
-    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
-    return order, label, home, records, border_at, border_of
+    return order, home, tops, make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
 
 
 @inline_kernel
