@@ -13,7 +13,7 @@ from naive.tree_records import tree_of
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.simulate.step import POSE
-from factorbus.solver import Options, Solver, errors
+from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.dense import factor_front
@@ -130,8 +130,7 @@ def test_maps_that_are_eliminated_at_once_share_the_cores(content: dict) -> None
 
 
 def loose(ends: list[int]) -> Batch:
-    """At each of these poses hang two new ones, tied to each other 10¹⁶ times as well as to it: as far as doubles can
-    tell nothing holds them."""
+    """At each of these poses hang two new ones, tied to each other 10¹⁶ times as well as to it."""
     first = np.array([-100 - 2 * n for n in range(len(ends))])
     keys = np.concatenate([np.column_stack([ends, first]), np.column_stack([first, first - 1])])
     information = np.repeat([1.0, 1e16], len(ends))[:, None] * [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]
@@ -141,21 +140,19 @@ def loose(ends: list[int]) -> Batch:
     )
 
 
-def test_of_several_pivots_that_fail_the_same_one_is_named() -> None:
-    def refused() -> int:
+def test_pivots_below_rounding_are_raised_alike() -> None:
+    def taken() -> bytes:
         solver = Solver(Options())
         for step in manhattan(POSES, 5):
             solver.stage(step.batch)
         solver.stage(loose([POSE + 200 * n for n in range(7)]))
-        with pytest.raises(errors.Underconstrained) as caught:
-            solver.step()
-        assert solver.variable_count == 0
-        return caught.value.detail["key"]
+        assert solver.step().chi2 < 1e6
+        return b"".join(group.values.tobytes() for group in solver.estimate())
 
-    alone = refused()
+    alone = taken()
     with lent() as (lender,):
         while not lender.made:
-            assert refused() == alone
+            assert taken() == alone
 
 
 def test_who_leaves_is_no_longer_there_and_makes_room_for_others(content: dict) -> None:

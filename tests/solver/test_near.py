@@ -18,7 +18,13 @@ from factorbus.solver.kernels.tree_near import MOST_RINGS
 NEAR = 60
 ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3, "around": 0.0, "detour": math.inf}  # of more than 27 flops
 NEVER = {"heavy": math.inf}
-LINEAR = {"bent_soon": math.inf, "bent_now": math.inf, "bent_most": math.inf}  # little is relinearised
+LINEAR = {
+    "bent_soon": math.inf,
+    "bent_now": math.inf,
+    "bent_most": math.inf,
+    "converged_share": math.inf,
+    "trust": math.inf,
+}  # little is relinearised
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
 
 

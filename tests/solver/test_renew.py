@@ -13,7 +13,7 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.tree import Tree
 
-OFTEN = {"bent_soon": 1e-9, "bent_now": np.inf, "bent": 1e-6, "look_every": 1, "reluctance": 1.0}
+OFTEN = {"bent_soon": 1e-9, "bent_now": np.inf, "bent": 1e-6, "reluctance": 1.0, "converged_share": np.inf}
 WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}
 
 

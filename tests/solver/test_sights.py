@@ -76,7 +76,7 @@ def test_every_lens_gives_the_residual_of_the_dense_twin(kind: str, name: str) -
 @pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
 @pytest.mark.parametrize("seed", range(2))
 def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
-    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "look_every": 1, "rounds": 40} if mode == "tree" else {}
+    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "rounds": 40} if mode == "tree" else {}
     solver, twin = Solver(Options(mode=mode, **TIGHT, **tree)), DenseGraph()
     for batch in camera_steps(seed):
         solver.stage(batch)

@@ -68,7 +68,7 @@ def follow(steps: Iterable[Batch], **options) -> Solver:
 @pytest.mark.parametrize("way", sorted(WAYS))
 @pytest.mark.parametrize("seed", range(2))
 def test_delta_is_the_dense_solution_in_maps_of_all_kinds(seed: int, way: str) -> None:
-    solver = follow(random_steps(seed, steps=12), **WAYS[way], look_every=1)
+    solver = follow(random_steps(seed, steps=12), **WAYS[way])
     assert solver.factor_count > 60
     dense, delta = linearised(solver)
     information, eta = dense.system()
@@ -112,7 +112,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
 @settings(max_examples=200)
 @given(steps=drives(), way=st.sampled_from(sorted(WAYS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
 def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, bent: float) -> None:
-    solver = follow(steps, **WAYS[way], bent=bent, look_every=1, trust=1e9)
+    solver = follow(steps, **WAYS[way], bent=bent, trust=1e9, converged_share=np.inf)
     settled = solver.step(settle=True).chi2
     assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
 
@@ -210,7 +210,10 @@ def test_a_long_drive_does_not_drift() -> None:
     for step in manhattan(10_000, 5):
         solver.stage(step.batch)
         solver.step()
-    tree, fresh = tree_of(solver), Solver(Options(**EXACT, bent=1e9, trust=1e9, place_new=False))
+    tree, fresh = (
+        tree_of(solver),
+        Solver(Options(**EXACT, bent=1e9, trust=1e9, converged_share=np.inf, place_new=False)),
+    )
     delta = tree.scalars[0, : solver._graph.counts[at.SCALARS]].copy()
     variables, factors = solver.graph()
     graph = solver._graph

@@ -46,10 +46,10 @@ class Options:
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
                     if what waits has `many` scalars
     many            tree: for fewer scalars much less is worth it; poses in space and landmarks have to be worth more
-    trust           tree: where a factor is bent by more than so many, χ² is looked at, and a step that raised it is
-                    replaced
-    look_every, look_moved   tree: it is looked for what is bent so many steps apart when a loop closes, four times as
-                    many without one, and when so much moved since that this may add this share to χ²
+    converged_share a step has converged if a full Gauss–Newton step from its estimate would lower χ² by less than this
+                    share of it; a step of the mode "tree" goes on for up to ten rounds until it has
+    trust           tree: a step that raised χ² by more than this share is replaced by Levenberg–Marquardt from where
+                    the estimate stood
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
                     scalars were; in wide cliques, which take longer, by more than that (MATH §9.7)
     recent_steps    tree: variables that had a factor in the last so many steps are eliminated last
@@ -86,10 +86,9 @@ class Options:
     rest: int = 96
     reluctance: float = 6.0
     dear: float = 5e8
-    trust: float = 3.0
+    converged_share: float = 1e-3
+    trust: float = 1e-4
     rounds: int = 3
-    look_every: int = 4
-    look_moved: float = 0.05
     ripple: float = 0.014
     recent_steps: int = 2
     heavy: float = 1e5

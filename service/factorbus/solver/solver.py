@@ -169,6 +169,14 @@ class Solver:
         """Σ rᵀ Ω r at the estimate, as of the last step."""
         return self._tree.chi2() if self._tree else max(self._done.chi2, 0.0)
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether a step with nothing staged may bring the estimate nearer to the optimum by what χ² shows.
+
+        That is so where a step has not converged, and in the mode "tree" also by as much as one that has leaves undone.
+        """
+        return self._tree.unfinished if self._tree else not bool(np.isfinite(self._done.unsolved))
+
     def ripe(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
         return self._graph.keys[find_ripe(self._graph, below)]

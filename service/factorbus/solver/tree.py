@@ -14,6 +14,7 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.lent_cores import NOBODY
 from factorbus.solver.kernels.tree_begin import HESSIAN
+from factorbus.solver.kernels.tree_hold import hold_at_linearization
 from factorbus.solver.kernels.tree_moved import exchange, list_moved
 from factorbus.solver.kernels.tree_step import tree_step
 from factorbus.solver.lending import BOARD
@@ -26,16 +27,16 @@ class Tree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = tl.ARENAS
-    NOT_KEPT = ("_graph", "settings", "marked", "places")
+    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
 
     def __init__(self, graph: Graph, options: Options) -> None:
-        self._graph = graph
+        self._graph, self._rest = graph, options.rest
         self.settings: F64 = np.empty(tl.P_SIZE)
         self.settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
         self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
-        self.settings[[tl.P_EVERY, tl.P_LOOK, tl.P_RECENT]] = (
-            options.look_every,
-            options.look_moved,
+        self.settings[[tl.P_CONVERGED, tl.P_TRUST, tl.P_RECENT]] = (
+            options.converged_share,
+            options.trust,
             options.recent_steps,
         )
         self.settings[[tl.P_SOON, tl.P_PATIENCE, tl.P_MOST]] = (
@@ -49,6 +50,10 @@ class Tree(Arenas):
         self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_AROUND]] = options.heavy, options.near, options.around
         self.settings[[tl.P_WORTH, tl.P_RINGS, tl.P_DETOUR]] = options.worth, options.rings, options.detour
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
+        self.clear()
+
+    def clear(self) -> None:
+        """Let go of everything: the next step takes in the whole graph."""
         self.node: I64 = lines((256, tl.N_WIDTH), np.int64)
         self.link: I64 = lines((512, tl.L_WIDTH), np.int64)
         self.clique: I64 = lines((256, tl.C_WIDTH), np.int64)
@@ -67,7 +72,7 @@ class Tree(Arenas):
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.account: F64 = np.zeros(tl.A_SIZE)
-        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARISED_AT] = -1, -options.rest
+        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARISED_AT] = -1, -self._rest
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
     def step(self, sure: bool = False) -> int:
@@ -84,6 +89,16 @@ class Tree(Arenas):
         return status
 
     @property
+    def rises(self) -> bool:
+        """Whether the last round of the step raised χ², so that it went no further."""
+        return bool(self.state[tl.S_RISES])
+
+    @property
+    def raised(self) -> bool:
+        """Whether pivots were raised, so that R alone does not lead to the optimum."""
+        return bool(self.state[tl.S_RAISED])
+
+    @property
     def failed(self) -> int:
         """The variable whose pivot made the last step fail."""
         return int(self.state[tl.S_FAILED])
@@ -95,7 +110,12 @@ class Tree(Arenas):
         self.node[free, tl.N_FLAGS] = 1
         self.pending[: free.size] = free
         self.state[tl.S_PENDING] = free.size
-        self.state[tl.S_DUE] = 1
+        self.state[[tl.S_DUE, tl.S_ONCE]] = 1
+        self.state[tl.S_RAISED] = 0
+
+    def hold(self) -> None:
+        """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""
+        hold_at_linearization(self._graph.places, self.places)
 
     def list_moved(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""

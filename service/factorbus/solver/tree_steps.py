@@ -1,10 +1,11 @@
 """Steps in the mode "tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
 
-A step solves a linear problem and is taken as it is where nothing bends far (MATH §9.6).  Where something does, χ² is
-compared with what it was, and a step that would raise it is replaced by a batch from where the estimate stood.
+A step solves a linear problem, measures χ² at the estimate that it comes to, and relinearizes what is too far from its
+linear model (MATH §9.6).  One that raises χ² is replaced by Levenberg-Marquardt from where the estimate stood.
 """
 
 import copy
+import math
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.chi2 import sum_chi2
 from factorbus.solver.kernels.move import differing
+from factorbus.solver.kernels.tree_step import FINISHED, LEAST_CHI2
 from factorbus.solver.options import Options
 from factorbus.solver.report import Shares, StepReport, Stopwatch
 from factorbus.solver.system import System
@@ -26,8 +28,15 @@ from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
 _POLISH = 100
+_ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
 _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
-_NONE_BENT = "0 variables bent too far"
+_NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
+# What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
+# hundred times what it comes to.
+_FINISHED_LEFT = 1e-5
+_WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
+_ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
+_GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
 _new = tuple.__new__
 
 
@@ -40,7 +49,7 @@ class TreeSteps:
         self._graph, self._options = graph, options
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
-        self._first_new, self._batched = 0, False
+        self._first_new, self._batched, self._held, self._at_end = 0, False, False, True
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
 
     @property
@@ -66,18 +75,26 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         compiled = clock() if clock else 0.0
-        course, account = None, tree.account.tolist()
-        if settle and self._graph.counts[at.COLUMNS]:
+        course, account, before, self._held = None, tree.account.tolist(), self._graph.values, False
+        worse = not account[tl.A_CHI2] <= (1.0 + self._options.trust) * account[tl.A_BEFORE] + LEAST_CHI2
+        settle &= bool(self._graph.counts[at.COLUMNS])
+        continues = self._graph.mark() == self._mark
+        goes_on = continues and tree.raised and not self._at_end
+        if settle or worse or tree.rises or goes_on:
             tree.exchange()
             before = self._graph.values.copy()
-            tree.exchange()
-            course, because = self._batch(before, settle=True), "asked to settle"
-        elif account[tl.A_BEND] > self._options.trust and self._is_worse():
-            before = self._graph.values.copy()
-            course = self._batch(before, settle=False)
-            because = "χ² would have risen: a batch from where the estimate stood"
-        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS])) if course else account[tl.A_CHI2]
-        return self._account(started, compiled, course, max(chi2, 0.0), because)
+            if not worse:
+                tree.exchange()
+            course = self._batch(before, settle)
+            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if tree.rises else _GOES_ON
+            # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
+            if goes_on and account[tl.A_BEFORE] - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
+                course.converged = True
+        self._at_end = course.converged if course else not tree.raised or (continues and self._at_end)
+        if not math.isfinite(tree.account[tl.A_CHI2]):
+            self._begin_anew(before)
+            raise errors.NotFinite("χ² of the estimate after the step")
+        return self._account(started, compiled, course, account[tl.A_BEFORE], because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -85,8 +102,18 @@ class TreeSteps:
             return self._moved
         return self._tree.list_moved(self._first_new)
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether a step with nothing new may bring the estimate nearer to the optimum by what χ² shows, (9.27)."""
+        _, chi2, _, error, _, _, _, left, *_ = self._tree.account.tolist()
+        share = max(chi2, 0.0) + LEAST_CHI2
+        scalars = int(self._graph.counts[at.SCALARS])
+        if self._held or self._tree.raised:
+            return not self._at_end
+        return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
+
     def chi2(self) -> float:
-        """Σ rᵀ Ω r at the estimate, as of the last step."""
+        """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
         return max(self._sum_chi2(self._mark[at.FACTORS]), 0.0)  # pieces of a form sum to zero but for rounding
 
     def _check_held(self) -> str:
@@ -106,6 +133,16 @@ class TreeSteps:
         system.factorize(0.0)
         return f"{suspects.size} new variables are held only by several factors together"
 
+    def _begin_anew(self, before: F64) -> None:
+        """The graph as it was before the step, at the values `before`, and a tree made for it that leaves it there."""
+        self._graph.values = before
+        self._graph.forget(self._mark)
+        self._tree.clear()
+        if self._graph.counts[at.VARIABLES]:
+            self._tree.step(sure=True)
+            self._tree.hold()
+            self._held = True
+
     def _apart(self) -> Graph:
         """The graph with rows of its own, for equations that leave it as it is."""
         graph = copy.copy(self._graph)
@@ -120,18 +157,9 @@ class TreeSteps:
         system.factor.moved()
         return system
 
-    def _is_worse(self) -> bool:
-        """Whether the step raised χ²; the estimate is then what it was before."""
-        factors = int(self._graph.counts[at.FACTORS])
-        after = self._sum_chi2(factors)
-        self._tree.exchange()
-        if not after <= self._sum_chi2(factors):
-            return True
-        self._tree.exchange()
-        return False
-
     def _batch(self, before: F64, settle: bool) -> Course:
-        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows.
+        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows, and stays where they
+        end if its own step from there would raise χ².
 
         before: the values as they were before the step
         """
@@ -146,6 +174,9 @@ class TreeSteps:
         if course.iterations or not settle:
             self._tree.move_all()
             self._tree.step()
+            self._held = not self._tree.account[tl.A_CHI2] <= course.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
+            if self._held:
+                self._tree.hold()
         count = int(self._graph.counts[at.VARIABLES])
         found = np.empty(count, np.int64)
         bits = before.view(np.int64), self._graph.values.view(np.int64)
@@ -156,22 +187,27 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, started: float, compiled: float, course: Course | None, chi2: float, because: str) -> StepReport:
+    def _account(
+        self, started: float, compiled: float, course: Course | None, chi2_before: float, because: str
+    ) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
         nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
+        chi2, error = self._tree.account[tl.A_CHI2], self._tree.account[tl.A_ERROR]
+        chi2 = chi2.item() if chi2 > 0.0 else 0.0  # pieces of a form sum to zero but for rounding
+        converged = course.converged if course else bool(error <= self._options.converged_share * (chi2 + LEAST_CHI2))
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
             "tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
-            because or (f"{relinearised} variables bent too far" if relinearised else _NONE_BENT),
+            because or (f"{relinearised} variables relinearized" if relinearised else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
-            chi2,  # chi2
-            chi2,  # chi2_before
+            chi2,
+            chi2_before if chi2_before > 0.0 else 0.0,
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - before[at.FACTORS],
             self._moved.size if course else changed,
@@ -181,7 +217,7 @@ class TreeSteps:
             nonzeros,
             float(flops),
             0.0,  # damping
-            course.converged if course else True,
+            converged,
             Shares(tl.PHASES, told[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,

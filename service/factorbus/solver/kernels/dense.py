@@ -19,19 +19,27 @@ from factorbus.solver.kernels.simd import LANES, TILE_ROWS, at, put, solve_rows
 # pivots of a free grid of 100 poses, zero in truth, come out at 4e-15·Λₖₖ or below zero, while the least pivot of a
 # chain of 30,000 poses held at one end only and eliminated from there, poor but real, is 1e-11·Λₖₖ.
 PIVOT_TOLERANCE = 1e-13
+# Where it is known that everything is held, a pivot below this share of Λₖₖ is rounding, and is raised to it.
+LEAST_PIVOT = 1e-14
+# The same of the largest Λₖₖ of all: its rounding, and that of its gradient, go on to what is eliminated later, and what
+# is known of anything by less is lost in them.  A map that only a prior of σ 1e5 rad holds would turn by 0.1 rad.
+ROUNDING = 2.0**-40
+RAISED = -2  # what `factor_front` gives where it raised a pivot
 
 
 @part
 def factor_front(
     a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, floors: F64, k: int, t: int, board: I64
 ) -> int:
-    """Factorise a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1.
+    """Factorise a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1; or RAISED.
 
     in   r, ld: its p rows over p + m columns   u, width: its m x m update matrix
-         floors[k + i]: pivot i must exceed it   t: scratch of this thread
+         floors[k + i]: pivot i must exceed it, or, where it is negative, is raised to its size if it does not
+         t: scratch of this thread
          board: where cores are lent, see `lent_cores`
     out  rows: R and S   update matrix: U
     """
+    raised = False
     for top in range(0, p, DEPTH):
         end = min(top + DEPTH, p)
         for i in range(top, end, TILE_ROWS):
@@ -40,21 +48,23 @@ def factor_front(
             failed = pivot_rows(a, rows, r + i * ld + i, ld, floors, k + i, t)
             if failed >= 0:
                 return i + failed
+            raised |= failed == RAISED
             lead = padded(p) - p
             first = i - (lead + i) % LANES
             solve_rows(a, rows, (padded(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, t)
         large = is_large(end - top, p + m - end)
         if not (large and take_panel_off_together(board, a, r, ld, p, m, u, width, top, end)):
             take_panel_off(a, r, ld, p, m, u, width, top, end, end, p + m)
-    return -1
+    return RAISED if raised else -1
 
 
 @inline_kernel
 def pivot_rows(a: F64, rows: int, d: int, ld: int, floors: F64, k: int, t: int) -> int:
-    """Cholesky of the `rows` x `rows` block at d into the scratch at t; gives the pivot that failed, or -1.
+    """Cholesky of the `rows` x `rows` block at d into the scratch at t; gives the pivot that failed, or -1; or RAISED.
 
     Scratch: 1/T₀₀ 1/T₁₁ 1/T₂₂ 1/T₃₃ T₀₁ T₀₂ T₁₂ T₀₃ T₁₃ T₂₃.
     """
+    status = -1
     for j in range(rows):
         column = t + 4 + j * (j - 1) // 2
         for i in range(j):
@@ -65,7 +75,11 @@ def pivot_rows(a: F64, rows: int, d: int, ld: int, floors: F64, k: int, t: int) 
         pivot = at(a, d + j * ld + j)
         for q in range(j):
             pivot -= at(a, column + q) ** 2
-        if not (pivot > floors[k + j] and pivot > 0.0):
-            return j
+        floor = floors[k + j]
+        if not (pivot > abs(floor) and pivot > 0.0):
+            if not (floor < 0.0 and pivot <= abs(floor)):
+                return j
+            put(a, d + j * ld + j, at(a, d + j * ld + j) - floor - pivot)
+            pivot, status = -floor, RAISED
         put(a, t + j, 1.0 / math.sqrt(pivot))
-    return -1
+    return status

@@ -26,7 +26,8 @@ def factorize(
         for b in range(front[fr.BLOCKS], front[fr.BLOCKS_END]):
             put_block(arena, blocks, b, ld, values, offsets[blocks[b, 0]], 1.0 + damping)
         for i in range(p):
-            floors[column + i] = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
+            floor = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
+            floors[column + i] = floor if floor > 0.0 else 0.0
         c = front[fr.CHILD]
         while c >= 0:
             child = fronts[c]

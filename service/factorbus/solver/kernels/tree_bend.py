@@ -15,17 +15,20 @@ against the pose, the Jacobian of the pose's turn is off by that share of d, and
 
     slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
 
-r being the residual at the linearisation point.  A pose seen from another one slips as well, by much less: errors of
-the gradient largely cancel along a path, and LINKS of it is what counts, with the residual r(x) at the estimate,
+r being the residual at the linearisation point.  A pose seen from another one slips as well, with the residual r(x) at
+the estimate,
 
-    slip = LINKS √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                     (9.13)
+    slip = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                           (9.13)
 
-and as u is off by |sⱼ − sᵢ| + φ (d + |r₀|) at most from what it was at the linearisation point, where the residual was
-r₀, that is not looked at where it cannot matter,
+As a bound it counts in full.  But errors of the gradient largely cancel along a path, so for what is relinearized as
+the drive goes on LINKS of it counts.  Where the slip is more than the bend, both ends move.
 
-    |r(x)| ≤ |r₀| + |sⱼ − sᵢ| + φ (d + |r₀|)                                                             (9.14)
+Angles of the plane add up; turns in space do not.  With ψ the turn of j as seen from i since both were linearized, and
+φ that of i, the vector part of the error is off by
 
-Where the slip is more than the bend, both ends move.  How a sight is
+    √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
+
+ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  How a sight is
 bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
 standard deviations,
 
@@ -37,9 +40,8 @@ and both ends move.
 import math
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, inline_kernel
-from factorbus.solver.kernels.se3 import rotation
+from factorbus.solver.kernels.se3 import quat_product
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.lenses.layout import FU
 
@@ -88,37 +90,25 @@ def slip_of(kind: int, root: float, d: float, shift: float, pull: float) -> floa
 
 
 @inline_kernel
-def may_slip(
-    kind: int, root: float, d: float, phi: float, shift: float, residual: float, stiff_turn: float, room: float
-) -> bool:
-    """Whether (9.13) can come to `room`, by (9.14); the residual is that at the linearisation point."""
-    if kind != at.BETWEEN_SE2 and kind != at.BETWEEN_SE3:
-        return False
-    most = LINKS * root * root * (residual + shift + phi * (d + residual)) * shift
-    return not (room > 0.0 and most * most < room * room * (d * d * root * root + stiff_turn))
+def slip_between(root: float, d: float, shift: float, residual: float, stiff_turn: float) -> float:
+    """(9.13) of poses; residual: of the translation, at the estimate."""
+    return root * residual * shift / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
 
 
 @inline_kernel
-def axes_of(planar: bool, x: int, values: F64) -> tuple:
-    """R of the pose at offset x, row by row."""
-    if planar:
-        c, s = math.cos(load(values, x + 2)), math.sin(load(values, x + 2))
-        return c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0
-    return rotation(values, x + 3)
+def turn_error(phi: float, i: int, j: int, values: F64, lin: F64, stiff_turn: float) -> float:
+    """(9.26) between poses in space at offsets i and j, the first turned by phi; stiff_turn is ω_θ of the angle."""
+    now = relative_turn(i, j, values)
+    was = relative_turn(i, j, lin)
+    x, y, z, _ = quat_product(-was[0], -was[1], -was[2], was[3], now[0], now[1], now[2], now[3])
+    psi = 2.0 * math.sqrt(x * x + y * y + z * z)
+    return math.sqrt(stiff_turn) * psi * (0.5 * phi + psi * psi / 24.0)
 
 
 @inline_kernel
-def slip_between(planar: bool, axes: tuple, i: int, j: int, shift: float, values: F64, stiff: F64, f: int) -> float:
-    """(9.13) of factor f between the poses at offsets i, which has these axes, and j."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = axes
-    dx, dy = load(values, j) - load(values, i), load(values, j + 1) - load(values, i + 1)
-    dz = 0.0 if planar else load(values, j + 2) - load(values, i + 2)
-    rx = a0 * dx + a3 * dy + a6 * dz - stiff[f, tl.B_MEASURED]
-    ry = a1 * dx + a4 * dy + a7 * dz - stiff[f, tl.B_MEASURED + 1]
-    rz = a2 * dx + a5 * dy + a8 * dz - stiff[f, tl.B_MEASURED + 2]
-    d, root = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT]
-    pull = root * math.sqrt(rx * rx + ry * ry + rz * rz)
-    return LINKS * pull * shift / math.sqrt(d * d + stiff[f, tl.B_TURN] / (root * root))
+def relative_turn(i: int, j: int, x: F64) -> tuple:
+    """qᵢ⁻¹ ⊗ qⱼ of the poses at offsets i and j, x y z w."""
+    return quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
 
 
 @inline_kernel

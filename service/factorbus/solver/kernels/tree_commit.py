@@ -25,10 +25,10 @@ def commit(
     for k in range(marked.size):
         state[tl.S_NONZEROS] -= nonzeros(clique[marked[k]])
         if clique[marked[k], tl.C_PARENT] < 0:
-            account[tl.A_CHI2] -= numbers[clique[marked[k], tl.C_UPDATE]]
+            account[tl.A_MODEL] -= numbers[clique[marked[k], tl.C_UPDATE]]
             state[tl.S_ROOTS] -= 1
     if state[tl.S_ROOTS] == 0:
-        account[tl.A_CHI2] = account[tl.A_CONSTANT]
+        account[tl.A_MODEL] = account[tl.A_CONSTANT]
     for e in range(orphans.size):
         if clique[orphans[e], tl.C_MARK] == state[tl.S_STAMP]:
             keep_leading(orphans[e], update[e], var, clique, lists, numbers, state)
@@ -51,7 +51,7 @@ def commit(
         above = records[f, fr.PARENT]
         if above < 0:
             state[tl.S_ROOTS] += 1
-            account[tl.A_CHI2] += numbers[row[tl.C_UPDATE]]
+            account[tl.A_MODEL] += numbers[row[tl.C_UPDATE]]
         else:
             hang(c, ids[above], border_of[border_at[f]] - records[above, fr.VARIABLE], clique)
     for e in range(orphans.size):
@@ -78,7 +78,7 @@ def add_constants(f0: int, f1: int, var: I64, fac: I64, link: I64, hessian: F64,
             dj = dim_of_variable(var, j) if j >= 0 else 0
             chi2 = hessian[link[f, tl.L_AT] + hessian_size(dim_of_variable(var, i), dj) - 1]
             account[tl.A_CONSTANT] += chi2
-            account[tl.A_CHI2] += chi2
+            account[tl.A_MODEL] += chi2
 
 
 @part

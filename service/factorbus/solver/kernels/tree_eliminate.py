@@ -14,7 +14,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64, inline_kernel, part
-from factorbus.solver.kernels.dense import factor_front
+from factorbus.solver.kernels.dense import RAISED, ROUNDING, factor_front
 from factorbus.solver.kernels.lent_cores import (
     AT,
     SUBTREES,
@@ -204,6 +204,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
     node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
     lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
     scalars, stamp = float_rows(tree, tl.T_SCALARS), ints(tree, tl.T_STATE)[tl.S_STAMP]
+    noise = ROUNDING * floats(tree, tl.T_ACCOUNT)[tl.A_STIFFEST]
     ids, records = ints(plan, IDS), int_rows(plan, RECORDS)
     orphans, update = ints(plan, ORPHANS), int_rows(plan, UPDATE)
     first_factor, factor_of = ints(plan, FIRST_FACTOR), ints(plan, FACTORS)
@@ -214,7 +215,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
     for f in range(begin, end):
         row = clique[ids[f]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-        number_columns(row, var, node, lists, scalars, column, floors)
+        number_columns(row, noise, var, node, lists, scalars, column, floors)
         clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
@@ -243,6 +244,8 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
         )  # fmt: skip
         if failed >= 0:
             return variable_at(failed, row, var, lists), flops
+        if failed == RAISED:
+            ints(tree, tl.T_STATE)[tl.S_RAISED] = 1
         flops += p * (p + m + 1) * (p + m + 1)
     return -1, flops
 

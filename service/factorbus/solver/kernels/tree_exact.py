@@ -1,4 +1,4 @@
-"""How far a factor is bent, computed: sights, and factors with a loss.  MATH (9.11)."""
+"""The linearization error of a factor, computed: sights, and factors with a loss.  MATH (9.11)."""
 
 import math
 
@@ -10,17 +10,23 @@ from factorbus.solver.kernels.linearise import evaluate_apart
 from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
 
+SWITCHED = 30.0  # of a sight that has lost its pixel or found it again: by which that counts in χ², see `sights`
+
 
 @part
-def exact_bend(f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64) -> float:
-    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations."""
+def exact_error(
+    f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
+) -> tuple[float, float]:  # fmt: skip
+    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations; and its χ²
+    there.
+    """
     r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
-    evaluate_apart(f, var, fac, values, payload, now, A, B)
+    chi2 = evaluate_apart(f, var, fac, values, payload, now, A, B)
     evaluate_apart(f, var, fac, lin, payload, r, A, B)
     kind = fac[f, at.F_KIND]
-    if kind >= at.IDP_FIRST and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD):
-        return math.inf  # it has fallen asleep, or woken
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
+    # It has fallen asleep, or woken.
+    switched = kind >= at.IDP_FIRST and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD)
     add_slope(fac[f, at.F_I], dim, var, delta, A, r)
     if fac[f, at.F_J] >= 0:
         add_slope(fac[f, at.F_J], dim, var, delta, B, r)
@@ -28,11 +34,13 @@ def exact_bend(f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, 
     for a in range(dim):
         gap = now[a] - r[a]
         total += gap * payload[p] * gap
+        chi2 += now[a] * payload[p] * now[a]
         p += 1
         for b in range(a + 1, dim):
             total += 2.0 * gap * payload[p] * (now[b] - r[b])
+            chi2 += 2.0 * now[a] * payload[p] * now[b]
             p += 1
-    return math.sqrt(max(total, 0.0))
+    return SWITCHED if switched else math.sqrt(max(total, 0.0)), chi2
 
 
 @part

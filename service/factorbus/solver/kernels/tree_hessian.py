@@ -5,6 +5,7 @@ import math
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.factor_chi2 import is_round
 from factorbus.solver.kernels.linearise import evaluate_apart, multiply
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, six
@@ -34,14 +35,12 @@ def linearise_factor(
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
         _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
-        stiff[f, tl.B_PULL] = math.sqrt(r[0] * r[0] + r[1] * r[1])
         stiff[f, tl.B_TURN] = hessian[h + 9 + 9 + 8]
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
         _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
         stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
         _write_between_se3(p, more, payload, r, H, W, h, hessian)
-        stiff[f, tl.B_PULL] = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
         stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
         _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
@@ -186,6 +185,4 @@ def weigh_factor(
             for a in range(dj):
                 scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
     stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
-    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        for a in range(3):
-            stiff[f, tl.B_MEASURED + a] = payload[fac[f, at.F_AT] + a] if a < 2 or kind == at.BETWEEN_SE3 else 0.0
+    stiff[f, tl.B_ROUND] = 1.0 if is_round(kind, fac[f, at.F_AT], payload) else 0.0

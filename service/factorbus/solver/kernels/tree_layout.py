@@ -15,23 +15,23 @@ The arenas of a tree are, each from the start of a cache line on:
     lists   int64            variables of cliques
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
-    stiff   (m, 8) float64   of each factor d and √ω, (9.4); between poses |r| of the translation where it was
-                             linearised, ω_θ, (9.14), and what was measured of the translation; of a landmark
-                             |Ω r| there, (9.12)
+    stiff   (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearised, (9.12);
+                             between poses ω_θ, (9.13); whether its Ω is that of a disc and an angle; χ² at the estimate
     lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearised
-    turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; Σ bend² of its factors that are bent,
-                             while it waits to be relinearised; cosine and sine where a plane pose is linearised
-    pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that changed
-                             since they were looked at last
+    turns   (n, 8) float64   of each variable: the largest d √ω of what it sees; Σ error² of the factors that it is the
+                             first of, as it counts, (9.13); cosine and sine where a plane pose is linearised; Σ error²
+                             in full
+    pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that moved
+                             since their factors were evaluated last
     marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
     settings (24,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
-    account (5,) float64     what a step found
+    account (12,) float64     what a step found
 """
 
 # The arenas of a tree in its table (`places`).
@@ -53,7 +53,7 @@ N_STAMP = 2  # the last elimination it took part in
 N_LOCAL = 3  # its index there
 N_ADJ = 4  # first incidence, 2 · factor + end; -1: none
 N_MOVED = 5  # the last step that changed its estimate
-N_LISTED = 6  # 1: it is in `moved`
+N_LISTED = 6  # not 0: it is in `moved`, see `tree_move`
 N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
 # and the rest.
 N_OWN = 8  # first factor that is added where this variable is eliminated; -1: none
@@ -64,11 +64,11 @@ N_NEAR = 12  # the last elimination that looked whether to bring it near the roo
 N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
 N_WIDTH = 16
 
-# Columns of `stiff`: d, √ω, |r| or |Ω r|, ω_θ, and what was measured of the translation.
-B_LEVER, B_ROOT, B_PULL, B_TURN, B_MEASURED, B_WIDTH = 0, 1, 2, 3, 4, 8
+# Columns of `stiff`: d, √ω, |Ω r|, ω_θ, 1 for an Ω of a disc and an angle, and χ² at the estimate.
+B_LEVER, B_ROOT, B_PULL, B_TURN, B_ROUND, B_CHI2, B_WIDTH = 0, 1, 2, 3, 4, 5, 8
 
 # Columns of `turns`.
-U_LEVER, U_STRAIN, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 3, 4
+U_LEVER, U_STRAIN, U_COS, U_SIN, U_BOUND, U_WIDTH = 0, 1, 2, 3, 4, 8
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable
@@ -162,13 +162,16 @@ S_OLD = 43  # variables before the step
 S_MOVING_ROOT = 44  # flops of the last elimination that brought variables near the root,
 S_SPENT = 45  # and of all others since
 S_RELINEARISED_AT = 46  # the step that relinearised last
-S_LOOKED = 47  # the step that looked last for what is bent
+S_CONTINUES = 47  # 1: the step under way has nothing new
 S_IDLE = 48  # doubles of free blocks of `numbers`,
 S_GIVEN = 49  # of those given back since they were joined,
 S_LARGEST = 50  # and no class above this one has any
 S_RELINEARISING = 51  # flops of the last elimination that relinearised
 S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of few flops
-S_FREE = 53  # heads of free lists: numbers, then lists
+S_RISES = 53  # 1: the last round of the step raised χ²
+S_ONCE = 54  # 1: the step under way has one round
+S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
+S_FREE = 56  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
@@ -181,12 +184,12 @@ P_BENT = 1  # what is bent by more waits to be relinearised
 P_BENT_NOW = 2  # it is so at once, where all that is bent adds more than this share to χ²
 P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
-P_EVERY = 5  # so many steps apart, when a loop closes, it is looked for what is bent
+P_CONVERGED = 5  # a step goes on while a Gauss–Newton step may lower χ² by more than this share
 P_NEGLIGIBLE = 6  # a χ² that is nothing
 P_RECENT = 7  # variables with a factor in the last so many steps go last
 P_ROUNDS = 8  # eliminations in a step, at most
 P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
-P_LOOK = 10  # and where what moved since may have bent by this share of χ², P_MANY variables
+P_TRUST = 10  # a round that raises χ² by more than this share ends the step
 P_SOON = 11  # and in the next step where it adds more than this share,
 P_PATIENCE = 12  # has waited for so many steps,
 P_MOST = 13  # or something is bent by more than this
@@ -207,9 +210,16 @@ PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "subs
 LINEARISE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
 
 # Entries of `account`.
-A_CHI2 = 0  # χ² of the linear problem at its solution
-A_BEND = 1  # the largest bend of what moved, units of (9.6)
-A_CONSTANT = 2  # χ² of factors between fixed variables
-A_ALARM = 3  # what may have bent since it was looked last, σ² (9.15)
+A_MODEL = 0  # χ² of the linear problem at its solution
+A_CHI2 = 1  # χ² at the estimate
+A_CONSTANT = 2  # in A_MODEL: χ² of factors between fixed variables
+A_ERROR = 3  # Σ error² of all factors, which bounds what a Gauss–Newton step would take off χ²
 A_UNIT = 4  # (9.6), as it was before the step
-A_SIZE = 5
+A_BEFORE = 5  # χ² at the estimate before the step, new factors and first values of new variables included
+A_ADDED = 6  # of that: of the new factors
+A_LEFT = 7  # by how much back-substitution left something undone, σ², the largest of all scalars
+A_ADDED_UP = 8  # what A_CHI2 has gained and lost since it was summed
+A_COUNTED = 9  # Σ error² as it counts for what is relinearized
+A_STIFFEST = 10  # the largest sum of the diagonals of Hessians of any scalar,
+A_STIFFEST_BEFORE = 11  # and before the step
+A_SIZE = 12

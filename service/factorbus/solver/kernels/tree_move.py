@@ -11,6 +11,9 @@ from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
 
+# In N_LISTED.
+PLACE, MODEL = 1, 2
+
 
 @inline_kernel
 def move_variable(
@@ -31,12 +34,14 @@ def move_variable(
 
 
 @inline_kernel
-def list_moved(v: int, node: I64, moved: I64, state: I64) -> None:
-    """It is looked for what is bent of variable v."""
-    if node[v, tl.N_LISTED] == 0:
-        node[v, tl.N_LISTED] = 1
+def list_moved(how: int, v: int, node: I64, moved: I64, state: I64) -> None:
+    """The factors of variable v are to be evaluated: PLACE, their χ²; MODEL and more, how linear they are as well."""
+    listed = node[v, tl.N_LISTED]
+    if listed == 0:
         moved[state[tl.S_MOVED]] = v
         state[tl.S_MOVED] += 1
+    if listed == 0 or (listed == PLACE and how == MODEL):
+        node[v, tl.N_LISTED] = how
 
 
 @inline_kernel

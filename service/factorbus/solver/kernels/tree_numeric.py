@@ -7,7 +7,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.dense import PIVOT_TOLERANCE
+from factorbus.solver.kernels.dense import LEAST_PIVOT
 from factorbus.solver.kernels.panels import take_off
 from factorbus.solver.kernels.simd import TILE_ROWS, add_run, put, zero
 from factorbus.solver.kernels.simd import at as load
@@ -17,8 +17,10 @@ from factorbus.solver.kernels.tree_store import give_numbers, size_class, take_n
 
 
 @inline_kernel
-def number_columns(row: I64, var: I64, node: I64, lists: I64, scalars: F64, column: I64, floors: F64) -> None:
-    """The first column of each variable of a clique, by its local number, and what each pivot has to exceed."""
+def number_columns(
+    row: I64, noise: float, var: I64, node: I64, lists: I64, scalars: F64, column: I64, floors: F64
+) -> None:
+    """The first column of each variable of a clique, by its local number, and what each pivot is raised to."""
     width, start = 0, row[tl.C_LIST]
     for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
         v = lists[s]
@@ -27,7 +29,7 @@ def number_columns(row: I64, var: I64, node: I64, lists: I64, scalars: F64, colu
         if width < row[tl.C_PIVOTS]:
             d = var[v, at.V_SCALAR]
             for a in range(dim):
-                floors[width + a] = PIVOT_TOLERANCE * scalars[1, d + a]
+                floors[width + a] = -max(LEAST_PIVOT * scalars[1, d + a], noise)
         width += dim
 
 

@@ -8,6 +8,7 @@ from factorbus.solver.kernels._jit import F64, I64, part
 from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import linearise_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_move import MODEL, list_moved
 from factorbus.solver.kernels.tree_take_in import next_incidence, note_turn
 
 WAITS, MOVES = 1, 2
@@ -17,7 +18,7 @@ SPARSE = 16  # where no more than one factor in so many is to be linearised, the
 @part
 def relinearise(
     pending: I64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64,
-    scalars: F64, stiff: F64, turns: F64, state: I64,
+    scalars: F64, stiff: F64, turns: F64, moved: I64, state: I64,
 ) -> None:  # fmt: skip
     """Move the pending variables to the estimate, and linearise their factors there."""
     for k in range(pending.size):
@@ -31,6 +32,7 @@ def relinearise(
             scalars[2, d + a], scalars[0, d + a] = scalars[0, d + a], 0.0
         note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = MOVES
+        list_moved(MODEL, v, node, moved, state)
         state[tl.S_RELINEARISED] += 1
     linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
 

@@ -11,7 +11,7 @@ from factorbus.solver.kernels import fronts as fr
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.dense import factor_front
+from factorbus.solver.kernels.dense import RAISED, ROUNDING, factor_front
 from factorbus.solver.kernels.multifrontal import clear_front
 from factorbus.solver.kernels.tree_fronts import row_layout, update_layout
 from factorbus.solver.kernels.tree_near import flops_of
@@ -89,8 +89,8 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 
 @part
 def renew(
-    renewed: I64, n: int, old: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64,
-    hessian: F64, scalars: F64, state: I64, board: I64,
+    renewed: I64, n: int, stiffest: float, old: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64,
+    numbers: F64, hessian: F64, scalars: F64, state: I64, board: I64,
 ) -> int:  # fmt: skip
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
@@ -114,7 +114,7 @@ def renew(
     for k in range(renewed.size):
         row = clique[renewed[k]]
         p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-        number_columns(row, var, node, lists, scalars, column, floors)
+        number_columns(row, ROUNDING * stiffest, var, node, lists, scalars, column, floors)
         clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
@@ -141,6 +141,8 @@ def renew(
             0,
             board,
         )
+        if failed == RAISED:
+            state[tl.S_RAISED] = 1
         if failed >= 0:
             state[tl.S_FAILED] = variable_at(failed, row, var, lists)
             give_back_renewed(renewed, old, clique, numbers, state)
@@ -194,13 +196,13 @@ def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64
         if row[tl.C_PARENT] < 0:
             roots[count] = renewed[k]
             count += 1
-            account[tl.A_CHI2] -= numbers[old[k, 5]]
+            account[tl.A_MODEL] -= numbers[old[k, 5]]
         row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
         state[tl.S_ELIMINATED] += row[tl.C_FRONTALS]
     if count == state[tl.S_ROOTS]:
-        account[tl.A_CHI2] = account[tl.A_CONSTANT]
+        account[tl.A_MODEL] = account[tl.A_CONSTANT]
     for k in range(count):
-        account[tl.A_CHI2] += numbers[clique[roots[k], tl.C_UPDATE]]
+        account[tl.A_MODEL] += numbers[clique[roots[k], tl.C_UPDATE]]
     for k in range(renewed.size):
         give_numbers(old[k, 0], old[k, 1], numbers, state)
         give_numbers(old[k, 5], old[k, 7], numbers, state)

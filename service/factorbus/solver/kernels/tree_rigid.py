@@ -22,13 +22,13 @@ from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.tree_bend import turn_of
 from factorbus.solver.kernels.tree_mark import dim_of_variable
-from factorbus.solver.kernels.tree_move import list_moved, move_variable
+from factorbus.solver.kernels.tree_move import MODEL, PLACE, list_moved, move_variable
 
 MOTION = tl.MOTION
 BODIES = 64  # that move at once, at most
-# Scratch of this: ξ since a clique was solved, what of it is new, the displacement of the variable at hand, and the new
-# motion of each body.
-WHOLE, FRESH, LOCAL, TABLE = 0, 6, 12, 18
+# Scratch of this: ξ since a clique was solved, what of it is new, the displacement of the variable at hand, the largest
+# square of what back-substitution left undone, and the new motion of each body.
+WHOLE, FRESH, LOCAL, LEFT, TABLE = 0, 6, 12, 18, 19
 SIZE = TABLE + BODIES * MOTION
 SINGULAR = 1e-12
 
@@ -241,13 +241,13 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
 @part
 def move_bodies(
     listed: I64, quiet: float, var: I64, node: I64, clique: I64, lists: I64, delta: F64, lin: F64, before: F64,
-    turns: F64, values: F64, changed: I64, moved: I64, motions: F64, motion: F64, state: I64, account: F64,
+    turns: F64, values: F64, changed: I64, moved: I64, motions: F64, motion: F64, state: I64,
 ) -> None:  # fmt: skip
     """The variables of the listed cliques move with their bodies, in the order in which they lie in memory.
 
-    Of what bends by its turns since it was solved, (9.21), no more than `quiet`, it is not looked for what is bent.
+    Where turns since it was solved bend, (9.21), by no more than `quiet`, linearization errors stay what they were.
     """
-    n, alarm = 0, 0.0
+    n = 0
     for k in range(listed.size):
         n += clique[listed[k], tl.C_FRONTALS]
     variables = np.empty(n, np.int64)
@@ -266,7 +266,4 @@ def move_bodies(
             put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
         move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
         bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
-        alarm += bend * bend
-        if bend > quiet:
-            list_moved(v, node, moved, state)
-    account[tl.A_ALARM] += alarm
+        list_moved(MODEL if bend > quiet else PLACE, v, node, moved, state)

@@ -13,9 +13,8 @@ from factorbus.solver.kernels import tree_rigid as rg
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put
-from factorbus.solver.kernels.tree_bend import turn_of
 from factorbus.solver.kernels.tree_mark import dim_of_variable
-from factorbus.solver.kernels.tree_move import list_moved, move_variable
+from factorbus.solver.kernels.tree_move import MODEL, list_moved, move_variable
 
 NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
 
@@ -29,9 +28,11 @@ def substitute(
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
-    were.  moved: gets those that may be bent by it, where they are not there yet.  listed: scratch, for all cliques
+    were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  A_LEFT gets
+    the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone
     """
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
+    motion[rg.LEFT] = 0.0
     shares = np.empty(64)
     body = count = 0
     for f in range(ids.size - 1, -1, -1):
@@ -46,9 +47,7 @@ def substitute(
             solve_rows(row, numbers, shares)
             row[tl.C_FIRST] = row[tl.C_MOVES] = 0
             state[tl.S_SOLVED] += 1
-            move_frontals(
-                row, var, node, lists, numbers, scalars, lin[0], lin[2], turns, values, changed, moved, state, account
-            )
+            move_frontals(row, var, node, lists, numbers, delta, lin[0], lin[2], turns, values, changed, moved, state)
             child, above = row[tl.C_CHILD], c
             while True:
                 c = next_clique(
@@ -62,7 +61,7 @@ def substitute(
                 if body == rg.BODIES:
                     rg.move_bodies(
                         listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed,
-                        moved, motions, motion, state, account,
+                        moved, motions, motion, state,
                     )  # fmt: skip
                     body = count = 0
                 count = rg.list_subtree(c, body, clique, motions, motion, listed, count)
@@ -70,8 +69,9 @@ def substitute(
                 child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
     rg.move_bodies(
         listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed, moved, motions,
-        motion, state, account,
+        motion, state,
     )  # fmt: skip
+    account[tl.A_LEFT] = max(account[tl.A_LEFT] if ripple > 0.0 else 0.0, motion[rg.LEFT])
 
 
 @inline_kernel
@@ -113,12 +113,12 @@ def has_moved(
     motions: F64, motion: F64,
 ) -> bool:  # fmt: skip
     """Whether a scalar of the separator is further than (9.17) from where the frontals have it, who were solved with
-    it and may have moved since.
+    it and may have moved since.  motion: gets the largest square of what is left
     """
     row = clique[c]
     far = far_of(row, far)
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
-    used, moves = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0
+    used, moves, left = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0, 0.0
     for s in range(start, start + row[tl.C_SEPARATORS]):
         v = lists[s]
         d = var[v, at.V_SCALAR]
@@ -128,9 +128,12 @@ def has_moved(
             gap = load(delta, d + a) - load(numbers, used)
             if moves:
                 gap -= motion[rg.LOCAL + a]
-            if gap * gap * load(weight, d + a) > far:
+            square = gap * gap * load(weight, d + a)
+            if square > far:
                 return True
+            left = max(left, square)
             used += 1
+    motion[rg.LEFT] = max(motion[rg.LEFT], left)
     return False
 
 
@@ -208,24 +211,18 @@ def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
 
 @inline_kernel
 def move_frontals(
-    row: I64, var: I64, node: I64, lists: I64, numbers: F64, scalars: F64, lin: F64, before: F64, turns: F64,
-    values: F64, changed: I64, moved: I64, state: I64, account: F64,
+    row: I64, var: I64, node: I64, lists: I64, numbers: F64, delta: F64, lin: F64, before: F64, turns: F64,
+    values: F64, changed: I64, moved: I64, state: I64,
 ) -> None:  # fmt: skip
     """The estimate of the frontals whose δ is another one."""
     start, solved = row[tl.C_LIST], row[tl.C_USED]
-    delta, weight = scalars[0], scalars[1]
     for s in range(start, start + row[tl.C_FRONTALS]):
         v = lists[s]
-        kind, d, differs, far = var[v, at.V_KIND], var[v, at.V_SCALAR], False, 0.0
-        shifts = 2 if kind == at.SE2 else 3
+        d, differs = var[v, at.V_SCALAR], False
         for a in range(dim_of_variable(var, v)):
-            gap = load(numbers, solved) - load(delta, d + a)
-            differs |= gap != 0.0
-            far += gap * gap * (load(weight, d + a) if a < shifts else turns[v, tl.U_LEVER] * turns[v, tl.U_LEVER])
+            differs |= load(numbers, solved) - load(delta, d + a) != 0.0
             put(delta, d + a, load(numbers, solved))
             solved += 1
         if differs:
             move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
-            list_moved(v, node, moved, state)
-            phi = turn_of(kind, delta, d)
-            account[tl.A_ALARM] += phi * phi * far  # (9.15)
+            list_moved(MODEL, v, node, moved, state)

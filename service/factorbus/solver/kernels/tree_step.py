@@ -10,7 +10,9 @@
 6  eliminate      front by front, on several cores where that takes long; orphans bring their update matrices
 7  commit         new cliques and numbers take the place of the old ones
 8  substitute     back down from the new roots, as far as anything changes
-9  again from 2   while something has bent so far that it cannot wait
+9  measure        χ² at the estimate, and how far factors are from their linear models
+10 again from 2   while that is so far that it cannot wait
+A step with nothing new goes on from 2 with what waits, and substitutes back through the whole tree.
 """
 
 import math
@@ -24,6 +26,7 @@ from factorbus.solver.kernels.bits import MOST
 from factorbus.solver.kernels.cycles import cycles
 from factorbus.solver.kernels.lend import lend
 from factorbus.solver.kernels.lent_cores import NOBODY
+from factorbus.solver.kernels.linearization_error import await_all, measure
 from factorbus.solver.kernels.places import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.tree_begin import begin
 from factorbus.solver.kernels.tree_commit import add_constants, commit
@@ -36,7 +39,6 @@ from factorbus.solver.kernels.tree_fronts import (
     keep_root,
     place_fronts,
 )
-from factorbus.solver.kernels.tree_look import find_bent, is_alarming, is_time_to_look
 from factorbus.solver.kernels.tree_mark import detach, gather_factors, touch
 from factorbus.solver.kernels.tree_moved import count_differing
 from factorbus.solver.kernels.tree_near import account_for, count_near, touch_near
@@ -59,7 +61,10 @@ from factorbus.solver.kernels.tree_take_in import next_incidence, take_in_factor
 FREE = 0
 LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
-QUIET = 0.05  # of P_BENT: a turn that bends by less is not looked at
+QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
+MOST_ROUNDS = 10  # of a step that has not converged
+FINISHED = 1e-6  # a step with nothing new goes on while Σ error² is more than this share of χ²
+PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to variables that do not move
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
@@ -92,11 +97,16 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         status = begin(counts, settings, var, fac, values, payload, node, link, hessian, lin, scalars, saved, state)
         if status != tl.DONE:
             return status
-        account[tl.A_BEND], account[tl.A_UNIT] = 0.0, residual_unit(f1, account)
-        state[tl.S_OLD] = state[tl.S_FIRST_NEW]
+        account[tl.A_STIFFEST_BEFORE] = account[tl.A_STIFFEST]
+        account[tl.A_UNIT], account[tl.A_BEFORE] = residual_unit(f1, account), account[tl.A_CHI2]
+        state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
+        state[tl.S_CONTINUES] = 1 if v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] else 0
     unit = account[tl.A_UNIT]
     scaled = settings.copy()
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
+    if state[tl.S_CONTINUES] != 0:
+        scaled[tl.P_RIPPLE] = 0.0
+        await_bound(scaled, var, fac, node, link, turns, pending, state, account)
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_MOST] *= unit
     scaled[tl.P_DEAR] = max(state[tl.S_RELINEARISING] / settings[tl.P_DEAR], 1.0)
@@ -104,18 +114,22 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
     scaled[tl.P_BENT_NOW] *= share
     scaled[tl.P_SOON] *= share
     scaled[tl.P_PATIENCE] *= scaled[tl.P_DEAR]
-    scaled[tl.P_LOOK] *= unit * unit * max(f1, 1)
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
-    if not take_in_factors(f1, var, fac, payload, node, link, hessian, lin, scalars, stiff, turns, saved, state):
-        undo(v0, var, fac, node, link, scalars, turns, saved, state)
+    if not take_in_factors(
+        f1, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, moved, saved, state, account
+    ):
+        undo(v0, var, fac, node, link, scalars, turns, moved, saved, state, account)
         return tl.INFINITE
     while True:
         moving = pending[: count_due(state)]
         if moving.size > 0:
-            relinearise(moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, state)
+            relinearise(
+                moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, moved, state
+            )
         lap(began, tl.LINEARISE, state)
-        bow, pull, status = eliminate_again(
+        before = account[tl.A_CHI2]
+        pull, status = eliminate_again(
             v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
             scalars, stiff, turns, pending, changed, moved, marked, motions, state, account, graph, tree, board,
         )  # fmt: skip
@@ -130,25 +144,35 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
             if moving.size > 0:
                 state[tl.S_WAIT] = 1
                 continue
-            undo(v0, var, fac, node, link, scalars, turns, saved, state)
+            undo(v0, var, fac, node, link, scalars, turns, moved, saved, state, account)
             return tl.FAILED
-        account[tl.A_BEND] = max(account[tl.A_BEND], bow / unit)
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
         state[tl.S_ROUNDS] += 1
-        again = pull > scaled[tl.P_BENT_NOW]
-        if state[tl.S_WAIT] != 0 or not again or state[tl.S_ROUNDS] >= settings[tl.P_ROUNDS]:
+        chi2 = account[tl.A_CHI2]
+        if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_TRUST]) * before + LEAST_CHI2:
+            state[tl.S_RISES] = 1
             break
+        if state[tl.S_WAIT] != 0 or not goes_on(pull, scaled, state, account):
+            break
+        await_bound(scaled, var, fac, node, link, turns, pending, state, account)
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
-    state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
+    state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
     if state[tl.S_FLOPS] < LIGHT:
         write_ahead(numbers, state)
     return tl.DONE
 
 
 @part
-def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, saved: F64, state: I64) -> None:
+def undo(
+    v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, moved: I64, saved: F64, state: I64,
+    account: F64,
+) -> None:  # fmt: skip
     """The tree is as it was before the step."""
+    for k in range(state[tl.S_MOVED]):
+        node[moved[k], tl.N_LISTED] = 0
+    state[tl.S_MOVED], account[tl.A_ADDED] = 0, 0.0
+    account[tl.A_STIFFEST] = account[tl.A_STIFFEST_BEFORE]
     take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, turns, saved, state)
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
@@ -158,7 +182,36 @@ def undo(v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns:
 @inline_kernel
 def residual_unit(factors: int, account: F64) -> float:
     """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
-    return math.sqrt((max(account[tl.A_CHI2], 0.0) + LEAST_CHI2) / max(factors, 1))
+    return math.sqrt((max(account[tl.A_MODEL], 0.0) + LEAST_CHI2) / max(factors, 1))
+
+
+@inline_kernel
+def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
+    """Whether what waits is relinearized and solved for again in the same step; pull: as `measure` gives it."""
+    rounds = state[tl.S_ROUNDS]
+    if state[tl.S_ONCE] != 0:
+        return False
+    if account[tl.A_ERROR] > allowed(settings, state, account):
+        return rounds < (settings[tl.P_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
+    return state[tl.S_CONTINUES] == 0 and pull > settings[tl.P_BENT_NOW] and rounds < settings[tl.P_ROUNDS]
+
+
+@inline_kernel
+def allowed(settings: F64, state: I64, account: F64) -> float:
+    """The Σ error² with which a step ends: half of what its report may call converged; FINISHED with nothing new."""
+    share = FINISHED if state[tl.S_CONTINUES] != 0 else 0.5 * settings[tl.P_CONVERGED]
+    return share * (account[tl.A_CHI2] + LEAST_CHI2)
+
+
+@inline_kernel
+def await_bound(
+    settings: F64, var: I64, fac: I64, node: I64, link: I64, turns: F64, pending: I64, state: I64, account: F64
+) -> None:  # fmt: skip
+    """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
+    most = allowed(settings, state, account)
+    if account[tl.A_ERROR] > most:
+        await_all(PASSED_OVER * most / state[tl.S_VARIABLES], var, fac, node, link, turns, pending, state)
+        state[tl.S_DUE] = 1
 
 
 @inline_kernel
@@ -182,8 +235,8 @@ def eliminate_again(
     link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
     pending: I64, changed: I64, moved: I64, marked: I64, motions: F64, state: I64, account: F64, graph: I64,
     tree: I64, board: I64,
-) -> tuple[float, float, int]:  # fmt: skip
-    """Steps 3 to 8; gives the largest bend of what moved, what waits, as `find_bent` has them, and the status."""
+) -> tuple[float, int]:  # fmt: skip
+    """Steps 3 to 9; gives Σ error² as `measure` does, and the status."""
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
@@ -219,14 +272,33 @@ def eliminate_again(
     orphans = orphans[:hanging]
     if n == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
-        return 0.0, 0.0, tl.DONE
+        return substitute_and_measure(
+            renewed[:0], renewed[:0], settings, var, fac, payload, node, link, clique, lists, numbers, lin, scalars,
+            stiff, turns, values, pending, changed, moved, listed, motions, state, account,
+        )  # fmt: skip
     now = lap(now, tl.MARK, state)
     old = np.empty((renewed.size, OLD), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
-        status = renew(renewed, n, old, var, fac, node, link, clique, lists, numbers, hessian, scalars, state, board)
+        status = renew(
+            renewed,
+            n,
+            account[tl.A_STIFFEST],
+            old,
+            var,
+            fac,
+            node,
+            link,
+            clique,
+            lists,
+            numbers,
+            hessian,
+            scalars,
+            state,
+            board,
+        )
         if status != tl.DONE:
-            return 0.0, 0.0, status
+            return 0.0, status
     now = lap(now, tl.ELIMINATE, state)
     factors = gather_factors(n, affected, state[tl.S_TAKEN], f1, node, link, fac, var)
     now = lap(now, tl.MARK, state)
@@ -258,12 +330,12 @@ def eliminate_again(
     update = np.empty((orphans.size, 3), np.int64)
     if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
         give_back_renewed(renewed, old, clique, numbers, state)
-        return 0.0, 0.0, tl.NO_ROOM
+        return 0.0, tl.NO_ROOM
     ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
     if not placed:
         give_back_renewed(renewed, old, clique, numbers, state)
         give_back_updates(update, numbers, state)
-        return 0.0, 0.0, tl.NO_ROOM
+        return 0.0, tl.NO_ROOM
     now = lap(now, tl.SYMBOLIC, state)
     # 6
     flops = state[tl.S_FLOPS]
@@ -275,7 +347,7 @@ def eliminate_again(
         give_back_fronts(ids, clique, lists, numbers, state)
         give_back_updates(update, numbers, state)
         give_back_renewed(renewed, old, clique, numbers, state)
-        return 0.0, 0.0, tl.FAILED
+        return 0.0, tl.FAILED
     account_for(state[tl.S_FLOPS] - flops, around > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
@@ -288,30 +360,56 @@ def eliminate_again(
     for k in range(moving.size):
         v = moving[k]
         node[v, tl.N_FLAGS], node[v, tl.N_LINEARISED] = FREE, state[tl.S_STEP]
-        turns[v, tl.U_STRAIN] = 0.0
     if moving.size > 0:
         state[tl.S_PENDING] = state[tl.S_DUE] = 0
         state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
         state[tl.S_RELINEARISING] = state[tl.S_FLOPS] - flops
-    now = lap(now, tl.COMMIT, state)
-    # 8
-    begins = np.empty(tops.size + ids.size, np.int64)
-    for k in range(begins.size):
-        begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
+    lap(now, tl.COMMIT, state)
+    return substitute_and_measure(
+        tops, ids, settings, var, fac, payload, node, link, clique, lists, numbers, lin, scalars, stiff, turns, values,
+        pending, changed, moved, listed, motions, state, account,
+    )  # fmt: skip
+
+
+@inline_kernel
+def substitute_and_measure(
+    tops: I64, ids: I64, settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, clique: I64,
+    lists: I64, numbers: F64, lin: F64, scalars: F64, stiff: F64, turns: F64, values: F64, pending: I64, changed: I64,
+    moved: I64, listed: I64, motions: F64, state: I64, account: F64,
+) -> tuple[float, int]:  # fmt: skip
+    """Steps 8 and 9, from the renewed cliques `tops` and the new ones `ids`, or from all roots."""
+    now = cycles()
+    if state[tl.S_CONTINUES] != 0:
+        begins = list_roots(node, clique, state)
+    else:
+        begins = np.empty(tops.size + ids.size, np.int64)
+        for k in range(begins.size):
+            begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
     substitute(
         begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
         lin, scalars, turns, values, changed, moved, listed, motions, state, account,
     )  # fmt: skip
-    bow = pull = 0.0
-    closes = f1 - state[tl.S_TAKEN] > v1 - v0
-    if is_time_to_look(closes, settings, state) or is_alarming(settings, state, account):
-        bow, pull = find_bent(
-            settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved,
-            state,
-        )  # fmt: skip
-        account[tl.A_ALARM] = 0.0
+    account[tl.A_CHI2] += account[tl.A_ADDED]
+    account[tl.A_BEFORE] += account[tl.A_ADDED]
+    account[tl.A_ADDED_UP] += account[tl.A_ADDED]
+    account[tl.A_ADDED] = 0.0
+    pull = measure(
+        settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved, state, account,
+    )  # fmt: skip
     lap(now, tl.SUBSTITUTE, state)
-    return bow, pull, tl.DONE
+    return pull, tl.DONE
+
+
+@part
+def list_roots(node: I64, clique: I64, state: I64) -> I64:
+    """All roots of the tree."""
+    roots, n = np.empty(state[tl.S_ROOTS], np.int64), 0
+    for v in range(state[tl.S_VARIABLES]):
+        c = node[v, tl.N_CLIQUE]
+        if c >= 0 and node[v, tl.N_PLACE] == 0 and clique[c, tl.C_PARENT] < 0:
+            roots[n] = c
+            n += 1
+    return roots
 
 
 @inline_kernel

@@ -7,9 +7,11 @@ import numpy as np
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.factor_chi2 import factor_chi2, heading_of
 from factorbus.solver.kernels.sizes import size_of
 from factorbus.solver.kernels.tree_hessian import hessian_size, linearise_factor, weigh_factor
 from factorbus.solver.kernels.tree_mark import dim_of_variable
+from factorbus.solver.kernels.tree_move import MODEL, list_moved
 
 
 @part
@@ -29,7 +31,7 @@ def take_in_variables(
         if d >= 0:
             for a in range(dim_of_variable(var, v)):
                 scalars[0, d + a] = scalars[1, d + a] = 0.0
-        turns[v, tl.U_LEVER] = turns[v, tl.U_STRAIN] = 0.0
+        turns[v, tl.U_LEVER] = turns[v, tl.U_STRAIN] = turns[v, tl.U_BOUND] = 0.0
         node[v, tl.N_NEAR] = -1
         note_turn(v, var, lin, turns)
     state[tl.S_VARIABLES] = v1
@@ -45,10 +47,13 @@ def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
 
 @part
 def take_in_factors(
-    f1: int, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64, stiff: F64,
-    turns: F64, saved: F64, state: I64,
+    f1: int, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
+    stiff: F64, turns: F64, moved: I64, saved: F64, state: I64, account: F64,
 ) -> bool:  # fmt: skip
     """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
+
+    A_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
+    linearised, and the factor is then off its model from the start.
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
@@ -65,11 +70,18 @@ def take_in_factors(
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
         linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
-        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1])
         _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
         weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
+        c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
+        account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
+        if j >= 0:
+            account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
+        stiff[f, tl.B_CHI2], _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
+        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
+        list_moved(MODEL, i, node, moved, state)
         link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
         node[i, tl.N_SEEN] = state[tl.S_STEP]
         if j >= 0:
@@ -77,6 +89,16 @@ def take_in_factors(
             node[j, tl.N_SEEN] = state[tl.S_STEP]
     state[tl.S_FACTORS] = f1
     return finite
+
+
+@inline_kernel
+def stiffest_of(v: int, var: I64, scalars: F64) -> float:
+    """The largest sum of the diagonals of Hessians of variable v."""
+    d, most = var[v, at.V_SCALAR], 0.0
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            most = max(most, scalars[1, d + a])
+    return most
 
 
 @part

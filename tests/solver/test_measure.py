@@ -1,4 +1,4 @@
-"""What is bent of what moved: the same whether it is looked for variable by variable or through all factors."""
+"""What moved is measured: the same variable by variable and through all factors."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,12 @@ from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_look import MUCH, look
+from factorbus.solver.kernels.linearization_error import MUCH, evaluate_moved
+from factorbus.solver.kernels.tree_move import MODEL
 from factorbus.solver.tree import Tree
 
 # Nothing is relinearised, so a lot is bent.
-NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, trust=1e9)
+NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, trust=1e9, converged_share=1e9)
 
 
 @pytest.mark.parametrize(("world", "poses"), [("manhattan", 300), ("city_trees", 120), ("sphere", 150)])
@@ -34,18 +35,25 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
         np.testing.assert_array_equal(through[2], one_by_one[2])
         assert one_by_one[2].size > 0
         np.testing.assert_array_equal(through[3], one_by_one[3])
+        np.testing.assert_array_equal(through[4], one_by_one[4])
 
 
 def found(solver: Solver, tree: Tree, moved: np.ndarray, bent: float, variables: int) -> tuple:
-    """The largest bend, Σ bend² by variable, who waits, ascending, and how each is marked."""
-    graph, state, node = solver._graph, tree.state.copy(), tree.node.copy()
-    turns, pending, listed = tree.turns.copy(), tree.pending.copy(), np.zeros_like(tree.moved)
+    """The largest error, Σ error² by variable, who waits, ascending, how each is marked, and χ² by factor."""
+    graph, state, node, account = solver._graph, tree.state.copy(), tree.node.copy(), tree.account.copy()
+    turns, pending, listed, stiff = tree.turns.copy(), tree.pending.copy(), np.zeros_like(tree.moved), tree.stiff.copy()
     node[:, tl.N_FLAGS] = node[:, tl.N_LISTED] = 0
-    node[moved, tl.N_LISTED], listed[: moved.size] = 1, moved
-    state[[tl.S_MOVED, tl.S_PENDING, tl.S_VARIABLES]] = moved.size, 0, variables
-    most = look(
-        bent, graph.var, graph.fac, graph.payload, node, tree.link, tree.stiff, tree.lin[0], tree.scalars,
-        graph.values, turns, pending, listed, state,
+    node[moved, tl.N_LISTED], listed[: moved.size] = MODEL, moved
+    turns[:, [tl.U_STRAIN, tl.U_BOUND]] = 0.0
+    stiff[:, tl.B_CHI2] = 0.0
+    state[[tl.S_MOVED, tl.S_PENDING]] = moved.size, 0
+    account[[tl.A_CHI2, tl.A_ERROR, tl.A_COUNTED]] = 0.0
+    state[tl.S_VARIABLES] = variables
+    most = evaluate_moved(
+        bent, graph.var, graph.fac, graph.payload, node, tree.link, stiff, tree.lin[0], tree.scalars, graph.values,
+        turns, pending, listed, state, account,
     )  # fmt: skip
+    assert account[tl.A_CHI2] == pytest.approx(stiff[:, tl.B_CHI2].sum())
+    assert account[tl.A_ERROR] == pytest.approx(turns[:, tl.U_BOUND].sum())
     waiting = np.sort(pending[: state[tl.S_PENDING]])
-    return most, turns[: node.shape[0], tl.U_STRAIN], waiting, node[:, tl.N_FLAGS]
+    return most, turns[: node.shape[0], tl.U_STRAIN], waiting, node[:, tl.N_FLAGS], stiff[:, tl.B_CHI2]

@@ -1,0 +1,19 @@
+"""When what waits is due, MATH (9.19)."""
+
+import numpy as np
+
+from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.tree_step import reluctance
+
+
+def test_so_soon_after_a_relinearisation_more_has_to_be_bent() -> None:
+    settings, state = np.zeros(tl.P_SIZE), np.zeros(tl.S_SIZE, np.int64)
+    settings[tl.P_REST], settings[tl.P_RELUCTANCE], state[tl.S_RELINEARISED_AT] = 100, 8.0, 1000
+    after = {}
+    for dear in (1.0, 4.0):  # times what is dear
+        settings[tl.P_DEAR] = dear
+        for step in (1001, 1035, 1050, 1100, 5000):
+            state[tl.S_STEP] = step
+            after[dear, step - 1000] = reluctance(settings, state)
+    assert [after[1.0, since] for since in (1, 35, 50, 100, 4000)] == [8.0, 8.0, 4.0, 1.0, 1.0]
+    assert [after[4.0, since] for since in (1, 35, 50, 100, 4000)] == [16.0, 16.0, 16.0, 16.0, 1.0]
