@@ -61,7 +61,7 @@ def main() -> None:
 
 
 HEAD = (
-    f"{'world':<11}{'seed':>11}{'steps':>6}{'p50':>10}{'p99':>10}{'max':>10}{'>1.001':>7}{'>1.01':>6}{'unconv':>7}"
+    f"{'world':<14}{'seed':>11}{'steps':>6}{'p50':>10}{'p99':>10}{'max':>10}{'>1.001':>7}{'>1.01':>6}{'unconv':>7}"
     f"{'worst conv':>11}{'odo σ':>7}{'chi2 off':>9}{'idle':>5}{'idle s':>7}{'idle ratio-1':>13}{'s':>6}"
 )
 
@@ -69,7 +69,7 @@ HEAD = (
 def line(row: dict[str, Any]) -> str:
     """For a person."""
     return (
-        f"{row['world']:<11}{row['seed']:>11}{row['steps']:>6}{row['p50']:>10.6f}{row['p99']:>10.5f}{row['max']:>10.4f}"
+        f"{row['world']:<14}{row['seed']:>11}{row['steps']:>6}{row['p50']:>10.6f}{row['p99']:>10.5f}{row['max']:>10.4f}"
         f"{row['above_1_001']:>7}{row['above_1_01']:>6}{row['unconverged']:>7}{row['worst_converged']:>11.4f}"
         f"{row['odometry_excess']:>7.2f}{row['chi2_untrue']:>9.2g}{row['idle_steps']:>5}{row['idle_s']:>7.2f}"
         f"{row['idle_ratio'] - 1:>13.1e}{row['wall_s']:>6.1f}"

@@ -1,14 +1,16 @@
-"""What is replayed, by name: a world is a function of a seed and a number of poses that gives steps."""
+"""What is replayed, by name: a world is a function of a number of poses and a seed that gives batches."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
 
 from . import hard
+from .motion import PLANE, SPACE
 
-Make = Callable[[int, int], Iterator[Batch]]  # poses, seed
+Make = Callable[[int, int], Iterable[Batch]]  # poses, seed
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,16 +23,22 @@ class World:
     ordinary: bool = True
 
 
-def _simulated(name: str, **more: object) -> Make:
-    return lambda poses, seed: (step.batch for step in SIMULATED[name](poses, seed, **more))
+def _simulated(name: str, poses: int, seed: int, **more: object) -> Iterable[Batch]:
+    return (step.batch for step in SIMULATED[name](poses, seed, **more))
 
 
 WORLDS = {
     world.name: world
     for world in (
-        World("manhattan", _simulated("manhattan")),
-        World("city_trees", _simulated("city_trees")),
-        World("sphere", _simulated("sphere")),
+        World("manhattan", partial(_simulated, "manhattan")),
+        World("city_trees", partial(_simulated, "city_trees")),
+        World("sphere", partial(_simulated, "sphere")),
+        World("bearing_range", partial(_simulated, "city_trees", sensor="bearing_range_se2")),
+        World("outliers", hard.outliers, ordinary=False),
         World("drift", hard.drift, ordinary=False),
+        World("meetings_2d", partial(hard.meetings, PLANE), 400, ordinary=False),
+        World("meetings_3d", partial(hard.meetings, SPACE), 400, ordinary=False),
+        World("late_2d", partial(hard.late_positions, PLANE), 300, ordinary=False),
+        World("late_3d", partial(hard.late_positions, SPACE), 300, ordinary=False),
     )
 }
