@@ -1,20 +1,20 @@
 """One drive by our solver: every step judged, and then the map is left alone until it is done."""
 
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Options, Solver, StepReport
 
 from .judge import FINE, Judge, Look
 
-MOST_IDLE = 1000  # steps without anything new
+MOST_IDLE_S = 10.0  # a map left alone is given up after so long
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One step: its number, how it was judged, whether it said `converged`, and what it said in full."""
+    """One step: its number, how its estimate was judged, and what it said."""
 
     step: int
     look: Look
@@ -22,54 +22,45 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Rest:
-    """A map left alone: how many steps without anything new until one said `converged` and moved nothing, the seconds
-    they took together, how each was judged, and whether they came to an end."""
-
-    steps: int
-    seconds: float
-    looks: list[Look]
-    done: bool
-    untrue: float
-
-
-@dataclass(slots=True)
 class Followed:
-    """A whole drive."""
+    """A drive and its rest.
 
-    seen: list[Seen] = field(default_factory=list)
-    rest: Rest | None = None
-    seconds: float = 0.0
+    seen: the steps that were judged.  idle: those without anything new that followed, until one said `converged` and
+    moved nothing; done: whether it came to that.  steps_s, idle_s: seconds that the solver took for each part.
+    """
+
+    seen: list[Seen]
+    idle: list[Seen]
+    done: bool
+    steps_s: float
+    idle_s: float
 
 
 def follow(
-    batches: Iterable[Batch], options: Options, every: int = 1, progress: Callable[[int], None] = lambda _: None
+    steps: Sequence[Batch], options: Options, every: int = 1, progress: Callable[[int], None] = lambda _: None
 ) -> Followed:
     """Replay; with `every`, judge only each so many-th step, those that say they have not converged, and the last."""
-    solver, judge, found = Solver(options), Judge(), Followed()
-    steps = list(batches)
+    solver, judge, seen, seconds = Solver(options), Judge(), [], 0.0
     for k, batch in enumerate(steps):
         start = time.perf_counter()
         solver.stage(batch)
         report = solver.step()
-        found.seconds += time.perf_counter() - start
+        seconds += time.perf_counter() - start
         judge.take_in(batch)
         if k % every == every - 1 or k == len(steps) - 1 or not report.converged:
-            found.seen.append(Seen(k, judge.look(solver.estimate()), report))
+            seen.append(Seen(k, judge.look(solver.estimate()), report))
         progress(k)
-    found.rest = leave_alone(solver, judge)
-    return found
+    idle, done, idle_s = _leave_alone(solver, judge, len(steps))
+    return Followed(seen, idle, done, seconds, idle_s)
 
 
-def leave_alone(solver: Solver, judge: Judge) -> Rest:
-    """Step without anything new, as a service does when nothing comes, until a step says that there is nothing to do."""
-    seconds, looks, done, untrue = 0.0, [], False, 1.0
-    while not done and len(looks) < MOST_IDLE:
+def _leave_alone(solver: Solver, judge: Judge, first: int) -> tuple[list[Seen], bool, float]:
+    """Step without anything new, as a service does when nothing comes, until there is nothing left to do."""
+    seen, done, seconds = [], False, 0.0
+    while not done and seconds < MOST_IDLE_S:
         start = time.perf_counter()
         report = solver.step()
         seconds += time.perf_counter() - start
-        looks.append(judge.look(solver.estimate(), coarse=FINE))
+        seen.append(Seen(first + len(seen), judge.look(solver.estimate(), coarse=FINE), report))
         done = report.converged and not report.changed
-        if report.converged:
-            untrue = max(untrue, looks[-1].ratio)
-    return Rest(len(looks), seconds, looks, done, untrue)
+    return seen, done, seconds

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bench.replays.columns import F64
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import WORLDS

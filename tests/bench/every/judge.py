@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from bench.replays.columns import F64, I64
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group
@@ -21,8 +22,6 @@ from factorbus.solver.kernels.chi2 import sum_chi2
 from factorbus.solver.kernels.move import move
 from factorbus.solver.ordering import order
 from factorbus.solver.symbolic import Symbolic, analyze
-
-from bench.replays.columns import F64, I64
 
 UNIT = 1.0  # below this χ² an excess is taken as it is, not as a share: 0.001 of it moves nothing by 0.032 σ
 COARSE, FINE = 1e-5, 1e-10  # of χ²: where the model of one pass is good enough, and where an optimum is one

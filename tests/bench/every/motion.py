@@ -7,10 +7,10 @@ from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
-
 from bench.replays.columns import F64
 from bench.replays.compose import compose_se2, compose_se3, inverse_se2, inverse_se3
+from scipy.spatial.transform import Rotation
+
 from factorbus.proto.messages import Batch, Factors, Variables
 
 Chance = np.random.Generator
@@ -78,9 +78,7 @@ class Motion:
         relative = self.compose(self.inverse(a), b)
         return self.compose(relative, self.inverse(self.small(chance.normal(size=len(self.sigmas)) * self.sigmas)))
 
-    def pose(
-        self, chance: Chance, letter: int, i: int, truth: F64, prior: tuple[float, ...] | None = None
-    ) -> Batch:
+    def pose(self, chance: Chance, letter: int, i: int, truth: F64, prior: tuple[float, ...] | None = None) -> Batch:
         """The i-th pose with its odometry; the first one is held at the identity, or has this prior there."""
         key = np.array([letter + i])
         if i:
