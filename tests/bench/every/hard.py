@@ -1,4 +1,4 @@
-"""Steps that turn much of a map: loops that drifted, robots that meet, positions that come late, closures that are wrong.
+"""Steps that turn much of a map: loops that drifted, robots that meet, positions that come late, wrong closures.
 
 Each world is a function of (poses, seed) and gives a batch a step.  What is drawn, is drawn from the seed: where and
 when the step comes, by how much it turns, and how weak the prior is that it turns against.

@@ -39,7 +39,7 @@ def first_values(batch: Batch, known: Known) -> dict[int, tuple[str, F64]]:
 
 
 def _factors(batch: Batch) -> Iterator[tuple[str, list[int], F64]]:
-    """Factors between poses before sightings, each kind in its order; not those of one variable: they reach no other."""
+    """Factors between poses before sightings, each kind in its order; none that has one end: it reaches no other."""
     pairs = [group for group in batch.factors if group.kind in ENDS]
     for group in sorted(pairs, key=lambda group: not group.kind.startswith("between")):
         for ends, z in zip(group.keys.tolist(), group.measured, strict=True):

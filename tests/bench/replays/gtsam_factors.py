@@ -1,7 +1,7 @@
 """Our factors as GTSAM's, as near as its wheel has them; what differs is said in `isam2`."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gtsam
@@ -111,7 +111,7 @@ _LOSSES = {
     "geman-mcclure": gtsam.noiseModel.mEstimator.GemanMcClure,
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
 }
-_FACTORS = {
+_FACTORS: dict[str, Callable[..., Any]] = {
     "between_se2": _between_se2,
     "between_se3": _between_se3,
     "landmark_se2": _landmark_se2,
