@@ -3,7 +3,7 @@
     python tests/bench/every_step.py [--only NAME,...] [--seeds N | --seed S,...] [--no-isam2] [--json [FILE]] [...]
 
     simulated  manhattan, city_trees, sphere, bearing_range: drives of 1,000 poses, drawn anew in each run
-    data       intel, killian, manhattan3500, victoria_park, parking_garage, sphere2500: the public data sets
+    data       intel, killian_freiburg, manhattan3500, victoria_park, parking_garage, sphere2500
     hard       steps that turn much of a map: loops closed after a drift of 60° to 180° (drift), two robots that meet at
                any angle (meetings_2d, _3d), positions that come late (late_2d, _3d), wrong loop closures under Huber's
                loss (outliers)
@@ -14,6 +14,9 @@ whole graph go from its estimate to the optimum: Gauss-Newton, damped where a st
 of 0.001 is a map that is nowhere off by more than 0.032 standard deviations.  At the end the map is left alone: steps
 without anything new, until one says `converged` and moves nothing.  GTSAM's iSAM2 (relinearizeThreshold 0.1,
 relinearizeSkip 1) takes the same drive, and is judged in the same way by its own error function.
+
+The full passes are made of our kernels.  At a few steps of every drive (--check) NumPy and SciPy alone look for the
+optimum from the same estimate, and have to come to the same χ².
 
 Seeds are drawn from the operating system and printed; --seed repeats a run.  The steps above 1.001 are in the output
 folder, with what they said.  The exit code is 1 when a target is missed.
@@ -38,7 +41,7 @@ from bench.every.drives import KINDS, WORLDS, World, chosen, is_here
 from bench.every.follow import follow
 from bench.every.rows import far_steps, row_of, together
 from bench.every.verdicts import judge
-from bench.replays.command import positive
+from bench.replays.command import natural, positive
 from bench.replays.targets import missed
 
 from factorbus.solver import Options, SolverError, warm
@@ -46,12 +49,13 @@ from factorbus.solver.options import MODES
 
 
 class Drive(NamedTuple):
-    """One drive to follow.  poses 0: all; every: judge each so many-th step."""
+    """One drive to follow.  poses 0: all; every: judge each so many-th step; check: so many by SciPy too."""
 
     world: str
     seed: int
     poses: int
     every: int
+    check: int
     isam2: bool
     options: dict[str, Any]
 
@@ -97,7 +101,7 @@ def measure(drive: Drive) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     warm()
     world = WORLDS[drive.world]
     steps = list(world.make(drive.poses or world.poses, drive.seed))
-    found = follow(steps, Options(**drive.options), drive.every)
+    found = follow(steps, Options(**drive.options), drive.every, drive.check)
     isam2 = None
     if drive.isam2:
         from bench.every.peer import follow_isam2  # here, so that without it GTSAM need not be installed
@@ -126,7 +130,7 @@ def conclude(
 def _drives(world: World, seeds: Sequence[int], asked: argparse.Namespace, settings: dict[str, Any]) -> list[Drive]:
     every = 1 if world.is_drawn else asked.every
     each = seeds if world.is_drawn else [0]
-    return [Drive(world.name, seed, asked.poses, every, not asked.no_isam2, settings) for seed in each]
+    return [Drive(world.name, seed, asked.poses, every, asked.check, not asked.no_isam2, settings) for seed in each]
 
 
 def _measured(drives: Sequence[Drive], jobs: int) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
@@ -150,7 +154,10 @@ def _setting(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         raise ValueError(f"--option {text}: wanted NAME=VALUE, as rounds=1")
-    return name, json.loads(value)
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        raise ValueError(f"--option {text}: {value!r} is no JSON; a text has its quotes") from None
 
 
 def _options() -> argparse.Namespace:
@@ -159,8 +166,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--only", default="", metavar="NAME,...", help=f"these: {names}")
     parser.add_argument("--seeds", type=positive, default=10, metavar="N", help="drives of each drawn world (10)")
     parser.add_argument("--seed", type=_seeds, metavar="S,...", help="these seeds, to repeat a run")
-    parser.add_argument("--poses", type=int, default=0, metavar="N", help="of each drive; 0: as many as it has")
+    parser.add_argument("--poses", type=natural, default=0, metavar="N", help="of each drive; 0: as many as it has")
     parser.add_argument("--every", type=positive, default=1, metavar="N", help="judge each Nth step of data sets (1)")
+    parser.add_argument("--check", type=natural, default=3, metavar="N", help="steps of a drive to ask SciPy about (3)")
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="drives at a time (1)")
     parser.add_argument("--mode", choices=MODES, default="auto", help="of our solver")
     parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="of our solver")

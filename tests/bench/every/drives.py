@@ -64,7 +64,7 @@ WORLDS = {
         World("late_3d", partial(hard.late_positions, SPACE), 300, "hard"),
         *(
             World(name, partial(_data, name), 0, "data")
-            for name in ("intel", "killian", "manhattan3500", "victoria_park", "parking_garage", "sphere2500")
+            for name in ("intel", "killian_freiburg", "manhattan3500", "victoria_park", "parking_garage", "sphere2500")
         ),
     )
 }

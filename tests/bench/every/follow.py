@@ -1,13 +1,16 @@
 """One drive by our solver: every step judged, and then the map is left alone until it is done."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from factorbus.proto.messages import Batch
-from factorbus.solver import Options, Solver, StepReport
+from bench.replays.samples import sample_steps
 
-from .judge import FINE, Judge, Look
+from factorbus.proto.messages import Batch
+from factorbus.solver import Group, Options, Solver, StepReport
+
+from .judge import FINE, UNIT, Judge, Look
+from .oracle import Oracle
 
 MOST_IDLE_S = 10.0  # a map left alone is given up after so long
 
@@ -27,6 +30,7 @@ class Followed:
 
     seen: the steps that were judged.  idle: those without anything new that followed, until one said `converged` and
     moved nothing; done: whether it came to that.  steps_s, idle_s: seconds that the solver took for each part.
+    oracle_off: the most that judge and oracle differ, as a share of χ².
     """
 
     seen: list[Seen]
@@ -34,24 +38,36 @@ class Followed:
     done: bool
     steps_s: float
     idle_s: float
+    oracle_off: float
 
 
-def follow(
-    steps: Sequence[Batch], options: Options, every: int = 1, progress: Callable[[int], None] = lambda _: None
-) -> Followed:
-    """Replay; with `every`, judge only each so many-th step, those that say they have not converged, and the last."""
-    solver, judge, seen, seconds = Solver(options), Judge(), [], 0.0
+def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int = 0) -> Followed:
+    """Replay; with `every`, judge only each so many-th step, those that say they have not converged, and the last.
+
+    check: at so many steps, spread, the oracle has to find the same optimum.
+    """
+    solver, judge, oracle, seen, seconds, off = Solver(options), Judge(), Oracle(), [], 0.0, 0.0
+    checked = set(sample_steps(len(steps), check)) if check else set()
     for k, batch in enumerate(steps):
         start = time.perf_counter()
         solver.stage(batch)
         report = solver.step()
         seconds += time.perf_counter() - start
         judge.take_in(batch)
+        oracle.take_in(batch)
+        if k in checked:
+            off = max(off, _disagreement(judge, oracle, solver.estimate()))
         if k % every == every - 1 or k == len(steps) - 1 or not report.converged:
             seen.append(Seen(k, judge.look(solver.estimate()), report))
-        progress(k)
     idle, done, idle_s = _leave_alone(solver, judge, len(steps))
-    return Followed(seen, idle, done, seconds, idle_s)
+    return Followed(seen, idle, done, seconds, idle_s, off)
+
+
+def _disagreement(judge: Judge, oracle: Oracle, estimate: Sequence[Group]) -> float:
+    """Of χ² at an estimate, and at the optimum from there."""
+    look, other = judge.look(estimate, coarse=FINE), oracle.optimum(estimate)
+    pairs = zip((look.chi2, look.optimum), other, strict=True)
+    return max(abs(mine - its) / max(its, UNIT) for mine, its in pairs)
 
 
 def _leave_alone(solver: Solver, judge: Judge, first: int) -> tuple[list[Seen], bool, float]:

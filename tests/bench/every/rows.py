@@ -32,6 +32,7 @@ def row_of(world: str, seed: int, steps: int, found: Followed, isam2: tuple[list
         "idle_done": found.done,
         "idle_ratio": found.idle[-1].look.ratio,
         "steps_s": found.steps_s,
+        "oracle_off": found.oracle_off,
         "ratios": [look.ratio for look in looks],
     }
     if isam2 is None:
@@ -47,7 +48,7 @@ def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """All drives of a world as one row."""
     ratios = [ratio for row in rows for ratio in row["ratios"]]
     sums = {name: sum(row[name] for row in rows) for name in ("steps", "judged", "unconverged", "steps_s")}
-    most = ("worst_converged", "odometry_excess", "chi2_untrue", "idle_steps", "idle_s", "idle_ratio")
+    most = ("worst_converged", "odometry_excess", "chi2_untrue", "idle_steps", "idle_s", "idle_ratio", "oracle_off")
     found = {
         "world": rows[0]["world"],
         "drives": len(rows),

@@ -8,7 +8,7 @@ from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
 from .drives import WORLDS
 from .rows import FAR, NEAR, together
 
-UNCONVERGED, P99, FINISHED, FINISHED_S, TRUE = 0.01, 1.002, 1e-6, 2.0, 1e-6
+UNCONVERGED, P99, FINISHED, FINISHED_S, TRUE, SAME = 0.01, 1.002, 1e-6, 2.0, 1e-6, 1e-6
 _NAMED = 3  # worlds that miss a target, in its line
 
 Row = dict[str, Any]
@@ -37,6 +37,7 @@ def judge(rows: Sequence[Row]) -> list[Verdict]:
             FINISHED,
         ),
         _most(everything, f"and within {FINISHED_S:g} s", "idle_s", FINISHED_S),
+        _most(everything, f"SciPy finds the same optima, to {SAME:g}", "oracle_off", SAME),
     ]
 
 
