@@ -4,12 +4,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from bench.replays.chi2 import UNIT
 from bench.replays.samples import sample_steps
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group, Options, Solver, StepReport
 
-from .judge import FINE, UNIT, Judge, Look
+from .judge import FINE, Judge, Look
 from .oracle import Oracle
 
 MOST_IDLE_S = 10.0  # a map left alone is given up after so long

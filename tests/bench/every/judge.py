@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from bench.replays.chi2 import UNIT, ratio
 from bench.replays.columns import F64, I64
 
 from factorbus.proto.messages import Batch
@@ -23,7 +24,6 @@ from factorbus.solver.kernels.move import move
 from factorbus.solver.ordering import order
 from factorbus.solver.symbolic import Symbolic, analyze
 
-UNIT = 1.0  # below this χ² an excess is taken as it is, not as a share: 0.001 of it moves nothing by 0.032 σ
 COARSE, FINE = 1e-5, 1e-10  # of χ²: where the model of one pass is good enough, and where an optimum is one
 _MOST_PASSES = 200
 _FIRST_DAMPING, _MOST_DAMPING = 1e-5, 1e12
@@ -44,8 +44,8 @@ class Look(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """χ² over the optimum's.  Where the optimum is below `UNIT`, 1 + the excess: it may be 0."""
-        return 1.0 + max(self.chi2 - self.optimum, 0.0) / max(self.optimum, UNIT)
+        """χ² over the optimum's, 1 at the least: below it is what passes stop at."""
+        return max(ratio(self.chi2, self.optimum), 1.0)
 
 
 class Judge:

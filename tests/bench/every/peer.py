@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import gtsam
+from bench.replays.chi2 import UNIT
 from bench.replays.contestants import Failed
 from bench.replays.isam2 import Isam2
 
 from factorbus.proto.messages import Batch
 
-from .judge import FINE, UNIT, Look
+from .judge import FINE, Look
 
 THRESHOLD, WILDFIRE = 0.1, 1e-3  # relinearizeThreshold; the wildfire threshold is its default.  relinearizeSkip is 1
 _COARSE = 1e-4  # of χ²: one pass is exact to a hundredth of it, and GTSAM's passes are dear

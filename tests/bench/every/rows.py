@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from bench.replays.chi2 import UNIT
 
 from .follow import Followed, Seen
-from .judge import UNIT, Look
+from .judge import Look
 
 NEAR, FAR = 1.001, 1.01
 

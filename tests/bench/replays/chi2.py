@@ -6,6 +6,10 @@ landmark       r = Rᵢᵀ(l − tᵢ) − z
 bearing_range  r = (wrap(atan2(u_y, u_x) − z₀), |u| − z₁),   u = Rᵢᵀ(l − tᵢ)
 prior          as between_se2 and between_se3 with the identity as xᵢ
 position       r = tᵢ + Rᵢ l − z, where z ends with the lever l
+
+A ratio is χ² over that of an optimum.  Where the optimum is below `UNIT` an excess is taken as it is, not as a share:
+before the first loop an optimum is 0 but for rounding, and data sets whose measurements agree (killian: 5.8e-8) stay
+there.  An excess of 0.001 moves nothing by more than √0.001 = 0.032 of its standard deviations.
 """
 
 from collections.abc import Callable
@@ -13,6 +17,13 @@ from collections.abc import Callable
 import numpy as np
 
 from .columns import ENDS, F64, Columns, Values
+
+UNIT = 1.0
+
+
+def ratio(chi2: float, optimum: float) -> float:
+    """χ² over that of an optimum."""
+    return 1.0 + (chi2 - optimum) / max(optimum, UNIT)
 
 
 def chi2_at(columns: Columns, values: Values, step: int) -> float:
