@@ -23,6 +23,7 @@ from bench.replays.contestants import Failed
 from bench.replays.gtsam_factors import gtsam_factors, pose3
 from bench.replays.targets import MET, MISSED, NOT_MEASURED
 
+from factorbus.cli import bench
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Group, Options, Solver, StepReport
@@ -272,6 +273,28 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(2 * np.arccos(min(abs(a[3:] @ b[3:]), 1.0)))
 
 
+def test_outliers_are_manhattan_s_closures_with_a_loss_and_few_of_them_are_of_another_place() -> None:
+    wrong = closures = 0
+    for batch, honest in zip(steps_of("outliers", 500), steps_of("manhattan", 500), strict=True):
+        measured = np.concatenate([np.empty((0, 3)), *(group.measured for group in batch.factors)])
+        true = np.concatenate([np.empty((0, 3)), *(group.measured for group in honest.factors)])
+        keys = np.concatenate([np.empty((0, 2)), *(group.keys for group in batch.factors)])
+        assert len(measured) == len(true)
+        wrong += int((measured != true).any(axis=1).sum())
+        closures += int((keys[:, 1] - keys[:, 0] > 1).sum())
+        assert all((group.keys[:, 1] - group.keys[:, 0] > 1).all() for group in batch.factors if group.loss)
+        assert all((group.keys[:, 1] - group.keys[:, 0] == 1).all() for group in batch.factors if not group.loss)
+    assert 0.01 < wrong / closures < 0.12
+
+
+@pytest.mark.parametrize("name", ["late_2d", "late_3d"])
+def test_late_positions_begin_after_thirty_poses(name: str) -> None:
+    for seed in range(1, 9):
+        steps = steps_of(name, 100, seed)
+        first = next(k for k, batch in enumerate(steps) if any("position" in group.kind for group in batch.factors))
+        assert 30 <= first <= 50
+
+
 def test_worlds_by_name_by_kind_and_all() -> None:
     assert [world.name for world in chosen(["hard"])] == [name for name in DRAWN if WORLDS[name].kind == "hard"]
     assert chosen([]) == list(WORLDS.values())
@@ -363,6 +386,12 @@ def test_what_is_asked_wrongly_is_told(
     ended = run(tmp_path, monkeypatch, *words)
     assert ended != 0
     assert told in str(ended) + capsys.readouterr().err
+
+
+def test_every_benchmark_of_the_command_line_has_its_file() -> None:
+    names = (*bench.BENCHES, *bench.ASKED, *bench.LONG)
+    assert "every-step" in names
+    assert all((bench._folder() / bench._file(name)).is_file() for name in names)
 
 
 @pytest.mark.data
