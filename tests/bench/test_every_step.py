@@ -278,7 +278,7 @@ def test_outliers_are_manhattan_s_closures_with_a_loss_and_few_of_them_are_of_an
     for batch, honest in zip(steps_of("outliers", 500), steps_of("manhattan", 500), strict=True):
         measured = np.concatenate([np.empty((0, 3)), *(group.measured for group in batch.factors)])
         true = np.concatenate([np.empty((0, 3)), *(group.measured for group in honest.factors)])
-        keys = np.concatenate([np.empty((0, 2)), *(group.keys for group in batch.factors)])
+        keys = np.concatenate([np.empty((0, 2), np.int64), *(group.keys for group in batch.factors)])
         assert len(measured) == len(true)
         wrong += int((measured != true).any(axis=1).sum())
         closures += int((keys[:, 1] - keys[:, 0] > 1).sum())
