@@ -18,11 +18,15 @@ MOST_IDLE_S = 10.0  # a map left alone is given up after so long
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One step: its number, how its estimate was judged, and what it said."""
+    """One step: its number, how its estimate was judged, and what it said.
+
+    before: χ² of the estimate before it, with its new factors; None where it brought variables that had none.
+    """
 
     step: int
     look: Look
     report: StepReport
+    before: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +54,7 @@ def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int 
     solver, judge, oracle, seen, seconds, off = Solver(options), Judge(), Oracle(), [], 0.0, 0.0
     checked = set(sample_steps(len(steps), check)) if check else set()
     for k, batch in enumerate(steps):
+        before = None if batch.variables else solver.estimate()
         start = time.perf_counter()
         solver.stage(batch)
         report = solver.step()
@@ -59,7 +64,7 @@ def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int 
         if k in checked:
             off = max(off, _disagreement(judge, oracle, solver.estimate()))
         if k % every == every - 1 or k == len(steps) - 1 or not report.converged:
-            seen.append(Seen(k, judge.look(solver.estimate()), report))
+            seen.append(Seen(k, judge.look(solver.estimate()), report, judge.chi2(before) if before else None))
     idle, done, idle_s = _leave_alone(solver, judge, len(steps))
     return Followed(seen, idle, done, seconds, idle_s, off)
 
@@ -75,9 +80,11 @@ def _leave_alone(solver: Solver, judge: Judge, first: int) -> tuple[list[Seen], 
     """Step without anything new, as a service does when nothing comes, until there is nothing left to do."""
     seen, done, seconds = [], False, 0.0
     while not done and seconds < MOST_IDLE_S:
+        before = solver.estimate()
         start = time.perf_counter()
         report = solver.step()
         seconds += time.perf_counter() - start
-        seen.append(Seen(first + len(seen), judge.look(solver.estimate(), coarse=FINE), report))
+        look = judge.look(solver.estimate(), coarse=FINE)
+        seen.append(Seen(first + len(seen), look, report, judge.chi2(before)))
         done = report.converged and not report.changed
     return seen, done, seconds

@@ -83,8 +83,11 @@ def worst_converged(seen: Sequence[Seen]) -> float:
 
 
 def untruth(seen: Seen) -> float:
-    """How far the χ² of a report is from that of the estimate, as a share of it."""
-    return abs(seen.report.chi2 - seen.look.chi2) / max(seen.look.chi2, UNIT)
+    """How far χ² of a report is from that of the estimate after the step, or before it, as a share of it."""
+    pairs = [(seen.report.chi2, seen.look.chi2)]
+    if seen.before is not None:
+        pairs.append((seen.report.chi2_before, seen.before))
+    return max(abs(told - true) / max(true, UNIT) for told, true in pairs)
 
 
 def far_steps(world: str, seed: int, found: Followed) -> list[dict[str, Any]]:
