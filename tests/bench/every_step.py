@@ -172,7 +172,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="drives at a time (1)")
     parser.add_argument("--mode", choices=MODES, default="auto", help="of our solver")
     parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE", help="of our solver")
-    parser.add_argument("--no-isam2", action="store_true", help="ours only: a fifth of the time")
+    parser.add_argument("--no-isam2", action="store_true", help="ours only: a quarter of the time")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="the document to FILE, or to -")
     parser.add_argument("--out", type=Path, default=Path("out/bench/every-step"), help="where results are kept")
     return parser.parse_args()

@@ -32,7 +32,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
     every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
-               drives, data sets, and steps that turn much of a map; about an hour; --no-isam2: ten minutes;
+               drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
                --seeds, --seed, --only simulated|data|hard|NAME,...
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
