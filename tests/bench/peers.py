@@ -3,7 +3,8 @@
     python tests/bench/peers.py [--quick] [--only NAME,...] [--json [FILE]] [--repetitions N] [--fresh] [...]
 
     replays    pose by pose, all eleven data sets: CPU time of `auto`, all variables read after every step, against that
-               of iSAM2's `update()` alone; long steps; χ²/χ²_batch at every hundredth step and the last
+               of iSAM2's `update()` alone; long steps; χ²/χ²_batch at every step (--chi2-every N: at each Nth), in
+               another replay than the timed ones
     growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
     cores      what a second core brings for the longest steps of 20,000 poses, by the clock
     full-pass  relinearise, order, analyse, factorise and solve each final system, against CHOLMOD with OpenBLAS
@@ -31,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.replays import peer_summary, peer_table, peer_targets, problems, runner, summary, targets
 from bench.replays.bars import Begin, Tell, bars
-from bench.replays.command import add_options, hand_out
+from bench.replays.command import add_options, hand_out, positive
 from bench.replays.contestants import ENTRIES, OURS, PEER, STAND_IN, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
@@ -49,6 +50,7 @@ _QUICK_GROWTH = 2_000
 _CORES_POSES = 20_000
 _OVERHEAD_POSES = 1_000
 _PASSES, _QUICK_PASSES = 15, 5
+RARE = 100  # steps between looks at χ² that do not disturb a timed replay
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,7 @@ class Plan:
     repetitions: int
     quick: bool
     judged: str
+    chi2_every: int = 1
 
     def jobs(self) -> int:
         """How many."""
@@ -68,7 +71,8 @@ class Plan:
         replays = len(self.chosen) * len(self.entries) * self.repetitions if "replays" in self.parts else 0
         growth = self.repetitions if "growth" in self.parts else 0
         passes = len(self.chosen) if "full-pass" in self.parts else 0
-        return references + replays + growth + passes + ("cores" in self.parts) + ("overhead" in self.parts)
+        looks = len(self.chosen) * len(self.entries) if "replays" in self.parts and self.chi2_every < RARE else 0
+        return references + replays + looks + growth + passes + ("cores" in self.parts) + ("overhead" in self.parts)
 
 
 def main() -> None:
@@ -76,7 +80,7 @@ def main() -> None:
     options = _options()
     chosen, note = problems.choose(options.quick, ALL)
     plan, absent = _plan(options, chosen)
-    sampling = Sampling(every=100)
+    sampling = Sampling(every=options.chi2_every if "replays" in plan.parts else RARE)
     settings = runner.Settings(options.out, runner.pick_core(), sampling, options.limit_s, options.fresh)
     try:
         with bars(plan.jobs()) as (begin, progress):
@@ -129,7 +133,11 @@ def measure(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell)
 
 
 def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell) -> dict[str, dict[str, list[Any]]]:
-    """Runs by data set and contestant.  The solvers take turns: all of them once before any of them a second time."""
+    """Runs by data set and contestant.  The solvers take turns: all of them once before any of them a second time.
+
+    Looks at χ² that are not rare are made in replays that are not timed.
+    """
+    looked, settings = settings, replace(settings, sampling=Sampling(every=max(plan.chi2_every, RARE)))
     runs: dict[str, dict[str, list[Any]]] = {p.key: {} for p in plan.chosen}
     for repetition in range(plan.repetitions):
         for problem in plan.chosen:
@@ -141,7 +149,23 @@ def _replays(settings: runner.Settings, plan: Plan, begin: Begin, progress: Tell
                     begin(f"{problem.key}: {STAND_IN}", problem.steps)
                     run = runner.run_replay(settings, problem, ENTRIES[STAND_IN], repetition, progress)
                     runs[problem.key].setdefault(STAND_IN, []).append(run)
+    if plan.chi2_every < RARE:
+        for problem in plan.chosen:
+            for name, each in runs[problem.key].items():
+                begin(f"{problem.key}: χ² of {name}", problem.steps)
+                each[0] = _looked_at(looked, problem, each[0], progress)
     return runs
+
+
+def _looked_at(settings: runner.Settings, problem: Problem, run: dict[str, Any], progress: Tell) -> dict[str, Any]:
+    """The run with χ² at all samples, up to where it came to."""
+    if not run.get("done"):
+        return run
+    try:
+        looks = runner.run_quality(settings, problem, ENTRIES[run["contestant"]], progress)
+    except runner.Crashed as crashed:
+        return {**run, "chi2": [], "reason": f"{run['reason']}; χ² along the way: {crashed}".strip("; ")}
+    return {**run, "chi2": [each for each in looks["chi2"] if each[0] < run["done"]]}
 
 
 def conclude(found: dict[str, Any], plan: Plan, notes: Sequence[str]) -> tuple[dict[str, Any], list[targets.Verdict]]:
@@ -239,12 +263,14 @@ def _plan(options: argparse.Namespace, chosen: list[Problem]) -> tuple[Plan, lis
     absent = [f"Not measured: {entry.label} ({entry.missing()})." for entry in entries if entry.missing()]
     entries = [entry for entry in entries if not entry.missing()]
     repetitions = options.repetitions or (1 if options.quick else 3)
-    return Plan(parts, wanted or chosen, entries, repetitions, options.quick, options.judge), absent
+    plan = Plan(parts, wanted or chosen, entries, repetitions, options.quick, options.judge, options.chi2_every)
+    return plan, absent
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_options(parser, "peers", repetitions=None)
+    parser.add_argument("--chi2-every", type=positive, default=1, metavar="N", help="look at χ² at each Nth step (1)")
     parser.add_argument("--judge", choices=OUR_MODES, default="auto", help="the mode that the targets are for")
     return parser.parse_args()
 

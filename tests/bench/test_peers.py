@@ -4,23 +4,37 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bench.replays import cores, full_pass, growth, overhead, peer_summary, peer_table, peer_targets
+from bench import peers
+from bench.replays import (
+    child,
+    cores,
+    full_pass,
+    growth,
+    overhead,
+    peer_summary,
+    peer_table,
+    peer_targets,
+    runner,
+)
 from bench.replays.columns import columns_of
 from bench.replays.contestants import ENTRIES, PEER, STAND_IN
 from bench.replays.peer_targets import BARS
 from bench.replays.problems import ALL, Problem, load
 from bench.replays.reference import optima
+from bench.replays.samples import Sampling
 from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
 
 from factorbus.solver import Options, Solver, warm
 
 PEERS = Path(__file__).parent / "peers.py"
 SILENT = lambda *_: None  # noqa: E731
+ALWAYS = Sampling(every=1).as_json()
 
 
 def a_run(name: str, cpu_s: float = 1.0, done: int = 300, **more: Any) -> dict[str, Any]:
@@ -302,7 +316,8 @@ def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
     assert {row["status"] for row in by_name.values()} == {"done"}
     assert by_name[PEER]["ratio_to_isam2"] == 1.0
     assert by_name["auto"]["ratio_to_isam2"] == pytest.approx(by_name["auto"]["cpu_s"] / by_name[PEER]["cpu_s"])
-    assert by_name["auto"]["chi2_ratio"]["samples"] == 6
+    assert by_name["auto"]["chi2_ratio"]["samples"] == by_name[PEER]["chi2_ratio"]["samples"] == 600
+    assert 1.0 <= by_name["auto"]["chi2_ratio"]["median"] <= by_name["auto"]["chi2_ratio"]["p99"]
     assert by_name["auto"]["chi2_settled"] == pytest.approx(by_name["gn-loop"]["chi2_final"], rel=1e-2)
     assert by_name[PEER]["chi2_settled"] is None
     assert by_name["auto"]["work"]["options"]["mode"] == "auto"
@@ -316,6 +331,49 @@ def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
     again = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
     repeated = json.loads(again.stdout)
     assert [row["measured_at"] for row in repeated["rows"]] == [row["measured_at"] for row in document["rows"]]
+
+
+@pytest.mark.parametrize("name", ["auto", PEER])
+def test_chi2_of_every_step_is_that_of_the_timed_replay(name: str) -> None:
+    world = Problem("manhattan", "Manhattan", poses=80, seed=3)
+    rarely = {"contestant": name, "limit_s": 100.0, "sampling": Sampling(every=20).as_json()}
+    timed, looked = child.replay(rarely, world, SILENT), child.quality({**rarely, "sampling": ALWAYS}, world, SILENT)
+    assert [step for step, _ in looked["chi2"]] == list(range(80))
+    assert looked["reason"] == ""
+    assert [step for step, _ in timed["chi2"]] == [19, 39, 59, 79]
+    every = dict(looked["chi2"])
+    for step, chi2 in timed["chi2"]:
+        assert every[step] == pytest.approx(chi2, rel=1e-9, abs=1e-12)
+
+
+def test_optima_of_every_step_are_those_of_settling() -> None:
+    steps = load(Problem("city_trees", "CityTrees", poses=120, seed=2))
+    columns = columns_of(steps)
+    each, last = optima(steps, columns, range(120))
+    assert len(each) == 120
+    for step in (40, 90, 119):
+        ((_, settled),) = optima(steps[: step + 1], columns, [step])[0]
+        assert each[step][1] == pytest.approx(settled, rel=1e-8, abs=1e-9)
+    assert sum(len(keys) for keys, _ in last.values()) == sum(batch.variable_count for batch in steps)
+
+
+def test_a_replay_that_is_looked_at_is_a_job_unless_looks_are_rare() -> None:
+    world, entries = Problem("manhattan", "Manhattan", poses=80, seed=3), [ENTRIES["auto"], ENTRIES[PEER]]
+    plan = peers.Plan(("replays",), [world], entries, 3, False, "auto")
+    assert plan.jobs() == 1 + 2 * 3 + 2
+    assert replace(plan, chi2_every=peers.RARE).jobs() == 1 + 2 * 3
+
+
+def test_a_run_whose_looks_crashed_has_no_quality_and_misses_its_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(*_: object) -> dict[str, Any]:
+        raise runner.Crashed("exit code -9")
+
+    monkeypatch.setattr(runner, "run_quality", crash)
+    world = Problem("intel", "intel")
+    run = peers._looked_at(runner.Settings(Path(), None), world, a_run("auto", chi2_settled=10.0), SILENT)
+    assert run["chi2"] == []
+    assert "exit code -9" in run["reason"]
+    assert judged(chi2=[])["at most median"] == MISSED
 
 
 def test_an_unknown_name_is_refused_with_those_there_are() -> None:

@@ -12,7 +12,7 @@ from factorbus.cli.options import json_option
 from factorbus.cli.screen import document, note
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
-LONG = ("paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
+LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
 ASKED = ("ask",)  # a minute or two, most of it GTSAM's; on request
 
 
@@ -31,11 +31,14 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     ros2       a robot's odometry with its transform back through `factorbus ros2`, against bare Zenoh
     ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
                of 10,000 candidates; --quick
+    every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
+               drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
+               --seeds, --seed, --only simulated|data|hard|NAME,...
     paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
                goes on where it was stopped; --quick: two minutes
     peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
                growth to 100,000 poses, a second core, full passes against CHOLMOD, Python's share; hours;
-               --quick: two minutes
+               --chi2-every N; --quick: two minutes
     fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
     journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
@@ -48,6 +51,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     \b
     factorbus bench cholesky
     factorbus bench paper --quick
+    factorbus bench every-step --only simulated --seeds 3
     factorbus bench peers --only intel,manhattan3500
     factorbus bench all --json > bench.json
     """
@@ -57,7 +61,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     for each in names:
         note(f"bench {each}")
         ran = subprocess.run(
-            [sys.executable, str(folder / f"{each}.py"), *(["--json"] if as_json else []), *options],
+            [sys.executable, str(folder / _file(each)), *(["--json"] if as_json else []), *options],
             stdout=subprocess.PIPE if as_json else None,
             text=True,
             check=False,
@@ -76,12 +80,17 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
 def _folder() -> Path:
     """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
     folder = Path(__file__).resolve().parents[3] / "tests" / "bench"
-    if not all((folder / f"{name}.py").is_file() for name in (*BENCHES, *ASKED, *LONG)):
+    if not all((folder / _file(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
         raise Stopped(
             "no_repository",
             "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",
         )
     return folder
+
+
+def _file(name: str) -> str:
+    """The file of a benchmark."""
+    return f"{name.replace('-', '_')}.py"
 
 
 def _result(name: str, ran: "subprocess.CompletedProcess[str]") -> object:

@@ -102,6 +102,25 @@ def replay(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
     }
 
 
+def quality(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
+    """χ² of the estimates of job["contestant"] at the samples, off any clock: a look takes what a step does."""
+    steps = load(problem)
+    columns, samples, chi2, reason = columns_of(steps), set(_samples(job, steps)), [], ""
+    contestant = contestants.make_reading(job["contestant"])
+    for k, batch in enumerate(steps):
+        try:
+            contestant.prepare(batch)
+            contestant.step()
+            contestant.read()
+        except contestants.Failed as failed:
+            reason = f"step {k}: {failed}"
+            break
+        if k in samples:
+            chi2.append((k, chi2_at(columns, contestant.values(), k)))
+        tell({"done": k + 1})
+    return {"contestant": job["contestant"], "chi2": chi2, "reason": reason}
+
+
 def reference(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
     """χ²_batch at the samples; the values at the end go to the file job["values"]."""
     from .reference import optima
@@ -131,6 +150,7 @@ def _measure(kind: str) -> "Job":
 Job: TypeAlias = Callable[[dict[str, Any], Problem, Tell], dict[str, Any]]
 _JOBS: dict[str, Job] = {
     "replay": replay,
+    "quality": quality,
     "reference": reference,
     "fill": fill,
     **{kind: _measure(kind) for kind in ("growth", "cores", "full_pass", "overhead")},

@@ -26,6 +26,14 @@ def positive(text: str) -> int:
     return number
 
 
+def natural(text: str) -> int:
+    """A number of things, 0 included."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{number}; wanted 0 or more")
+    return number
+
+
 def hand_out(name: str, document: dict[str, Any], text: str, options: argparse.Namespace) -> None:
     """Markdown and JSON into the output folder, and to where they were asked for."""
     options.out.mkdir(parents=True, exist_ok=True)

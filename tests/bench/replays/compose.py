@@ -39,8 +39,9 @@ def first_values(batch: Batch, known: Known) -> dict[int, tuple[str, F64]]:
 
 
 def _factors(batch: Batch) -> Iterator[tuple[str, list[int], F64]]:
-    """Factors between poses before sightings, each kind in its order."""
-    for group in sorted(batch.factors, key=lambda group: not group.kind.startswith("between")):
+    """Factors between poses before sightings, each kind in its order; none that has one end: it reaches no other."""
+    pairs = [group for group in batch.factors if group.kind in ENDS]
+    for group in sorted(pairs, key=lambda group: not group.kind.startswith("between")):
         for ends, z in zip(group.keys.tolist(), group.measured, strict=True):
             yield group.kind, ends, z
 

@@ -187,6 +187,12 @@ def make(name: str) -> Contestant:
     return _makers()[entry.solver](**entry.settings)
 
 
+def make_reading(name: str) -> Contestant:
+    """One with the same estimates, all of which can be had: iSAM2's `update()` alone has none without a rehearsal."""
+    entry = ENTRIES[name]
+    return _makers()[ISAM2 if entry.solver == ISAM2_ALONE else entry.solver](**entry.settings)
+
+
 def _makers() -> dict[str, Callable[..., Contestant]]:
     """Imports of peers are inside: who is not asked for need not be installed."""
 
@@ -195,10 +201,10 @@ def _makers() -> dict[str, Callable[..., Contestant]]:
 
         return Ours(mode)
 
-    def isam2(threshold: float, factorization: str, wildfire: float) -> Contestant:
+    def isam2(**settings: Any) -> Contestant:
         from .isam2 import Isam2
 
-        return Isam2(threshold, factorization, wildfire)
+        return Isam2(**settings)
 
     def g2o(every: int) -> Contestant:
         from .g2o_batch import G2oBatch

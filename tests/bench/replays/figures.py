@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from factorbus.viz import style
 
+from .chi2 import ratio
 from .contestants import ENTRIES
 from .problems import Problem
-from .summary import FLOOR
 
 # Okabe and Ito's colours, which differ for colour-blind readers as well; dashes tell them apart in grey.
 LOOKS: dict[str, dict[str, Any]] = {
@@ -83,8 +83,7 @@ def chi2_figure(path: Path, title: str, runs: Sequence[dict[str, Any]], batch: d
         upper.plot(steps, optimum, color="#BBBBBB", linewidth=4, label="optimum", zorder=1)
         for run in compared:
             at, chi2 = (np.array(part) for part in zip(*run["chi2"], strict=True))
-            best = np.array([batch[int(step)] for step in at])
-            excess = np.maximum(chi2, FLOOR) / np.maximum(best, FLOOR) - 1
+            excess = [ratio(value, batch[int(step)]) - 1 for step, value in run["chi2"]]
             upper.plot(at, chi2, label=ENTRIES[run["contestant"]].label, **LOOKS[run["contestant"]])
             lower.plot(at, np.maximum(excess, 1e-10), marker=".", markersize=3, **LOOKS[run["contestant"]])
         upper.set_ylabel("χ²")

@@ -9,7 +9,6 @@ request this is as it does, another problem than ours then.  (On parking_garage,
 iSAM2 with Cholesky goes through only so.)
 """
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -19,12 +18,12 @@ import numpy as np
 
 from factorbus.proto.messages import Batch
 
-from .columns import F64, Values, symmetric
+from .columns import F64, Values
 from .compose import first_values
 from .contestants import Failed
+from .gtsam_factors import gtsam_factors, held, pose3
 
 Prepared: TypeAlias = tuple[Any, Any]  # GTSAM's graph and values of a step
-_TIGHT = 1e-4  # metres and radians of the prior that holds the first pose; nothing pulls at it
 
 
 class Isam2:
@@ -33,7 +32,7 @@ class Isam2:
 
     def __init__(self, threshold: float, factorization: str, wildfire: float, as_gtsam_reads: bool = False) -> None:
         self._isam = _made(threshold, factorization, wildfire)
-        self._factors = {**_FACTORS, "between_se3": _between_se3_as_read} if as_gtsam_reads else _FACTORS
+        self._as_gtsam_reads = as_gtsam_reads
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._estimate = gtsam.Values()
         self._last_pose = ("se2", -1)
@@ -54,14 +53,10 @@ class Isam2:
         for group in batch.variables:
             if group.fixed:
                 for key in group.keys.tolist():
-                    self._graph.add(_prior(group.kind, key, self._values))
+                    self._graph.add(held(group.kind, key, self._values))
         for group in batch.factors:
-            make = self._factors.get(group.kind)
-            if make is None:
-                raise Failed(f"no factor for {group.kind} in GTSAM's wheel")
-            rows = zip(group.keys.tolist(), group.measured, symmetric(group.information), strict=True)
-            for (i, j), z, information in rows:
-                self._graph.add(make(i, j, z, information))
+            for factor in gtsam_factors(group, self._as_gtsam_reads):
+                self._graph.add(factor)
         self._estimate = gtsam.Values()  # taking the old one down is not on the clock
 
     def prepared(self) -> "Prepared":
@@ -201,12 +196,6 @@ def _failed(problem: RuntimeError) -> Failed:
     return Failed(" ".join(str(problem).split())[:200] or "RuntimeError without words")
 
 
-def pose3(value: F64) -> Any:
-    """(x y z qx qy qz qw) as GTSAM's."""
-    x, y, z, w = value[3:].tolist()
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), value[:3])
-
-
 def _insert(values: Any, kind: str, key: int, value: F64) -> None:
     if kind == "se2":
         values.insert(key, gtsam.Pose2(*value.tolist()))
@@ -216,42 +205,6 @@ def _insert(values: Any, kind: str, key: int, value: F64) -> None:
         values.insert(key, np.ascontiguousarray(value))
 
 
-def _prior(kind: str, key: int, values: Any) -> Any:
-    if kind == "se2":
-        return gtsam.PriorFactorPose2(key, values.atPose2(key), gtsam.noiseModel.Isotropic.Sigma(3, _TIGHT))
-    return gtsam.PriorFactorPose3(key, values.atPose3(key), gtsam.noiseModel.Isotropic.Sigma(6, _TIGHT))
-
-
-def _between_se2(i: int, j: int, z: F64, information: F64) -> Any:
-    noise = gtsam.noiseModel.Gaussian.Information(information)
-    return gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*z.tolist()), noise)
-
-
-def _between_se3(i: int, j: int, z: F64, information: F64) -> Any:
-    scale = np.array([1, 1, 1, 0.5, 0.5, 0.5])
-    return _between_se3_as_read(i, j, z, information * np.outer(scale, scale))
-
-
-def _between_se3_as_read(i: int, j: int, z: F64, information: F64) -> Any:
-    order = [3, 4, 5, 0, 1, 2]
-    noise = gtsam.noiseModel.Gaussian.Information(information[np.ix_(order, order)])
-    return gtsam.BetweenFactorPose3(i, j, pose3(z), noise)
-
-
-def _landmark_se2(i: int, j: int, z: F64, information: F64) -> Any:
-    distance, bearing = math.hypot(z[0], z[1]), math.atan2(z[1], z[0])
-    c, s = math.cos(bearing), math.sin(bearing)
-    jacobian = np.array([[-s / distance, c / distance], [c, s]])
-    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
-    noise = gtsam.noiseModel.Gaussian.Covariance((covariance + covariance.T) / 2)
-    return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(bearing), distance, noise)
-
-
-def _bearing_range_se2(i: int, j: int, z: F64, information: F64) -> Any:
-    noise = gtsam.noiseModel.Gaussian.Information(information)
-    return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(float(z[0])), float(z[1]), noise)
-
-
 def _extract_pose3(values: Any) -> F64:
     from scipy.spatial.transform import Rotation
 
@@ -259,12 +212,6 @@ def _extract_pose3(values: Any) -> F64:
     return np.concatenate((rows[:, 9:], Rotation.from_matrix(rows[:, :9].reshape(-1, 3, 3)).as_quat()), axis=1)
 
 
-_FACTORS = {
-    "between_se2": _between_se2,
-    "between_se3": _between_se3,
-    "landmark_se2": _landmark_se2,
-    "bearing_range_se2": _bearing_range_se2,
-}
 _EXTRACT = {
     "se2": (lambda values: gtsam.utilities.extractPose2(values), ord("x")),
     "se3": (_extract_pose3, ord("x")),

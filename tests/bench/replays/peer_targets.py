@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from .chi2 import ratio
 from .contestants import ENTRIES, PEER
-from .summary import ratio
 from .targets import MET, MISSED, NOT_MEASURED, Rows, Verdict
 
 OURS = "auto"
@@ -207,6 +207,8 @@ def _p99(dataset: str, ours: dict[str, Any]) -> Verdict:
 def _quality(dataset: str, ours: dict[str, Any]) -> Verdict:
     bars = ", ".join(f"{name} {bar:g}" for name, bar in QUALITY.items())
     found = ours["chi2_ratio"]
+    if not found:
+        return Verdict(f"{dataset}: χ²/χ²_batch at most {bars}", ours["note"], MISSED)
     seen = ", ".join(f"{name} {found[name]:.6f}" for name in QUALITY)
     is_met = all(found[name] <= bar for name, bar in QUALITY.items())
     return _verdict(f"{dataset}: χ²/χ²_batch at most {bars}", seen, is_met)

@@ -76,6 +76,17 @@ def run_replay(
     return run
 
 
+def run_quality(settings: Settings, problem: Problem, entry: Entry, progress: Progress) -> dict[str, Any]:
+    """χ² of its estimates at the samples, in a replay of its own.  Raises Crashed."""
+    path = settings.folder / "quality" / problem.key / f"{entry.name}.{_run_key(settings, problem, entry)}.json"
+    kept = _kept(path, settings)
+    if kept is None:
+        job = {"kind": "quality", "contestant": entry.name}
+        kept = _do(settings, problem, job, progress, wall_s=4 * settings.limit_s + _GRACE_S)
+        _keep(path, kept)
+    return kept
+
+
 def run_reference(settings: Settings, problem: Problem, progress: Progress) -> dict[str, Any]:
     """The optima at the samples, and under "values" the file with the map at the end.  Raises Crashed."""
     return _remembered(settings, problem, "reference", _REFERENCE, {}, progress)
@@ -181,8 +192,9 @@ def _run_key(settings: Settings, problem: Problem, entry: Entry) -> str:
         settings.sampling.as_json(),
         _cpu_model(),
     ]
-    mine = {OURS: "ours", RIVAL: "gn_loop", ISAM2: "isam2", ISAM2_ALONE: "isam2"}.get(entry.solver, "g2o_batch")
-    said += [platform.python_version(), *_sources((*_MACHINERY, mine))]
+    isam2 = ("isam2", "gtsam_factors")
+    own = {OURS: ("ours",), RIVAL: ("gn_loop",), ISAM2: isam2, ISAM2_ALONE: isam2}.get(entry.solver, ("g2o_batch",))
+    said += [platform.python_version(), *_sources((*_MACHINERY, *own))]
     if entry.runs_our_kernels:
         said += _solver()
     return _hash(said)

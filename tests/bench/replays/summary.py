@@ -6,12 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from .chi2 import ratio
 from .contestants import Entry
 from .problems import Problem
 
-# χ² below this is nothing: data sets whose measurements agree (killian: 5.8e-8) and steps without a loop (1e-27)
-# would give ratios of rounding errors.  Ratios are max(χ², FLOOR) / max(χ²_batch, FLOOR).
-FLOOR = 1e-3
 SPIKE = 1.01  # χ²/χ²_batch above which a sample counts as a spike
 
 
@@ -48,23 +46,19 @@ def row_of(problem: Problem, entry: Entry, runs: Sequence[dict[str, Any]], batch
 
 
 def ratio_statistics(curve: Sequence[Sequence[float]], batch: dict[int, float]) -> dict[str, float]:
-    """median, p95, max, mean of χ²/χ²_batch over the samples, how many there are and how many are spikes."""
+    """median, p95, p99, max, mean of χ²/χ²_batch over the samples, how many there are and how many are spikes."""
     if not curve:
         return {}
     ratios = np.array([ratio(chi2, batch[int(step)]) for step, chi2 in curve])
     return {
         "median": float(np.median(ratios)),
         "p95": float(np.percentile(ratios, 95)),
+        "p99": float(np.percentile(ratios, 99)),
         "max": float(ratios.max()),
         "mean": float(ratios.mean()),
         "samples": len(ratios),
         "spikes": int((ratios > SPIKE).sum()),
     }
-
-
-def ratio(chi2: float, optimum: float) -> float:
-    """χ²/χ²_batch above the floor."""
-    return max(chi2, FLOOR) / max(optimum, FLOOR)
 
 
 def best_known(

@@ -134,5 +134,6 @@ CityTrees10k. What it stands above that is the work of its thresholds: isam2-0.1
 - g2o: `initialize_optimization` and Gauss-Newton with Eigen's sparse Cholesky (the wheel has no CHOLMOD) until the \
 gain is below 1e-6, at steps that have a loop, or at every tenth pose; between them its only answer is composed.
 - χ² is Σ rᵀΩr of g2o's residuals, by one evaluator for all, at up to 100 steps spread by the golden section, against \
-the optimum at the same step; χ² below 1e-3 counts as 1e-3; spikes are samples more than 1 % above the optimum.
+the optimum at the same step; where that is below 1, an excess is not a share; spikes are samples more than 1 % above \
+the optimum.
 - MB: the largest resident size of the process, in brackets what it had before the first step."""

@@ -4,7 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .summary import SPIKE, ratio
+from .chi2 import ratio
+from .summary import SPIKE
 
 MET, MISSED, NOT_MEASURED = "met", "MISSED", "not measured"
 Rows = dict[tuple[str, str], dict[str, Any]]  # (data set, name of the contestant) -> row
