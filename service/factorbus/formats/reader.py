@@ -16,6 +16,7 @@ from factorbus.formats.lines import Bucket, read_buckets
 from factorbus.formats.mixtures import best_components
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
+from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.records import G2O, SWITCH_PRIOR, Dialect, Vertex
 from factorbus.formats.rotations import normalised_poses
 from factorbus.formats.sniff import named, sniffed
@@ -62,6 +63,8 @@ def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
         left.say("poses and points are numbered separately")
     lone = [format_symbol(key) for key in unnamed(batch).tolist()] if batch.factors else []
     left.drop("vertices", len(lone), f"no edge names {shown(lone)}")
+    lost = [format_symbol(key) for key in lone_bearings(batch).tolist()]
+    left.drop("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
     numbering = "keys" if are_keys else "apart" if apart else "ids"
     return GraphFile(file, chosen.name, batch, lines, tuple(left.notes), dict(left.counts), numbering)
 
