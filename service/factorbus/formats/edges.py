@@ -75,7 +75,7 @@ def _prepared(name: str, record: Edge, bucket: Bucket, left: LeftOut) -> Bucket:
     if record.weight == "euler_root":
         return _with_roots(bucket, record)
     if record.extra and any(long := [len(rest.split()) == record.width + 1 for rest in bucket.rests]):
-        left.say(f"{sum(long)} {name} with a number behind the information, as RTAB-Map writes them: it is not looked at")
+        left.say(f"{sum(long)} {name} with a number behind the information, as RTAB-Map has it: not looked at")
         cut = [rest.rsplit(None, 1)[0] if is_long else rest for rest, is_long in zip(bucket.rests, long, strict=True)]
         return Bucket(cut, bucket.numbers)
     return bucket
@@ -106,7 +106,8 @@ def _columns(name: str, record: Edge, bucket: Bucket, reading: Reading) -> EdgeC
         )
     information = checked_information(file, name, lines, information, kind.dim)
     measured, information = _on_the_pose(name, record, lines, heads_left, measured, information, reading)
-    columns = EdgeColumns(record.kind, lines, *map(np.ascontiguousarray, (ends, measured, information)))
+    ends, measured = np.ascontiguousarray(ends), np.ascontiguousarray(measured)
+    columns = EdgeColumns(record.kind, lines, ends, measured, np.ascontiguousarray(information))
     if record.lead == "switch":
         scale = np.sqrt([reading.switches.get(number, 1.0) for number in heads_left[:, -1].tolist()])
         reading.left.say(f"{len(lines)} {name} read with the loss dcs, as wide as their switches are held on")

@@ -45,12 +45,13 @@ class Offsets:
         known = {**(self.cameras if space == "se3" else {}), **self.places[space]}
         unknown = np.array([number not in known for number in parameters.tolist()], bool)
         identity = "0 0 0" if space == "se2" else "0 0 0 0 0 0 1"
+        first = parameters[int(np.argmax(unknown))] if len(unknown) else 0
         refuse_first(
             file,
             lines,
             unknown,
             lambda row: f"{name} with parameter {parameters[row]}, which no line declares",
-            f"a line PARAMS_{space.upper()}OFFSET {parameters[int(np.argmax(unknown))] if len(unknown) else 0} {identity}",
+            f"a line PARAMS_{space.upper()}OFFSET {first} {identity}",
         )
         return np.array([known[number] for number in parameters.tolist()]).reshape(len(lines), -1)
 
@@ -79,9 +80,7 @@ def leave_cameras(offsets: Offsets, named: set[int], left: LeftOut) -> None:
         left.leave(record, unused, "no edge that is read here needs a camera")
 
 
-def _declared(
-    file: str, name: str, space: str, bucket: Bucket, more: int = 0
-) -> tuple[dict[int, F64], list[int]]:
+def _declared(file: str, name: str, space: str, bucket: Bucket, more: int = 0) -> tuple[dict[int, F64], list[int]]:
     """(places by number, the numbers line by line)."""
     width = {"se2": 4, "se3": 8}[space]
     fields = _FIELDS[space] + (", and what the camera is" if more else "")

@@ -57,9 +57,7 @@ def delay_points(batch: Batch, ends: tuple[I64, ...], rank: I64, fixed: np.ndarr
         entry[point] = min(_met(seen, poses), int(placing[point]))
 
 
-def composed(
-    batch: Batch, ends: tuple[I64, ...], rank: I64, entry: I64, known: Mapping[int, F64]
-) -> F64:
+def composed(batch: Batch, ends: tuple[I64, ...], rank: I64, entry: I64, known: Mapping[int, F64]) -> F64:
     """Where the 2D poses are by composed odometry, each from the pose nearest in time that was in before: (N, 3).
 
     known: values of poses that have one, by row.
@@ -85,7 +83,8 @@ def _place(pose: int, poses: F64, edges: list[tuple[int, F64]], known: Mapping[i
     if pose in known:
         poses[pose] = known[pose]
         return True
-    near = [(abs(int(rank[other] - rank[pose])), at) for at, (other, _) in enumerate(edges) if poses[other, 0] == poses[other, 0]]
+    placed = [(other, at) for at, (other, _) in enumerate(edges) if not np.isnan(poses[other, 0])]
+    near = [(abs(int(rank[other] - rank[pose])), at) for other, at in placed]
     if not near:
         return False
     other, z = edges[min(near)[1]]

@@ -78,8 +78,10 @@ def _edges(
     columns: list[EdgeColumns] = []
     for name in buckets:
         if name in chosen.edges:
-            for found in read_edges(name, chosen.edges[name], buckets[name], reading):
-                columns.append(best_components(file, found, vertices, left) if isinstance(found, Lead) else found)
+            columns += [
+                best_components(file, found, vertices, left) if isinstance(found, Lead) else found
+                for found in read_edges(name, chosen.edges[name], buckets[name], reading)
+            ]
     leave_cameras(offsets, reading.named, left)
     return _priors_of_poses(columns, vertices) if is_g2o else columns
 
@@ -100,7 +102,7 @@ def _leave_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket], l
     for name in foreign:
         if not (dialect is G2O and name in _CAMERAS):
             short = name if len(name) <= 40 else name[:37] + "..."
-            instead = "their edges have a loss instead" if name in _SWITCHES else f"no {dialect.name} record that is read"
+            instead = "its edge has a loss instead" if name in _SWITCHES else f"no {dialect.name} record that is read"
             left.leave(short, buckets[name].numbers, instead)
 
 
@@ -120,7 +122,9 @@ def _priors_of_poses(columns: list[EdgeColumns], vertices: Sequence[VertexColumn
     for group in columns:
         if group.kind in _OF_POSES:
             kind = _OF_POSES[group.kind]
-            points, poses = (_ids_of(end, columns, vertices) for end in (group.kind[6:], FACTOR_KINDS[kind].connects[0]))
+            points, poses = (
+                _ids_of(end, columns, vertices) for end in (FACTOR_KINDS[g].connects[0] for g in (group.kind, kind))
+            )
             of_pose = np.isin(group.ids[:, 0], poses) & ~np.isin(group.ids[:, 0], points)
             lever = ((0, 0), (0, FACTOR_KINDS[kind].size - group.measured.shape[1]))
             if of_pose.any():

@@ -195,7 +195,9 @@ def _known_poses(batch: Batch, names: Roster, root: int, given: I64, use_values:
     known = {row: value for row, value in values.items() if use_values or row in chosen}
     for group, ends in zip(batch.factors, names.ends, strict=True):
         if group.kind == "prior_se2":
-            known |= {row: value for row, value in zip(ends[:, 0].tolist(), group.measured, strict=True) if row not in known}
+            known |= {
+                row: value for row, value in zip(ends[:, 0].tolist(), group.measured, strict=True) if row not in known
+            }
     if names.is_pose.any():
         known.setdefault(int(names.pose_at[0]) if root < 0 else root, np.zeros(3))
     return known
