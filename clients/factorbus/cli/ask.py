@@ -104,9 +104,9 @@ def covariance_command(
 def gate_command(
     name: str, candidates: Path, probability: float, connect: str, zenoh: str, timeout_s: float, as_json: bool
 ) -> int:
-    """Whether the factors in the file CANDIDATES (g2o, TORO, iSAM, SLAM++) are plausible; the exit code is 1 when one is not.
+    """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
-    Their keys are those of the map; vertices in the file are not looked at.
+    The file is g2o, TORO, iSAM or SLAM++ text. Their keys are those of the map; vertices in the file are not looked at.
 
     \b
     factorbus ask gate warehouse candidates.g2o --probability 0.99

@@ -127,9 +127,8 @@ async def _export(maps: Maps, request: Request) -> Response:
         format, robot = request.query_params.get("format", "g2o"), request.query_params.get("robot")
         exported = await asyncio.wrap_future(joined.map.ask.export(format, None, robot))
     name = f"{request.path_params['name']}{f'-{robot}' if robot else ''}.{format}"
-    return PlainTextResponse(
-        logged(request.path_params["name"], exported), headers={"Content-Disposition": f'attachment; filename="{name}"'}
-    )
+    text = logged(request.path_params["name"], exported)
+    return PlainTextResponse(text, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
 async def _variable(maps: Maps, request: Request) -> Response:

@@ -10,7 +10,7 @@ from factorbus.formats.errors import refuse_first
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
-from factorbus.formats.offsets import Offsets, has_lever, seen_from_pose
+from factorbus.formats.offsets import Offsets, has_lever, is_moved, seen_from_pose
 from factorbus.formats.records import SWITCH_PRIOR, Edge
 from factorbus.formats.rotations import isam_edges3, normalised_poses
 from factorbus.formats.weights import checked_information, packed_upper, squared
@@ -120,14 +120,20 @@ def _on_the_pose(
 ) -> tuple[F64, F64]:
     """(measured, information) in the frame of the pose, not of a sensor beside it."""
     kind = FACTOR_KINDS[record.kind]
+    missing = kind.size - measured.shape[1]  # a position, whose antenna is on the pose
+    measured = np.pad(measured, ((0, 0), (0, missing))) if missing else measured
     if not record.parameters:
-        missing = kind.size - measured.shape[1]  # a position has its antenna on the pose then
-        return (np.pad(measured, ((0, 0), (0, missing))) if missing else measured), information
+        return measured, information
     space = kind.connects[0]
     numbers = [heads[:, column] for column in range(record.parameters)]
     places = [reading.offsets.of(reading.file, name, space, lines, column) for column in numbers]
-    if space == "se3":
+    if space == "se3" and record.applied:
         reading.named.update(*(column.tolist() for column in numbers))
+    if not record.applied:
+        beside = int(is_moved(places).sum())
+        if beside:
+            reading.left.say(f"{beside} {name}: their offset is not applied, as g2o does not apply it in this record")
+        return measured, information
     if has_lever(record.kind, places):
         reading.left.say(f"{name}: of a sensor beside the pose, its weight is carried over to first order in the error")
     moved, weights = seen_from_pose(record.kind, places, measured, information)

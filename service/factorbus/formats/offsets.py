@@ -3,17 +3,19 @@
 A sensor at P on its pose X stands at X P.  What g2o measures from there becomes what we measure from X:
 
     a point      e = (X P)⁻¹ l − z        r = R_P e                     z' = P z,        Ω' = R_P Ω R_Pᵀ        exact
-    a position   e = X t_P − z            the kind has a lever arm                                             exact
     a pose       e = z⁻¹ (X P)            e' = P e P⁻¹,  r_e = A r_e'   z' = z P⁻¹,      Ω' = Aᵀ Ω A
     two poses    e = z⁻¹ (Xᵢ P)⁻¹ (Xⱼ Q)   e' = Q e Q⁻¹,  r_e = A r_e'   z' = P z Q⁻¹,    Ω' = Aᵀ Ω A
 
-with A as in MATH (3.28): of the last two z' is exact, and Ω' to first order in the error, exact without a lever arm.
+In EDGE_SE3_XYZ_PRIOR and EDGE_SE2_POINTXY_OFFSET g2o does not apply the offset, and so it is not applied here.
+
+A is that of MATH (3.28): of the last two z' is exact, and Ω' to first order in the error, exact without a lever arm.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorbus.formats.errors import FormatError, refuse_first
 from factorbus.formats.left_out import LeftOut
@@ -102,15 +104,18 @@ def seen_from_pose(kind: str, places: list[F64], measured: F64, information: F64
 
     in   kind: of the factor   places: of each parameter (n, 3 or 7)   measured (n, size)   information packed
     """
-    if kind.startswith("position"):
-        return np.concatenate([measured, places[0][:, : measured.shape[1]]], axis=1), information
-    moved = np.any([place != _identity(place.shape[1]) for place in places], axis=(0, 2))
+    moved = is_moved(places)
     if not moved.any():
         return measured, information
     new, weights = measured.copy(), information.copy()
     rows = [place[moved] for place in places]
     new[moved], weights[moved] = _moved(kind, rows, measured[moved], information[moved])
     return new, weights
+
+
+def is_moved(places: list[F64]) -> NDArray[np.bool]:
+    """Whether any of a row's places is not the pose's own: (n,)."""
+    return np.any([place != _identity(place.shape[1]) for place in places], axis=(0, 2))
 
 
 def has_lever(kind: str, places: list[F64]) -> bool:

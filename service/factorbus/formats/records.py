@@ -35,7 +35,8 @@ class Edge:
     """A record `NAME ids [parameters] [lead] measurement weight` of a factor of `kind`.
 
     parameters: how many numbers of offsets (PARAMS_SE2OFFSET, PARAMS_SE3OFFSET) stand after the ids; optional: they
-    may be left out.  lead: what one number before the measurement is, "switch" or "mixture".  sized: how many numbers
+    may be left out; applied: whether g2o applies them, which it does not in every record.
+    lead: what one number before the measurement is, "switch" or "mixture".  sized: how many numbers
     are measured in the file, where that is not the kind's own size.  extra: one more number may stand at the end, as
     RTAB-Map writes it.  order: where each number of the upper triangle is found.  weight: "information"; "root" (the
     upper triangular R of information RᵀR); "sigmas" (standard deviations); "euler_root" (R of x y z and roll pitch
@@ -45,6 +46,7 @@ class Edge:
     kind: str
     parameters: int = 0
     optional: bool = False
+    applied: bool = True
     lead: str = ""
     sized: int = 0
     extra: bool = False
@@ -103,7 +105,7 @@ class Dialect:
 OFFSETS = {"PARAMS_SE2OFFSET": "se2", "PARAMS_SE3OFFSET": "se3"}
 SWITCH_PRIOR = "EDGE_SWITCH_PRIOR"
 _POSITION_SE2 = Edge("position_se2", sized=2)
-_POSITION_SE3 = Edge("position_se3", sized=3, parameters=1, optional=True)
+_POSITION_SE3 = Edge("position_se3", sized=3, parameters=1, optional=True, applied=False)
 _PRIOR_SE3 = Edge("prior_se3", parameters=1, optional=True)
 
 # The first record of a kind is the one that is written; the others are names that other programs give to the same.
@@ -129,7 +131,7 @@ G2O = Dialect(
         "EDGE_SE3_XYZ_PRIOR": _POSITION_SE3,
         "EDGE_SE2_OFFSET": Edge("between_se2", parameters=2),
         "EDGE_SE3_OFFSET": Edge("between_se3", parameters=2),
-        "EDGE_SE2_POINTXY_OFFSET": Edge("landmark_se2", parameters=1),
+        "EDGE_SE2_POINTXY_OFFSET": Edge("landmark_se2", parameters=1, applied=False),
         "EDGE_SE3": Edge("between_se3", extra=True),  # RTAB-Map, of landmarks with an orientation
         "EDGE_POINTXY_PRIOR": Edge("prior_point2"),
         "EDGE_SE2_PRIOR": Edge("prior_se2"),

@@ -22,7 +22,7 @@ _EDGES: dict[str, tuple[str, Edge]] = {}
 for _name, _record in G2O.edges.items():
     if not _record.lead:
         _EDGES.setdefault(_record.kind, (_name, _record))
-_IDENTITY = (0.0, 0.0, 0.0)
+_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,26 +67,15 @@ def as_g2o(batch: Batch, strict: bool = False, ids: str = "auto") -> Written:
 
 
 def _lines(batch: Batch, keys: I64, ids: I64) -> Iterator[str]:
-    places = _places(batch)
-    for number, place in enumerate(places):
-        yield f"PARAMS_SE3OFFSET {number} {_plain(place)} 0 0 0 1"
+    if any(_EDGES[group.kind][1].parameters for group in batch.factors):
+        yield _OFFSET
     for group in batch.variables:
         yield from _vertex_lines(group, ids[np.searchsorted(keys, group.keys)])
     for group in batch.variables:
         if group.fixed:
             yield from (f"FIX {number}" for number in ids[np.searchsorted(keys, group.keys)].tolist())
     for group in batch.factors:
-        yield from _edge_lines(group, ids[np.searchsorted(keys, group.keys)], places)
-
-
-def _places(batch: Batch) -> list[tuple[float, ...]]:
-    """Where sensors sit on their poses, the pose itself first, if any edge has to say so."""
-    groups = [group for group in batch.factors if _EDGES[group.kind][1].parameters]
-    if not groups:
-        return []
-    levers = [group.measured[:, 3:] for group in groups if group.kind == "position_se3"]
-    others = {tuple(lever.tolist()) for lever in np.concatenate([np.empty((0, 3)), *levers])} - {_IDENTITY}
-    return [_IDENTITY, *sorted(others)]
+        yield from _edge_lines(group, ids[np.searchsorted(keys, group.keys)])
 
 
 def _vertex_lines(group: Variables, ids: I64) -> Iterator[str]:
@@ -96,15 +85,11 @@ def _vertex_lines(group: Variables, ids: I64) -> Iterator[str]:
             yield f"{name} {number} {_plain(values)}"
 
 
-def _edge_lines(group: Factors, ids: I64, places: list[tuple[float, ...]]) -> Iterator[str]:
+def _edge_lines(group: Factors, ids: I64) -> Iterator[str]:
     name, record = _EDGES[group.kind]
+    offset = " 0" if record.parameters else ""
     numbers = np.concatenate([group.measured[:, : record.measured], group.information], axis=1)
-    parameters = [""] * len(ids)
-    if record.parameters:
-        number = {place: f" {at}" for at, place in enumerate(places)}
-        beside = group.measured[:, 3:].tolist() if group.kind == "position_se3" else [_IDENTITY] * len(ids)
-        parameters = [number[tuple(place)] for place in beside]
-    for ends, offset, row in zip(ids.tolist(), parameters, numbers.tolist(), strict=True):
+    for ends, row in zip(ids.tolist(), numbers.tolist(), strict=True):
         yield f"{name} {' '.join(map(str, ends))}{offset} {_plain(row)}"
 
 
@@ -135,9 +120,9 @@ def _writable_factors(group: Factors, gone: I64, left: LeftOut) -> Factors | Non
         left.drop(group.kind, len(group.keys), "g2o has no record for such factors")
         return None
     kept = np.ones(len(group.keys), bool)
-    if group.kind == "position_se2":
-        kept = (group.measured[:, 2:] == 0.0).all(axis=1)
-        left.drop(group.kind, int((~kept).sum()), "g2o has no record for an antenna beside a 2D pose")
+    if group.kind in ("position_se2", "position_se3"):
+        kept = (group.measured[:, _EDGES[group.kind][1].measured :] == 0.0).all(axis=1)
+        left.drop(group.kind, int((~kept).sum()), "g2o has no record for an antenna beside its pose")
     if group.loss:
         left.drop(f"{group.kind} loss", len(group.keys), f"g2o has no losses: written without their {group.loss}")
     if not kept.any():
