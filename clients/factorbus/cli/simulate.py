@@ -47,7 +47,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
                 show(number, "")
     if out:
         graph = merged(batches)
-        say(out, write_g2o(out, graph))
+        say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
         screen.note(f"{out}: {poses} poses, {graph.factor_count} factors")
     if truth:
         write_tum(truth, merged(truths))
