@@ -109,6 +109,7 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
     assert "a.g2o: 2 ROBOTLASER1 left out" in shown.err
     assert (told["written"], told["poses"]) == (["o.g2o", "t.tum"], 4)
     assert main([*asked, "--strict"]) == BAD_FILE
+    assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {"file": "a.g2o", "line": 5}
     (folder / "a.txt").write_text(SLAMPP)
     chi2 = []
     for more in ([], ["--dialect", "slam++"]):
