@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,35 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.formats import FormatError, g2o_text, kitti_text, read, tum_text, write_g2o, write_kitti, write_tum
+from factorbus.formats import (
+    FormatError,
+    as_g2o,
+    g2o_text,
+    kitti_text,
+    read,
+    tum_text,
+    write_g2o,
+    write_kitti,
+    write_tum,
+)
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.problems import SeveralRobots
 from factorbus.proto.symbols import symbol
 
-WRITABLE = ("prior_se2", "prior_se3", "between_se2", "between_se3", "landmark_se2", "landmark_se3", "prior_point3")
+WRITABLE = (
+    "prior_se2",
+    "prior_se3",
+    "prior_point2",
+    "prior_point3",
+    "between_se2",
+    "between_se3",
+    "landmark_se2",
+    "landmark_se3",
+    "position_se2",
+    "position_se3",
+    "bearing_se2",
+)
 UNWRITABLE = [name for name in FACTOR_KINDS if name not in WRITABLE]
 WRITABLE_VARIABLES = {name: kind for name, kind in VARIABLE_KINDS.items() if name != "idp"}
 NUMBERS = st.floats(-1e9, 1e9) | st.sampled_from([0.0, -0.0, 5e-324, 1.7e308, 1 / 3])
@@ -62,6 +86,8 @@ def batches(draw: st.DrawFn) -> Batch:
                 ]
                 root = [draw(st.lists(st.floats(-3, 3), min_size=kind.dim**2, max_size=kind.dim**2)) for _ in rows]
                 full = [np.reshape(r, (kind.dim, kind.dim)) for r in root]
+                if name.startswith("position"):  # g2o has no antenna beside its pose
+                    measured = [np.pad(row[: kind.dim], (0, kind.dim)) for row in measured]
                 packed = [(m.T @ m + np.eye(kind.dim))[np.triu_indices(kind.dim)] for m in full]
                 factors.append(Factors(name, np.array(rows), np.array(measured), np.array(packed)))
     return Batch(tuple(groups), tuple(sorted(factors, key=lambda group: list(FACTOR_KINDS).index(group.kind))))
@@ -113,7 +139,7 @@ def test_text_of_g2o() -> None:
     assert out.getvalue() == g2o_text(small())
 
 
-def test_keys_that_share_an_index_are_numbered_anew(tmp_path: Path) -> None:
+def test_keys_that_share_a_number_are_written_whole(tmp_path: Path) -> None:
     batch = small()
     shared = np.array([symbol("l", 1)])
     batch = Batch(
@@ -124,34 +150,58 @@ def test_keys_that_share_an_index_are_numbered_anew(tmp_path: Path) -> None:
             ),
         ),
     )
-    text = g2o_text(batch)
-    assert "VERTEX_XY 2 3 4\n" in text
-    assert "EDGE_SE2_XY 1 2 2 1 1 0 1\n" in text
     path = tmp_path / "a.g2o"
-    path.write_text(text)
-    assert read(path).batch.variable_count == 3
+    (note,) = write_g2o(path, batch)
+    assert "ids are keys" in note
+    assert f"VERTEX_XY {shared[0]} 3 4\n" in path.read_text()
+    assert_same(read(path).batch, batch)
+    counted = g2o_text(batch, ids="counted")
+    assert "VERTEX_XY 2 3 4\n" in counted
+    assert "EDGE_SE2_XY 1 2 2 1 1 0 1\n" in counted
+    with pytest.raises(FormatError, match="keys that their numbers do not tell apart"):
+        g2o_text(batch, ids="ids")
+    with pytest.raises(FormatError, match="ids 'many'; wanted one of auto"):
+        g2o_text(batch, ids="many")
 
 
-def test_features_of_inverse_depth_have_no_record() -> None:
-    feature = Variables("idp", np.array([symbol("f", 1)]), np.zeros((1, 6)))
-    with pytest.raises(FormatError, match=r"1 variable\(s\) of kind idp"):
-        g2o_text(Batch((feature,)))
-
-
-@pytest.mark.parametrize("kind", ["bearing_range_se2", "prior_point2"])
-def test_what_g2o_has_no_record_for_is_refused_before_writing(tmp_path: Path, kind: str) -> None:
-    facts = FACTOR_KINDS[kind]
-    factor = Factors(kind, np.zeros((1, len(facts.connects)), np.int64), np.ones((1, 2)), np.array([[1, 0, 1.0]]))
+@pytest.mark.parametrize("kind", UNWRITABLE)
+def test_kinds_without_a_record_are_left_out_and_said(tmp_path: Path, kind: str) -> None:
+    facts, batch = FACTOR_KINDS[kind], small()
+    keys = np.array([[symbol("f", 10 * end + 9) for end in range(len(facts.connects))]])
+    others = tuple(
+        Variables(name, keys[0, end : end + 1], np.ones((1, VARIABLE_KINDS[name].size)))
+        for end, name in enumerate(facts.connects)
+    )
+    factor = Factors(kind, keys, np.ones((1, facts.size)), np.eye(facts.dim)[np.triu_indices(facts.dim)][None])
+    whole = Batch((*batch.variables, *others), (*batch.factors, factor))
+    written = as_g2o(whole)
+    assert written.left_out[kind] == 1
+    assert f"1 {kind} left out: g2o has no record for such factors" in written.notes
+    assert written.text.count("EDGE_") == 2
     path = tmp_path / "a.g2o"
-    with pytest.raises(FormatError, match=f"1 factor.* of kind {kind}; wanted only between_se2"):
-        write_g2o(path, Batch((), (factor,)))
+    with pytest.raises(FormatError, match=r"nothing that would be left out \(strict\)"):
+        write_g2o(path, whole, strict=True)
     assert not path.exists()
 
 
-def test_variable_that_would_be_lost_is_refused() -> None:
+def test_losses_and_antennas_beside_the_pose_are_left_out_and_said() -> None:
+    batch = small()
+    edge, sight = batch.factors
+    robust = edge._replace(loss="huber", scale=np.array([1.0]))
+    antenna = Factors("position_se2", edge.keys[:, :1], np.array([[1, 2, 0.5, 0]]), np.array([[1, 0, 1.0]]))
+    written = as_g2o(Batch(batch.variables, (robust, sight, antenna)))
+    assert written.text == g2o_text(batch)
+    assert written.left_out == {"between_se2 loss": 1, "position_se2": 1}
+    assert "written without their huber" in written.notes[0]
+    with pytest.raises(FormatError, match="1 between_se2 loss"):
+        g2o_text(Batch(batch.variables, (robust, sight)), strict=True)
+
+
+def test_variable_that_nothing_tells_of_is_left_out_and_said() -> None:
     lonely = Variables("se2", np.array([symbol("x", 3)]))
-    with pytest.raises(FormatError, match="x3 has neither a value nor a factor"):
-        g2o_text(Batch((lonely,)))
+    written = as_g2o(Batch((lonely,)))
+    assert written.left_out == {"variables": 1}
+    assert written.notes == ("1 variables left out: neither a value nor an edge tells of x3",)
     with pytest.raises(FormatError, match="a factor of x0, which is not in the graph"):
         g2o_text(Batch((), small().factors))
 
@@ -168,12 +218,36 @@ def test_text_of_tum(tmp_path: Path) -> None:
     assert (tmp_path / "a.tum").read_text() == tum_text(batch)
 
 
-def test_tum_of_two_robots_and_of_poses_without_value() -> None:
-    one = Variables("se2", np.array([symbol("a", 5)]), np.zeros((1, 3)))
-    two = Variables("se2", np.array([symbol("b", 5)]), np.ones((1, 3)))
-    assert [line.split()[:2] for line in tum_text(Batch((two, one))).splitlines()] == [["0", "0.0"], ["1", "1.0"]]
+@pytest.mark.parametrize(("text", "write"), [(tum_text, write_tum), (kitti_text, write_kitti)])
+def test_a_trajectory_is_one_robots(tmp_path: Path, text: Callable, write: Callable) -> None:
+    one = Variables("se2", np.array([symbol("a", k) for k in (0, 2, 4, 6)]), np.array([[k, 0, 0.0] for k in range(4)]))
+    two = Variables(
+        "se2", np.array([symbol("b", k) for k in (7, 1, 3, 5)]), np.array([[k, 100, 0.0] for k in range(4)])
+    )
+    bare = Variables("se2", np.array([1403636579763555584]), np.ones((1, 3)))
+    batch = Batch((two, one, bare))
+    with pytest.raises(SeveralRobots, match="keys without a letter, a, b, and none was chosen") as caught:
+        text(batch)
+    assert caught.value.detail == {"robots": ["", "a", "b"]}
+    with pytest.raises(SeveralRobots, match="none is 'c'"):
+        text(batch, "c")
+    files = write(tmp_path / "out.txt", batch)
+    assert [file.name for file in files] == ["out.txt", "out-a.txt", "out-b.txt"]
+    for file, robot, alone in zip(files, ("", "a", "b"), (bare, one, two), strict=True):
+        assert file.read_text() == text(batch, robot) == text(Batch((alone,)))
+        assert len(file.read_text().splitlines()) == len(alone.keys)
+    assert write(tmp_path / "b.txt", batch, "b") == [tmp_path / "b.txt"]
+    assert (tmp_path / "b.txt").read_text() == text(batch, "b")
     with pytest.raises(FormatError, match="x1 has no value"):
-        tum_text(Batch((Variables("se2", np.array([symbol("x", 1)])),)))
+        text(Batch((Variables("se2", np.array([symbol("x", 1)])),)))
+    assert text(Batch(())) == ""
+
+
+def test_a_time_stamp_as_a_key_keeps_all_its_digits() -> None:
+    stamps = [1403636579763555584, 1403636579763555585]
+    batch = Batch((Variables("se2", np.array(stamps), np.zeros((2, 3))),))
+    assert [line.split()[0] for line in tum_text(batch).splitlines()] == list(map(str, stamps))
+    assert [line.split()[1] for line in g2o_text(batch).splitlines()] == list(map(str, stamps))
 
 
 def test_text_of_kitti(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import click
 
 from factorbus.cli.exits import FAILED, OK, input_file
 from factorbus.cli.options import DEFAULT_ENDPOINT, file_argument, json_option, zenoh_option
+from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
 
 _SHOWN = 20  # more false factors than these are told with --json only
@@ -103,14 +104,15 @@ def covariance_command(
 def gate_command(
     name: str, candidates: Path, probability: float, connect: str, zenoh: str, timeout_s: float, as_json: bool
 ) -> int:
-    """Whether the factors in the file CANDIDATES (g2o, TORO, iSAM) are plausible; the exit code is 1 when one is not.
+    """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
-    Their keys are those of the map; vertices in the file are not looked at.
+    The file is g2o, TORO, iSAM or SLAM++ text. Their keys are those of the map; vertices in the file are not looked at.
 
     \b
     factorbus ask gate warehouse candidates.g2o --probability 0.99
     """
-    factors = _factors(candidates)
+    read = _read(candidates)
+    factors = read.batch.factors
     with _map(name, connect, zenoh, timeout_s) as asked:
         found = asked.doubt.ask.gate(factors, probability, timeout_s).result()
     columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
@@ -119,7 +121,7 @@ def gate_command(
         for told, distance, allowed, plausible in zip(_described(factors), *columns, strict=True)
     ]
     if as_json:
-        document({"revision": found.revision, "candidates": rows})
+        document({"revision": found.revision, "read": read.account(), "candidates": rows})
     else:
         table(
             [
@@ -140,13 +142,14 @@ def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_
     \b
     factorbus ask gain warehouse candidates.g2o
     """
-    factors = _factors(candidates)
+    read = _read(candidates)
+    factors = read.batch.factors
     with _map(name, connect, zenoh, timeout_s) as asked:
         found = asked.doubt.ask.gain(factors, timeout_s).result()
     rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
     if as_json:
         content = [{"factor": told, "gain": gain} for told, gain in rows]
-        document({"revision": found.revision, "candidates": content})
+        document({"revision": found.revision, "read": read.account(), "candidates": content})
     else:
         table([(told, f"{gain:.4g}") for told, gain in rows], title=f"Nats at revision {found.revision}")
     return OK
@@ -265,11 +268,9 @@ def _word(plausible: bool) -> str:
     return "plausible" if plausible else "not plausible"
 
 
-def _factors(path: Path) -> tuple[Any, ...]:
-    from factorbus.formats import read
-
+def _read(path: Path) -> Any:
     with input_file(path):
-        return read(path).batch.factors
+        return read_graph(path)
 
 
 def _described(factors: tuple[Any, ...]) -> list[str]:

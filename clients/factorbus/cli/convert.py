@@ -1,11 +1,15 @@
 """`factorbus convert`: from one file format to another."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from factorbus.cli.options import file_argument
-from factorbus.cli.screen import note
+from factorbus.cli.options import file_argument, json_option
+from factorbus.cli.reading import IDS, read_graph, reading_options, robot_option, say
+
+if TYPE_CHECKING:
+    from factorbus.formats import GraphFile
 
 _WRITES = (".g2o", ".tum", ".kitti")
 
@@ -13,21 +17,57 @@ _WRITES = (".g2o", ".tum", ".kitti")
 @click.command()
 @file_argument("source")
 @file_argument("target")
-def command(source: Path, target: Path) -> None:
-    """Read SOURCE (g2o, TORO .graph or iSAM text) and write TARGET (.g2o, .tum or .kitti, by its ending).
+@reading_options
+@robot_option
+@click.option(
+    "--ids",
+    type=click.Choice(IDS),
+    default="auto",
+    show_default=True,
+    help="Of a .g2o: auto, as in SOURCE; ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...",
+)
+@json_option
+def command(
+    source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str, as_json: bool
+) -> None:
+    """Read SOURCE (g2o, TORO .graph, iSAM or SLAM++ text) and write TARGET (.g2o, .tum or .kitti, by its ending).
+
+    What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
+    letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum.
 
     \b
     factorbus convert w10000.graph w10000.g2o
     factorbus convert estimate.g2o estimate.tum
+    factorbus convert two-robots.g2o a.tum --robot a
+    factorbus convert edges.txt edges.g2o --dialect slam++
     """
     if target.suffix not in _WRITES:
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
-    from factorbus.formats import read, write_g2o, write_kitti, write_tum
+    if robot is not None and target.suffix == ".g2o":
+        raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
+    from factorbus.cli.screen import document, note
 
-    graph = read(source)
-    for text in graph.notes:
-        note(f"{source}: {text}")
-    {".g2o": write_g2o, ".tum": write_tum, ".kitti": write_kitti}[target.suffix](target, graph.batch)
-    note(f"{target}: {graph.poses} poses, {graph.landmarks} landmarks, {graph.batch.factor_count} factors")
+    graph = read_graph(source, dialect, strict)
+    files, notes = _written(graph, target, strict, robot, ids)
+    say(target, notes)
+    counts = {"poses": graph.poses, "landmarks": graph.landmarks, "factors": graph.batch.factor_count}
+    if as_json:
+        about = {"source": str(source), "read": graph.account(), "files": [str(file) for file in files]}
+        document({**about, "notes": list(notes), **counts})
+    told = ", ".join(f"{count} {name}" for name, count in counts.items())
+    note(f"{', '.join(map(str, files))}: {told}")
+
+
+def _written(
+    graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
+) -> tuple[list[Path], tuple[str, ...]]:
+    """(the files, what was left out of them)."""
+    from factorbus.formats import write_g2o, write_kitti, write_tum
+
+    if target.suffix == ".g2o":
+        same = graph.numbering if graph.numbering != "ids" else "auto"
+        return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids)
+    write = write_tum if target.suffix == ".tum" else write_kitti
+    return write(target, graph.batch, robot), ()

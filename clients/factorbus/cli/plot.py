@@ -8,6 +8,7 @@ import click
 
 from factorbus.cli.exits import require
 from factorbus.cli.options import ModeChoice, ellipses_option, out_option
+from factorbus.cli.reading import reading_options
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -18,7 +19,8 @@ _FROM_BUS = "SOURCE is a map of the service at ENDPOINT."
 def command() -> None:
     """Draw into a .png, .svg or .pdf file, in colours that colour-blind readers can tell apart.
 
-    SOURCE is a graph file (g2o, TORO, iSAM), the name of a data set, or with --connect the name of a map on the bus.
+    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++), the name of a data set, or with --connect the name of a map on
+    the bus. What of a file is left out is said.
 
     \b
     factorbus plot map town.g2o --solve
@@ -30,7 +32,9 @@ def command() -> None:
 
 
 def _source(command: F) -> F:
-    return click.argument("source")(click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(command))
+    return click.argument("source")(
+        click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(reading_options(command))
+    )
 
 
 def _out(what: str) -> Callable[[F], F]:
@@ -42,7 +46,15 @@ def _out(what: str) -> Callable[[F], F]:
 @click.option("--solve", is_flag=True, help="Draw the optimum of the graph, found here, instead of the file's values.")
 @ellipses_option(0)
 @_out("map")
-def map_command(source: str, connect: str | None, solve: bool, ellipses: int, out: Path | None) -> None:
+def map_command(
+    source: str,
+    connect: str | None,
+    dialect: str | None,
+    strict: bool,
+    solve: bool,
+    ellipses: int,
+    out: Path | None,
+) -> None:
     """Trajectory, landmarks, loop closures, and where odometry alone would have led.
 
     \b
@@ -54,7 +66,7 @@ def map_command(source: str, connect: str | None, solve: bool, ellipses: int, ou
     from factorbus.cli.plot_source import graph_of, solved, spread_in
     from factorbus.viz import Course
 
-    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
     drawn = solved(drawn) if solve else drawn
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses) if ellipses else None
@@ -64,6 +76,7 @@ def map_command(source: str, connect: str | None, solve: bool, ellipses: int, ou
 
 @command.command("drive")
 @click.argument("source")
+@reading_options
 @click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
 @click.option(
     "--every",
@@ -72,7 +85,9 @@ def map_command(source: str, connect: str | None, solve: bool, ellipses: int, ou
     help="Solve from scratch at every Nth step, to hold χ² against.  [default: ten times]",
 )
 @_out("drive")
-def drive_command(source: str, mode: str, every: int | None, out: Path | None) -> None:
+def drive_command(
+    source: str, dialect: str | None, strict: bool, mode: str, every: int | None, out: Path | None
+) -> None:
     """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
 
     \b
@@ -81,7 +96,7 @@ def drive_command(source: str, mode: str, every: int | None, out: Path | None) -
     from factorbus.cli.plot_source import file_of
 
     require("service", "factorbus plot drive")
-    file = _ready(lambda: file_of(source), out)
+    file = _ready(lambda: file_of(source, dialect, strict), out)
     from factorbus.cli.drive import drive
     from factorbus.cli.local import LocalMap
     from factorbus.cli.picture import course_of
@@ -107,7 +122,7 @@ def drive_command(source: str, mode: str, every: int | None, out: Path | None) -
 @command.command("sparsity")
 @_source
 @_out("sparsity")
-def sparsity_command(source: str, connect: str | None, out: Path | None) -> None:
+def sparsity_command(source: str, connect: str | None, dialect: str | None, strict: bool, out: Path | None) -> None:
     """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
 
     \b
@@ -116,7 +131,7 @@ def sparsity_command(source: str, connect: str | None, out: Path | None) -> None
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot sparsity")
-    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
     from factorbus.cli.sparsity import pattern_of
     from factorbus.viz import save, sparsity_figure
 
@@ -128,7 +143,7 @@ def sparsity_command(source: str, connect: str | None, out: Path | None) -> None
 @command.command("tree")
 @_source
 @_out("tree")
-def tree_command(source: str, connect: str | None, out: Path | None) -> None:
+def tree_command(source: str, connect: str | None, dialect: str | None, strict: bool, out: Path | None) -> None:
     """The elimination tree of Λ, and what of it the last loop closure makes anew.
 
     \b
@@ -137,7 +152,7 @@ def tree_command(source: str, connect: str | None, out: Path | None) -> None:
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot tree")
-    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
     from factorbus.cli.sparsity import last_loop, pattern_of
     from factorbus.viz import save, tree_figure
 

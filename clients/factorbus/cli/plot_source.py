@@ -29,24 +29,20 @@ class Drawn:
         return out or Path(f"{self.name}-{what}.png")
 
 
-def graph_of(source: str, connect: str | None) -> Drawn:
+def graph_of(source: str, connect: str | None, dialect: str | None = None, strict: bool = False) -> Drawn:
     """The graph of a file, or, with an endpoint, of the map of that name.  Raises Stopped, FormatError, Problem."""
     if connect is not None:
         return _from_bus(source, connect)
-    file = file_of(source)
+    file = file_of(source, dialect, strict)
     return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}")
 
 
-def file_of(source: str) -> "GraphFile":
+def file_of(source: str, dialect: str | None = None, strict: bool = False) -> "GraphFile":
     """The file of that name, or the data set; says what was left out.  Raises Stopped, FormatError."""
+    from factorbus.cli.reading import read_graph
     from factorbus.cli.replay_source import source_of
-    from factorbus.cli.screen import note
-    from factorbus.formats import read
 
-    file = read(source_of(Path(source)))
-    for text in file.notes:
-        note(f"{file.path}: {text}")
-    return file
+    return read_graph(source_of(Path(source)), dialect, strict)
 
 
 def solved(drawn: Drawn) -> Drawn:

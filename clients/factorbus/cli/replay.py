@@ -11,6 +11,7 @@ import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
 from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option, zenoh_option
+from factorbus.cli.reading import read_graph, reading_options
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,8 @@ class Request:
     live: bool = False
     port: int = 8080
     pace: float | None = None
+    dialect: str | None = None
+    strict: bool = False
 
     @property
     def where(self) -> str:
@@ -83,9 +86,10 @@ class Request:
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
+@reading_options
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO .graph or iSAM text, or the name of a data set) through a map, pose by pose.
+    """Drive FILE (g2o, TORO .graph, iSAM or SLAM++ text, or the name of a data set) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
@@ -125,16 +129,13 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
     from factorbus.cli import screen
     from factorbus.cli.drive import drive
     from factorbus.cli.replay_source import source_of
-    from factorbus.formats import read
 
     if request.plot:
         require("viz", "--plot")
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
-    graph = read(request.file)
-    for text in graph.notes:
-        screen.note(f"{request.file}: {text}")
+    graph = read_graph(request.file, request.dialect, request.strict)
     steps = graph.steps(use_values=request.use_values)
     with _target(request) as target:
         before = target.account()
@@ -142,10 +143,11 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
             driven = drive(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
-        _write(request, target)
+        written = _write(request, target, graph.numbering)
         if request.plot:
             _draw(request.plot, request.file.name, driven, target, steps)
         result = _document(request, driven, target, steps, last, unsettled, before)
+        result |= {"read": graph.account(), "written": [str(file) for file in written]}
         told(result)
         if request.live:
             _stay()
@@ -239,16 +241,25 @@ def _stay() -> None:
         wait_until(stop)
 
 
-def _write(request: Request, target: Any) -> None:
+def _write(request: Request, target: Any, numbering: str) -> list[Path]:
+    """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
+    from factorbus.cli.reading import say
+    from factorbus.cli.screen import note
     from factorbus.formats import write_g2o, write_kitti, write_tum
     from factorbus.proto.messages import Batch
 
+    files: list[Path] = []
     if request.out:
-        write_g2o(request.out, target.graph())
-    if request.tum:
-        write_tum(request.tum, Batch(target.estimate()))
-    if request.kitti:
-        write_kitti(request.kitti, Batch(target.estimate()))
+        ids = numbering if numbering != "ids" else "auto"
+        say(request.out, write_g2o(request.out, target.graph(), request.strict, ids))
+        files.append(request.out)
+    for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
+        if path:
+            robots = write(path, Batch(target.estimate()))
+            if robots != [path]:
+                note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
+            files += robots
+    return files
 
 
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:

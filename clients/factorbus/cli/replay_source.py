@@ -19,7 +19,7 @@ def source_of(given: Path, places: Places | None = None, catalogue: Sequence[Dat
     if str(given) not in known:
         raise Stopped(
             "bad_file",
-            f"{given}: no such file, and no data set of that name; wanted a g2o, TORO or iSAM file, or one of "
+            f"{given}: no such file, and no data set of that name; wanted a g2o, TORO, iSAM or SLAM++ file, or one of "
             f"{', '.join(dataset.name for dataset in catalogue)}",
             BAD_FILE,
             path=str(given),

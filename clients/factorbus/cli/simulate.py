@@ -34,6 +34,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
         raise click.UsageError("there is nothing to write: give --out FILE.g2o, --truth FILE.tum or both")
     from factorbus.cli import screen
     from factorbus.cli.columns import merged
+    from factorbus.cli.reading import say
     from factorbus.formats import write_g2o, write_tum
     from factorbus.proto.messages import Batch
 
@@ -46,7 +47,7 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
                 show(number, "")
     if out:
         graph = merged(batches)
-        write_g2o(out, graph)
+        say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
         screen.note(f"{out}: {poses} poses, {graph.factor_count} factors")
     if truth:
         write_tum(truth, merged(truths))

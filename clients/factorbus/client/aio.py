@@ -27,6 +27,7 @@ from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
+from factorbus.client.questions import logged
 from factorbus.client.stream import DeltaStream
 from factorbus.client.ticket import NoAnswerYet, Ticket
 from factorbus.proto.asking import Repaired
@@ -239,9 +240,17 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.stats(timeout_s))
 
-    async def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
-        return await asyncio.wrap_future(self._map.ask.export(format, timeout_s))
+    async def export(
+        self,
+        format: str = "g2o",
+        timeout_s: float | None = None,
+        robot: str | None = None,
+        strict: bool = False,
+        ids: str = "auto",
+    ) -> str:
+        """The map as the text of a file: "g2o", "tum" or "kitti", as in `Map.export`.  Raises Refused, Unavailable."""
+        exported = await asyncio.wrap_future(self._map.ask.export(format, timeout_s, robot, strict, ids))
+        return logged(self._map.name, exported)
 
     async def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the mirror is at `revision` or later and not stale.  Raises Unavailable."""

@@ -16,7 +16,7 @@ from factorbus.client.draft import Draft, Key
 from factorbus.client.link import Link
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
-from factorbus.client.questions import Questions
+from factorbus.client.questions import Questions, logged
 from factorbus.client.ticket import Ticket
 from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
@@ -235,9 +235,22 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return self.ask.stats(timeout_s).result()
 
-    def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o", "tum" or "kitti".  Raises Refused, Unavailable."""
-        return self.ask.export(format, timeout_s).result()
+    def export(
+        self,
+        format: str = "g2o",
+        timeout_s: float | None = None,
+        robot: str | None = None,
+        strict: bool = False,
+        ids: str = "auto",
+    ) -> str:
+        """The map as the text of a file: "g2o", "tum" or "kitti".
+
+        robot: the letter of the robot whose trajectory it is ("" for keys without one), if the map has several.  What
+        g2o has no record for is left out and logged, and with `strict` refused; `ask.export` gives it as notes.  ids:
+        of a g2o file, "auto" (numbers if x and l are all the letters, else keys), "ids", "keys" or "counted".
+        Raises Refused, Unavailable.
+        """
+        return logged(self.name, self.ask.export(format, timeout_s, robot, strict, ids).result())
 
     def close(self) -> None:
         """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""

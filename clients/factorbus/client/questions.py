@@ -1,8 +1,9 @@
 """Questions to a map: each method sends one and returns the future of its answer."""
 
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,14 @@ from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
 from factorbus.proto.symbols import parse_symbol
 
 T = TypeVar("T")
+log = logging.getLogger("factorbus.client")
+
+
+class Exported(NamedTuple):
+    """A map as the text of a file.  notes: what g2o has no record for and was left out, for people."""
+
+    text: str
+    notes: tuple[str, ...]
 
 
 class Questions:
@@ -43,9 +52,17 @@ class Questions:
         """What the service counts and times about the map."""
         return self._ask("stats", codec.encode_map({}), codec.decode_map, timeout_s)
 
-    def export(self, format: str, timeout_s: float | None) -> Future[str]:
-        """The map as the text of a file."""
-        return self._ask("export", codec.encode_map({"format": format}), _text, timeout_s)
+    def export(
+        self,
+        format: str,
+        timeout_s: float | None,
+        robot: str | None = None,
+        strict: bool = False,
+        ids: str = "auto",
+    ) -> Future[Exported]:
+        """The map as the text of a file, and what was left out of it."""
+        question = {"format": format, "strict": strict, "ids": ids} | ({} if robot is None else {"robot": robot})
+        return self._ask("export", codec.encode_map(question), _exported, timeout_s)
 
     def repair(self, factors: Sequence[int] | None, probability: float, timeout_s: float | None) -> Future[Repaired]:
         """Which factors are false, and the estimate without them."""
@@ -60,8 +77,18 @@ class Questions:
         return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
 
 
-def _text(data: bytes) -> str:
-    text = codec.decode_map(data).get("text")
+def logged(name: str, exported: Exported) -> str:
+    """The text alone; what was left out of it goes to the log."""
+    for note in exported.notes:
+        log.warning("export of map %r: %s", name, note)
+    return exported.text
+
+
+def _exported(data: bytes) -> Exported:
+    content = codec.decode_map(data)
+    text, notes = content.get("text"), content.get("notes", [])
     if not isinstance(text, str):
         raise BadMessage("export.text", "missing or not a string", "a string")
-    return text
+    if not (isinstance(notes, list) and all(isinstance(note, str) for note in notes)):
+        raise BadMessage("export.notes", "not strings", "an array of strings")
+    return Exported(text, tuple(notes))

@@ -6,7 +6,7 @@
 | /api/maps | the maps of the service |
 | /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
-| /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti` |
+| /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
 """
 
@@ -28,6 +28,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from factorbus.client import Bus, Problem
+from factorbus.client.questions import logged
 from factorbus.gateway.documents import estimate, groups
 from factorbus.gateway.explain import explain
 from factorbus.gateway.live import follow
@@ -123,9 +124,10 @@ async def _stats(maps: Maps, request: Request) -> Response:
 
 async def _export(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
-        format = request.query_params.get("format", "g2o")
-        text = await asyncio.wrap_future(joined.map.ask.export(format, None))
-    name = f"{request.path_params['name']}.{format}"
+        format, robot = request.query_params.get("format", "g2o"), request.query_params.get("robot")
+        exported = await asyncio.wrap_future(joined.map.ask.export(format, None, robot))
+    name = f"{request.path_params['name']}{f'-{robot}' if robot else ''}.{format}"
+    text = logged(request.path_params["name"], exported)
     return PlainTextResponse(text, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 

@@ -152,6 +152,20 @@ class UnknownQuestion(Problem):
         super().__init__(f"question {question!r} is not understood; wanted {wanted}", seen=question)
 
 
+class SeveralRobots(Problem):
+    """A trajectory is one robot's.  robots: the letters of those there are, "" for keys without a letter."""
+
+    code = "several_robots"
+
+    def __init__(self, robot: str | None, robots: tuple[str, ...]) -> None:
+        there = ", ".join(letter or "keys without a letter" for letter in robots) or "no pose"
+        asked = "none was chosen" if robot is None else f"none is {robot[:8]!r}"
+        super().__init__(
+            f"a trajectory is one robot's; there are {there}, and {asked}: name one (robot, --robot)",
+            robots=list(robots),
+        )
+
+
 class Busy(Problem):
     code = "busy"
 

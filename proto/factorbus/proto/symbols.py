@@ -7,6 +7,7 @@ from factorbus.proto.problems import BadSymbol
 
 _INDEX_BITS = 56
 MAX_INDEX = (1 << _INDEX_BITS) - 1
+MAX_KEY = (1 << 63) - 1
 
 
 def symbol(letter: str, index: int) -> int:
@@ -19,11 +20,18 @@ def symbol(letter: str, index: int) -> int:
 
 
 def parse_symbol(text: str) -> int:
-    """The key that prints as `text`: "x12", "l3", or "7" for a key without a letter.  Raises BadSymbol."""
+    """The key that prints as `text`: "x12", "l3", or "7" for a key without a letter.  Raises BadSymbol.
+
+    A number alone is the key itself, also one above MAX_INDEX, as a time stamp in nanoseconds is.
+    """
     letter, digits = (text[:1], text[1:]) if text[:1].isalpha() else ("", text)
-    if not (digits.isascii() and digits.isdigit()):
+    if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
         raise BadSymbol(text, "a letter and a number, such as x12, or a number")
-    return symbol(letter, int(digits))
+    if letter:
+        return symbol(letter, int(digits))
+    if int(digits) > MAX_KEY:
+        raise BadSymbol(text, f"a number from 0 to {MAX_KEY}")
+    return int(digits)
 
 
 def format_symbol(key: int) -> str:
@@ -35,6 +43,6 @@ def format_symbol(key: int) -> str:
 
 
 def symbol_parts(key: int) -> tuple[str, int]:
-    """(letter or "", index) of `key`."""
+    """(letter, index) of `key`; ("", key) of one that no letter fits, with all its digits."""
     letter = key >> _INDEX_BITS
-    return (chr(letter), key & MAX_INDEX) if key >= 0 and letter else ("", int(key))
+    return (chr(letter), int(key) & MAX_INDEX) if key >= 0 and chr(letter).isalpha() else ("", int(key))

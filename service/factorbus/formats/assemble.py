@@ -6,7 +6,7 @@ import numpy as np
 
 from factorbus.formats.errors import refuse_first
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
@@ -27,13 +27,18 @@ class VertexColumns:
 
 @dataclass(frozen=True, slots=True)
 class EdgeColumns:
-    """Edge lines of one record: lines (n,), ids (n, arity), measured (n, size), information (n, r(r+1)/2)."""
+    """Edge lines of one record: lines (n,), ids (n, arity), measured (n, size), information (n, r(r+1)/2).
+
+    loss: of all of them, "": none; scale (n,): of the loss.
+    """
 
     kind: str
     lines: I64
     ids: I64
     measured: F64
     information: F64
+    loss: str = ""
+    scale: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,7 @@ def numbered_apart(vertices: list[VertexColumns]) -> bool:
 
 def assembled(
     file: str,
+    are_keys: bool,
     one_numbering: bool,
     vertices: list[VertexColumns],
     edges: list[EdgeColumns],
@@ -64,11 +70,13 @@ def assembled(
 ) -> tuple[Batch, tuple[I64, ...]]:
     """(the graph, the line of each factor for each group of factors).
 
+    are_keys: ids are keys already, of poses and of points; otherwise a letter is added for what it is.
     Variables come per kind, fixed ones first, those with a value before those without, each in the order of the file.
     Raises FormatError for an id that names two different things or a FIX of nothing.
     """
     mentions = _mentions(vertices, edges)
-    names = mentions.ids if one_numbering else mentions.ids + _BASE[mentions.kinds]
+    base = np.zeros_like(_BASE) if are_keys else _BASE
+    names = mentions.ids if one_numbering or are_keys else mentions.ids + base[mentions.kinds]
     _, first, inverse = np.unique(names, return_index=True, return_inverse=True)
     clash = mentions.kinds != mentions.kinds[first][inverse]
     refuse_first(
@@ -76,12 +84,12 @@ def assembled(
     )
     order = np.argsort(first)  # variables in the order in which they first appear
     chosen = first[order]
-    keys, kinds = mentions.ids[chosen] + _BASE[mentions.kinds[chosen]], mentions.kinds[chosen]
+    keys, kinds = mentions.ids[chosen] + base[mentions.kinds[chosen]], mentions.kinds[chosen]
     fixed = np.zeros(len(keys), bool)
     if fixes is not None:
         fixed[_fixed_rows(file, fixes, mentions.ids[chosen])] = True
-    groups = _variables(keys, kinds, fixed, _values(file, vertices))
-    factors, lines = _factors(edges)
+    groups = _variables(keys, kinds, fixed, _values(file, vertices, base))
+    factors, lines = _factors(edges, base)
     return Batch(tuple(groups), factors), lines
 
 
@@ -119,7 +127,7 @@ def _fixed_rows(file: str, fixes: tuple[I64, I64], ids: I64) -> I64:
     return order[at]
 
 
-def _values(file: str, vertices: list[VertexColumns]) -> dict[str, tuple[I64, F64]]:
+def _values(file: str, vertices: list[VertexColumns], base: I64) -> dict[str, tuple[I64, F64]]:
     """Per kind the keys that have a value, sorted, and the values."""
     found = {}
     for kind in dict.fromkeys(columns.kind for columns in vertices):
@@ -138,7 +146,7 @@ def _values(file: str, vertices: list[VertexColumns]) -> dict[str, tuple[I64, F6
             ),
             "one value for a vertex",
         )
-        found[kind] = (unique + _BASE[KIND_NAMES.index(kind)], values[first])
+        found[kind] = (unique + base[KIND_NAMES.index(kind)], values[first])
     return found
 
 
@@ -156,17 +164,20 @@ def _variables(keys: I64, kinds: I64, fixed: np.ndarray, values: dict[str, tuple
     return groups
 
 
-def _factors(edges: list[EdgeColumns]) -> tuple[tuple[Factors, ...], tuple[I64, ...]]:
-    """Factors per kind in the order of the file, and their lines."""
+def _factors(edges: list[EdgeColumns], base: I64) -> tuple[tuple[Factors, ...], tuple[I64, ...]]:
+    """Factors per kind and loss in the order of the file, and their lines."""
     groups, all_lines = [], []
-    for kind in (name for name in FACTOR_KINDS if any(columns.kind == name for columns in edges)):
-        same = [columns for columns in edges if columns.kind == kind]
-        lines = np.concatenate([columns.lines for columns in same])
-        base = _BASE[[KIND_NAMES.index(name) for name in FACTOR_KINDS[kind].connects]]
-        keys = np.concatenate([columns.ids for columns in same]) + base
-        measured = np.concatenate([columns.measured for columns in same])
-        information = np.concatenate([columns.information for columns in same])
-        order = np.argsort(lines, kind="stable")
-        groups.append(Factors(kind, keys[order], measured[order], information[order]))
-        all_lines.append(lines[order])
+    for kind, loss in ((name, loss) for name in FACTOR_KINDS for loss in ("", *LOSSES)):
+        same = [columns for columns in edges if (columns.kind, columns.loss) == (kind, loss)]
+        if same:
+            lines = np.concatenate([columns.lines for columns in same])
+            order = np.argsort(lines, kind="stable")
+            bases = base[[KIND_NAMES.index(name) for name in FACTOR_KINDS[kind].connects]]
+            keys = np.concatenate([columns.ids for columns in same]) + bases
+            measured = np.concatenate([columns.measured for columns in same])
+            information = np.concatenate([columns.information for columns in same])
+            scales = [columns.scale for columns in same if columns.scale is not None]
+            scale = np.concatenate(scales)[order] if scales else None
+            groups.append(Factors(kind, keys[order], measured[order], information[order], loss, scale))
+            all_lines.append(lines[order])
     return tuple(groups), tuple(all_lines)

@@ -1,7 +1,12 @@
 """A graph as a file has it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+import numpy as np
+
+from factorbus.formats.errors import FormatError
+from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.steps import Steps, planned, planned_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
@@ -11,9 +16,13 @@ from factorbus.proto.messages import Batch
 class GraphFile:
     """What `read` found.
 
-    batch: all variables (values where the file has a vertex line) and all factors, per kind in the order of the
-    file; fixed is what FIX lines say, and nothing else.  factor_lines: the line of each factor, one array for each
-    group of batch.factors.  notes: what was left out, for people.
+    batch: all variables (values where the file has a vertex line) and all factors, per kind and loss in the order of
+    the file; fixed is what FIX lines say, and nothing else.  factor_lines: the line of each factor, one array for each
+    group of batch.factors.  notes: what was left out, assumed or turned into something else, for people; left_out: how
+    many lines of each record were, "vertices" that no edge names, and "points" that a single bearing sees: those two
+    stay in `batch`, and are in no step.
+    numbering: "ids" (keys are letters and ids), "apart" (the same, poses and points numbered separately) or "keys" (ids
+    are keys): what `write_g2o` takes to write the same ids.
     """
 
     path: str
@@ -21,6 +30,8 @@ class GraphFile:
     batch: Batch
     factor_lines: tuple[I64, ...]
     notes: tuple[str, ...] = ()
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    numbering: str = "ids"
 
     @property
     def poses(self) -> int:
@@ -34,8 +45,46 @@ class GraphFile:
 
     def steps(self, use_values: bool = False) -> Steps:
         """The replay of the file in time order (see `steps.Steps`).  Raises FormatError for a graph in parts."""
-        return planned(self.path, self.batch, self.factor_lines, use_values)
+        return planned(self.path, *self._joined(), use_values)
 
     def whole(self, use_values: bool = True) -> Batch:
         """All steps as one insert, with the first pose fixed where the file leaves the choice.  Raises FormatError."""
-        return planned_whole(self.path, self.batch, self.factor_lines, use_values)
+        return planned_whole(self.path, *self._joined(), use_values)
+
+    def account(self) -> dict[str, object]:
+        """What a program is told of how the file was read."""
+        return {"dialect": self.dialect, "notes": list(self.notes), "left_out": dict(self.left_out)}
+
+    def _joined(self) -> tuple[Batch, tuple[I64, ...]]:
+        """The graph, and the lines of its factors, without what nothing is known of.  Raises FormatError."""
+        if not self.batch.factors:
+            if not self.poses:
+                raise FormatError(self.path, None, "no pose", "at least one pose to replay")
+            return self.batch, self.factor_lines
+        lost = np.concatenate([unnamed(self.batch), lone_bearings(self.batch)])
+        return _without(self.batch, self.factor_lines, lost) if lost.size else (self.batch, self.factor_lines)
+
+
+def unnamed(batch: Batch) -> I64:
+    """Keys of the variables that no factor names, but for fixed ones, which are known."""
+    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
+    free = np.concatenate([np.empty(0, np.int64), *(group.keys for group in batch.variables if not group.fixed)])
+    return free[~np.isin(free, named)]
+
+
+def _without(batch: Batch, lines: tuple[I64, ...], keys: I64) -> tuple[Batch, tuple[I64, ...]]:
+    """The same without some variables and all factors on them."""
+    variables, factors, left = [], [], []
+    for group in batch.variables:
+        kept = ~np.isin(group.keys, keys)
+        if kept.any():
+            values = None if group.values is None else group.values[kept]
+            variables.append(group._replace(keys=group.keys[kept], values=values))
+    for group, at in zip(batch.factors, lines, strict=True):
+        kept = ~np.isin(group.keys, keys).any(axis=1)
+        if kept.any():
+            scale = None if group.scale is None else group.scale[kept]
+            rows = {"keys": group.keys[kept], "measured": group.measured[kept], "information": group.information[kept]}
+            factors.append(group._replace(**rows, scale=scale))
+            left.append(at[kept])
+    return Batch(tuple(variables), tuple(factors)), tuple(left)

@@ -17,7 +17,7 @@ class Bucket:
 
 
 def read_buckets(path: Path) -> dict[str, Bucket]:
-    """The lines of `path` by record, in the order of the file; blank lines and those that begin with # are left out.
+    """The lines of `path` by record, in the order of the file; blank lines and what follows a # are left out.
 
     Raises FormatError when the file cannot be read, is not text or has no record.
     """
@@ -27,8 +27,8 @@ def read_buckets(path: Path) -> dict[str, Bucket]:
         raise FormatError(str(path), line, "a zero byte", "a text file in ASCII or UTF-8")
     found: dict[bytes, Bucket] = {}
     for number, line in enumerate(content.split(b"\n"), 1):
-        name, *rest = line.split(None, 1) or (b"#",)
-        if name[0] == 35:  # '#'
+        name, *rest = line.partition(b"#")[0].split(None, 1) or (b"",)
+        if not name:
             continue
         bucket = found.get(name)
         if bucket is None:
@@ -49,6 +49,6 @@ def _content(path: Path) -> bytes:
     except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
         raise FormatError(
-            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO or iSAM file"
+            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO, iSAM or SLAM++ file"
         ) from failure
     return content.removeprefix(b"\xef\xbb\xbf")

@@ -8,7 +8,7 @@ import numpy as np
 from factorbus.formats.errors import FormatError, refuse_first
 from factorbus.formats.lines import Bucket
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.symbols import MAX_INDEX
+from factorbus.proto.symbols import MAX_KEY
 
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _EXACT = 2.0**53  # integers below are exact as floats
@@ -73,8 +73,8 @@ def _ids_one_by_one(file: str, name: str, bucket: Bucket, ids: int) -> I64:
     table = np.empty((len(bucket.rests), ids), np.int64)
     for row, (rest, line) in enumerate(zip(bucket.rests, bucket.numbers, strict=True)):
         for column, word in enumerate(rest.split(None, ids)[:ids]):
-            if not (word.isdigit() and len(word) < 20 and int(word) <= MAX_INDEX):
-                raise FormatError(file, line, f"{name} with id {_shown(word)}", f"a whole number from 0 to {MAX_INDEX}")
+            if not (word.isdigit() and len(word) < 20 and int(word) <= MAX_KEY):
+                raise FormatError(file, line, f"{name} with id {_shown(word)}", f"a whole number from 0 to {MAX_KEY}")
             table[row, column] = int(word)
     return table
 

@@ -1,94 +1,109 @@
 """Read a graph file: sniff the dialect, convert record by record, put variables and factors together."""
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from factorbus.formats.assemble import EdgeColumns, VertexColumns, assembled, numbered_apart
-from factorbus.formats.errors import FormatError, refuse_first
-from factorbus.formats.graph import GraphFile
+from factorbus.formats.edges import Lead, Reading, read_edges, read_switches
+from factorbus.formats.errors import FormatError
+from factorbus.formats.graph import GraphFile, unnamed
+from factorbus.formats.left_out import LeftOut, shown
 from factorbus.formats.lines import Bucket, read_buckets
+from factorbus.formats.mixtures import best_components
 from factorbus.formats.numbers import read_numbers
-from factorbus.formats.records import DIALECTS, Dialect, Edge, Vertex
-from factorbus.formats.rotations import isam_edges3, normalised_poses
-from factorbus.formats.sniff import sniffed
-from factorbus.formats.weights import checked_information, packed_upper, squared
-from factorbus.proto.arrays import F64, I64
+from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
+from factorbus.formats.parallax import lone_bearings
+from factorbus.formats.records import G2O, SWITCH_PRIOR, Dialect, Vertex
+from factorbus.formats.rotations import normalised_poses
+from factorbus.formats.sniff import named, sniffed
+from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.symbols import MAX_INDEX, format_symbol
 
-_IDENTITY_ROOT = b" ".join(b"1" if i == j else b"0" for i in range(6) for j in range(i, 6))
+# A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
+_OF_POSES = {"prior_point2": "position_se2", "prior_point3": "position_se3"}
+_SWITCHES = ("VERTEX_SWITCH", SWITCH_PRIOR)
+_CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 
 
-def read(path: str | os.PathLike[str], dialect: str | None = None) -> GraphFile:
-    """The graph in `path`: g2o, TORO or iSAM text, plain or gzipped.
+def read(path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False) -> GraphFile:
+    """The graph in `path`: g2o, TORO, iSAM or SLAM++ text, plain or gzipped.
 
-    dialect: "g2o", "toro" or "isam"; without it the names of the records decide, and the ending where they do not.
-    Keys are symbol("x", id) for poses and symbol("l", id) for points.  Quaternions are normalised; angles stay as
-    they are.  Raises FormatError, which names the file and the line.
+    dialect: "g2o", "toro", "isam" or "slam++"; without it the names of the records decide, and the ending where they
+    do not; a guess is in the notes.  Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is
+    2^56 or more, as GTSAM's symbols and time stamps are, all keys are the ids themselves.  Quaternions are normalised;
+    angles stay as they are.  Records that have no kind here are left out, which `notes` and `left_out` say; with
+    `strict` they are refused.  Raises FormatError, which names the file and the line.
     """
     with np.errstate(all="ignore"):  # what overflows is not finite or not positive definite, and refused as such
-        return _read(Path(path), dialect)
+        return _read(Path(path), dialect, strict)
 
 
-def _read(path: Path, dialect: str | None) -> GraphFile:
+def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     file = str(path)
     buckets = read_buckets(path)
-    chosen = sniffed(path, buckets) if dialect is None else _named(file, dialect)
-    _refuse_foreign(file, chosen, buckets)
-    offsets = _identity_offsets(file, buckets)
+    guess = sniffed(path, buckets) if dialect is None else named(file, dialect)
+    chosen, left = guess.dialect, LeftOut(file, strict)
+    if guess.why:
+        left.say(guess.why)
     vertices = [
         _vertices(file, name, chosen.vertices[name], buckets[name]) for name in buckets if name in chosen.vertices
     ]
-    edges = [_edges(file, name, chosen.edges[name], buckets[name], offsets) for name in buckets if name in chosen.edges]
-    fixes = _fixes(file, buckets["FIX"]) if "FIX" in buckets else None
-    apart = chosen.one_numbering and numbered_apart(vertices)
-    batch, lines = assembled(file, chosen.one_numbering and not apart, vertices, edges, fixes)
-    notes = [f"{len(buckets[name].rests)} {note}" for name, note in chosen.unspoken.items() if name in buckets]
+    edges = _edges(file, chosen, buckets, vertices, left)
+    fixes = _fixes(file, buckets["FIX"]) if chosen is G2O and "FIX" in buckets else None
+    _leave_foreign(file, chosen, buckets, left)
+    are_keys = any((columns.ids > MAX_INDEX).any() for columns in (*vertices, *edges))
+    apart = chosen.one_numbering and not are_keys and numbered_apart(vertices)
+    batch, lines = assembled(file, are_keys, chosen.one_numbering and not apart, vertices, edges, fixes)
     if apart:
-        notes.append("poses and points are numbered separately")
-    return GraphFile(file, chosen.name, batch, lines, tuple(notes))
+        left.say("poses and points are numbered separately")
+    lone = [format_symbol(key) for key in unnamed(batch).tolist()] if batch.factors else []
+    left.drop("vertices", len(lone), f"no edge names {shown(lone)}")
+    lost = [format_symbol(key) for key in lone_bearings(batch).tolist()]
+    left.drop("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
+    numbering = "keys" if are_keys else "apart" if apart else "ids"
+    return GraphFile(file, chosen.name, batch, lines, tuple(left.notes), dict(left.counts), numbering)
 
 
-def _named(file: str, dialect: str) -> Dialect:
-    if dialect not in DIALECTS:
-        raise FormatError(file, None, f"dialect {dialect!r}", f"one of {', '.join(DIALECTS)}")
-    return DIALECTS[dialect]
+def _edges(
+    file: str, chosen: Dialect, buckets: Mapping[str, Bucket], vertices: list[VertexColumns], left: LeftOut
+) -> list[EdgeColumns]:
+    is_g2o = chosen is G2O
+    offsets = read_offsets(file, buckets) if is_g2o else Offsets({"se2": {}, "se3": {}}, {})
+    reading = Reading(file, offsets, read_switches(file, buckets) if is_g2o else {}, left, set())
+    columns: list[EdgeColumns] = []
+    for name in buckets:
+        if name in chosen.edges:
+            columns += [
+                best_components(file, found, vertices, left) if isinstance(found, Lead) else found
+                for found in read_edges(name, chosen.edges[name], buckets[name], reading)
+            ]
+    leave_cameras(offsets, reading.named, left)
+    return _priors_of_poses(columns, vertices) if is_g2o else columns
 
 
-def _refuse_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket]) -> None:
-    """Raise FormatError for the first line whose record the dialect does not have."""
+def _leave_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket], left: LeftOut) -> None:
+    """Leave out the records that the dialect does not have.
+
+    Raises FormatError for the first one without which the file would be another graph, or any when strict.
+    """
     foreign = [name for name in buckets if name not in dialect.names and name not in dialect.unspoken]
-    if foreign:
-        name = min(foreign, key=lambda name: buckets[name].numbers[0])
-        line = buckets[name].numbers[0]
-        if name in dialect.refused:
-            raise FormatError(file, line, f"record {name}", f"a record that can be read here ({dialect.refused[name]})")
-        shown = name if len(name) <= 40 else name[:37] + "..."
-        raise FormatError(
-            file, line, f"unknown record {shown!r}", f"a {dialect.name} record: {', '.join(dialect.names)}"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Offsets:
-    """Parameters of the file: the ids there are, and those that are the identity."""
-
-    known: frozenset[int]
-    identity: frozenset[int]
-
-
-def _identity_offsets(file: str, buckets: Mapping[str, Bucket]) -> _Offsets:
-    name = "PARAMS_SE3OFFSET"
-    if name not in buckets:
-        return _Offsets(frozenset(), frozenset())
-    ids, poses = read_numbers(file, name, buckets[name], 1, 8, "id x y z qx qy qz qw")
-    poses = normalised_poses(file, name, np.array(buckets[name].numbers), poses)
-    at_origin = (poses[:, :6] == 0).all(axis=1)
-    moved = frozenset(ids[~at_origin, 0].tolist())
-    return _Offsets(frozenset(ids[:, 0].tolist()), frozenset(ids[:, 0].tolist()) - moved)
+    refused = [name for name in foreign if name in dialect.refused]
+    for name in sorted(refused, key=lambda name: buckets[name].numbers[0])[:1]:
+        reason = f"a record that can be read here ({dialect.refused[name]})"
+        raise FormatError(file, buckets[name].numbers[0], f"record {name}", reason)
+    for name, note in dialect.unspoken.items():
+        if name in buckets:
+            left.say(f"{len(buckets[name].rests)} {note}")
+    for name in foreign:
+        if not (dialect is G2O and name in _CAMERAS):
+            short = name if len(name) <= 40 else name[:37] + "..."
+            instead = "its edge has a loss instead" if name in _SWITCHES else f"no {dialect.name} record that is read"
+            left.leave(short, buckets[name].numbers, instead)
 
 
 def _vertices(file: str, name: str, record: Vertex, bucket: Bucket) -> VertexColumns:
@@ -99,73 +114,42 @@ def _vertices(file: str, name: str, record: Vertex, bucket: Bucket) -> VertexCol
     return VertexColumns(record.kind, lines, ids[:, 0], np.ascontiguousarray(values))
 
 
-def _edges(file: str, name: str, record: Edge, bucket: Bucket, offsets: _Offsets) -> EdgeColumns:
-    """One record of edges, in our terms and checked."""
-    if record.weight == "euler_root":
-        bucket = _with_roots(bucket, record)
-    ids, numbers = read_numbers(file, name, bucket, record.ids + record.offset, record.width, record.fields)
-    lines = np.array(bucket.numbers, np.int64)
-    if record.offset:
-        _refuse_offsets(file, name, lines, ids[:, -1], offsets)
-        ids = ids[:, :-1]
-    if record.ids == 2 and record.kind.startswith("between"):
-        loops = ids[:, 0] == ids[:, 1]
-        refuse_first(file, lines, loops, lambda row: f"{name} from {ids[row, 0]} to itself", "two different vertices")
-    measured, weights = numbers[:, : record.measured], numbers[:, record.measured :]
-    ids, measured, information = _converted(file, name, record, lines, ids, measured, weights)
-    if FACTOR_KINDS[record.kind].size == 7:
-        measured = normalised_poses(file, name, lines, measured)
-    if record.kind == "bearing_range_se2":
-        refuse_first(
-            file, lines, measured[:, 1] <= 0, lambda row: f"{name} with range {measured[row, 1]:g}", "a range above 0"
-        )
-    information = checked_information(file, name, lines, information, FACTOR_KINDS[record.kind].dim)
+def _priors_of_poses(columns: list[EdgeColumns], vertices: Sequence[VertexColumns]) -> list[EdgeColumns]:
+    """The same, with each prior of a point that names a pose as a prior of that pose's position."""
+    if not any(group.kind in _OF_POSES for group in columns):
+        return columns
+    found = []
+    for group in columns:
+        if group.kind in _OF_POSES:
+            kind = _OF_POSES[group.kind]
+            points, poses = (
+                _ids_of(end, columns, vertices) for end in (FACTOR_KINDS[g].connects[0] for g in (group.kind, kind))
+            )
+            of_pose = np.isin(group.ids[:, 0], poses) & ~np.isin(group.ids[:, 0], points)
+            lever = ((0, 0), (0, FACTOR_KINDS[kind].size - group.measured.shape[1]))
+            if of_pose.any():
+                mine = _rows(group, of_pose)
+                found.append(replace(mine, kind=kind, measured=np.pad(mine.measured, lever)))
+            group = _rows(group, ~of_pose)
+        if len(group.lines):
+            found.append(group)
+    return found
+
+
+def _ids_of(kind: str, columns: Sequence[EdgeColumns], vertices: Sequence[VertexColumns]) -> I64:
+    """All ids that a vertex, or an edge of something else than a point alone, says are of this kind."""
+    ids = [vertex.ids for vertex in vertices if vertex.kind == kind]
+    for group in columns:
+        if group.kind not in _OF_POSES:
+            connects = FACTOR_KINDS[group.kind].connects
+            ids += [group.ids[:, column] for column, end in enumerate(connects) if end == kind]
+    return np.unique(np.concatenate([np.empty(0, np.int64), *ids]))
+
+
+def _rows(group: EdgeColumns, chosen: np.ndarray) -> EdgeColumns:
+    """Some of its edges; one without a loss."""
     return EdgeColumns(
-        record.kind, lines, np.ascontiguousarray(ids), np.ascontiguousarray(measured), np.ascontiguousarray(information)
-    )
-
-
-def _converted(
-    file: str, name: str, record: Edge, lines: I64, ids: I64, measured: F64, weights: F64
-) -> tuple[I64, F64, F64]:
-    """(ids, measured, information) in our terms."""
-    dim = FACTOR_KINDS[record.kind].dim
-    if record.weight == "euler_root":
-        ids, measured, information = isam_edges3(ids, measured, weights)
-        return ids, measured, information
-    if record.weight == "root":
-        return ids, measured, squared(weights, dim)
-    if record.weight == "sigmas":
-        bad = ~(weights > 0).all(axis=1)
-        refuse_first(
-            file, lines, bad, lambda row: f"{name} with standard deviations {weights[row].tolist()}", "all above 0"
-        )
-        return ids, measured, packed_upper(np.eye(dim) * (weights**-2.0)[:, None, :])
-    return ids, measured, weights[:, record.order] if record.order else weights
-
-
-def _with_roots(bucket: Bucket, record: Edge) -> Bucket:
-    """The bucket with the identity added to the lines that end after the measurement, as iSAM reads them."""
-    short = record.ids + record.measured
-    rests = [rest + b" " + _IDENTITY_ROOT if len(rest.split()) == short else rest for rest in bucket.rests]
-    return Bucket(rests, bucket.numbers)
-
-
-def _refuse_offsets(file: str, name: str, lines: I64, parameters: I64, offsets: _Offsets) -> None:
-    unknown = ~np.isin(parameters, list(offsets.known))
-    refuse_first(
-        file,
-        lines,
-        unknown,
-        lambda row: f"{name} with parameter {parameters[row]}, which no line declares",
-        f"a line PARAMS_SE3OFFSET {parameters[int(np.argmax(unknown))] if unknown.any() else 0} 0 0 0 0 0 0 1",
-    )
-    refuse_first(
-        file,
-        lines,
-        ~np.isin(parameters, list(offsets.identity)),
-        lambda row: f"{name} from a sensor beside the pose (PARAMS_SE3OFFSET {parameters[row]} is not the identity)",
-        "measurements in the frame of the pose itself",
+        group.kind, group.lines[chosen], group.ids[chosen], group.measured[chosen], group.information[chosen]
     )
 
 

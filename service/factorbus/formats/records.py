@@ -32,15 +32,24 @@ class Vertex:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """A record `NAME ids [parameter] measurement weight` of a factor of `kind`.
+    """A record `NAME ids [parameters] [lead] measurement weight` of a factor of `kind`.
 
-    offset: the number of a PARAMS_SE3OFFSET stands after the ids.  order: where each number of the upper triangle
-    is found.  weight: "information"; "root" (the upper triangular R of information RᵀR); "sigmas" (standard
-    deviations); "euler_root" (R of x y z and roll pitch yaw, and the measurement has these angles too).
+    parameters: how many numbers of offsets (PARAMS_SE2OFFSET, PARAMS_SE3OFFSET) stand after the ids; optional: they
+    may be left out; applied: whether g2o applies them, which it does not in every record.
+    lead: what one number before the measurement is, "switch" or "mixture".  sized: how many numbers
+    are measured in the file, where that is not the kind's own size.  extra: one more number may stand at the end, as
+    RTAB-Map writes it.  order: where each number of the upper triangle is found.  weight: "information"; "root" (the
+    upper triangular R of information RᵀR); "sigmas" (standard deviations); "euler_root" (R of x y z and roll pitch
+    yaw, and the measurement has these angles too).
     """
 
     kind: str
-    offset: bool = False
+    parameters: int = 0
+    optional: bool = False
+    applied: bool = True
+    lead: str = ""
+    sized: int = 0
+    extra: bool = False
     order: tuple[int, ...] | None = None
     weight: str = "information"
 
@@ -50,7 +59,9 @@ class Edge:
 
     @property
     def measured(self) -> int:
-        return FACTOR_KINDS[self.kind].dim if self.weight == "euler_root" else FACTOR_KINDS[self.kind].size
+        if self.weight == "euler_root":
+            return FACTOR_KINDS[self.kind].dim
+        return self.sized or FACTOR_KINDS[self.kind].size
 
     @property
     def weights(self) -> int:
@@ -59,36 +70,45 @@ class Edge:
 
     @property
     def width(self) -> int:
-        return self.ids + self.offset + self.measured + self.weights
+        return self.ids + self.parameters + bool(self.lead) + self.measured + self.weights
 
     @property
     def fields(self) -> str:
-        offset = ", the id of its PARAMS_SE3OFFSET" if self.offset else ""
+        offset = f", the id(s) of {self.parameters} offset(s)" if self.parameters else ""
+        lead = {"switch": ", the id of its switch", "mixture": ", the weight of its null hypothesis"}.get(self.lead, "")
         what = {"sigmas": "standard deviations"}.get(self.weight, "information")
-        return f"{self.ids} id(s){offset}, {self.measured} numbers measured, {self.weights} of {what}"
+        return f"{self.ids} id(s){offset}{lead}, {self.measured} numbers measured, {self.weights} of {what}"
 
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
     """One way of writing graphs.
 
-    one_numbering: poses and points share their ids.  unspoken: records known and left out on purpose, with the note
-    they leave.  refused: records known to be unreadable here, with the reason.
+    one_numbering: poses and points share their ids.  others: records that are read but are neither variable nor factor.
+    unspoken: records known and left out on purpose, with the note they leave.  refused: records that cannot be left
+    out without making another graph of the file, with the reason.
     """
 
     name: str
     vertices: Mapping[str, Vertex]
     edges: Mapping[str, Edge]
     one_numbering: bool = True
+    others: tuple[str, ...] = ()
     unspoken: Mapping[str, str] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
-        fixes = ("FIX", "PARAMS_SE3OFFSET") if self.name == "g2o" else ()
-        return (*self.vertices, *self.edges, *fixes)
+        return (*self.vertices, *self.edges, *self.others)
 
 
+OFFSETS = {"PARAMS_SE2OFFSET": "se2", "PARAMS_SE3OFFSET": "se3"}
+SWITCH_PRIOR = "EDGE_SWITCH_PRIOR"
+_POSITION_SE2 = Edge("position_se2", sized=2)
+_POSITION_SE3 = Edge("position_se3", sized=3, parameters=1, optional=True, applied=False)
+_PRIOR_SE3 = Edge("prior_se3", parameters=1, optional=True)
+
+# The first record of a kind is the one that is written; the others are names that other programs give to the same.
 G2O = Dialect(
     "g2o",
     vertices={
@@ -98,22 +118,38 @@ G2O = Dialect(
         "VERTEX_TRACKXYZ": Vertex("point3"),
     },
     edges={
-        "EDGE_SE2": Edge("between_se2"),
-        "EDGE_SE2_XY": Edge("landmark_se2"),
-        "EDGE_SE3:QUAT": Edge("between_se3"),
-        "EDGE_SE3_TRACKXYZ": Edge("landmark_se3", offset=True),
+        "EDGE_SE2": Edge("between_se2", extra=True),
+        "EDGE_SE2_XY": Edge("landmark_se2", extra=True),
+        "EDGE_SE3:QUAT": Edge("between_se3", extra=True),
+        "EDGE_SE3_TRACKXYZ": Edge("landmark_se3", parameters=1, extra=True),
         "EDGE_PRIOR_SE2": Edge("prior_se2"),
-        "EDGE_SE3_PRIOR": Edge("prior_se3", offset=True),
+        "EDGE_SE3_PRIOR": _PRIOR_SE3,
+        "EDGE_PRIOR_XY": Edge("prior_point2"),
         "EDGE_POINTXYZ_PRIOR": Edge("prior_point3"),
+        "EDGE_BEARING_SE2_XY": Edge("bearing_se2"),
+        "EDGE_PRIOR_SE2_XY": _POSITION_SE2,
+        "EDGE_SE3_XYZ_PRIOR": _POSITION_SE3,
+        "EDGE_SE2_OFFSET": Edge("between_se2", parameters=2),
+        "EDGE_SE3_OFFSET": Edge("between_se3", parameters=2),
+        "EDGE_SE2_POINTXY_OFFSET": Edge("landmark_se2", parameters=1, applied=False),
+        "EDGE_SE3": Edge("between_se3", extra=True),  # RTAB-Map, of landmarks with an orientation
+        "EDGE_POINTXY_PRIOR": Edge("prior_point2"),
+        "EDGE_SE2_PRIOR": Edge("prior_se2"),
+        "EDGE_PRIOR_SE3:QUAT": _PRIOR_SE3,
+        "EDGE_PRIOR_SE3_QUAT": _PRIOR_SE3,
+        "EDGE_SE3_PRIORXYZ": _POSITION_SE3,  # hdl_graph_slam
+        "EDGE_SE2_SWITCHABLE": Edge("between_se2", lead="switch"),  # Vertigo, and RTAB-Map with it
+        "EDGE_SE3_SWITCHABLE": Edge("between_se3", lead="switch"),
+        "EDGE_SE3:QUAT_SWITCHABLE": Edge("between_se3", lead="switch"),
+        "EDGE_SE2_MAXMIX": Edge("between_se2", lead="mixture"),
+        "EDGE_SE3_MAXMIX": Edge("between_se3", lead="mixture"),
+        "EDGE_SE3:QUAT_MAXMIX": Edge("between_se3", lead="mixture"),
     },
-    refused={
-        "EDGE_PRIOR_SE2_XY": "a prior on the x and y of a pose without its angle is no factor kind here",
-        "EDGE_BEARING_SE2_XY": "a bearing without a range is no factor kind here",
-        "EDGE_SE3_XYZ_PRIOR": "a prior on the position of a pose without its rotation is no factor kind here",
-    },
+    others=("FIX", *OFFSETS),
 )
 
 _TORO_3D = "readers of 3D TORO files do not agree on the order of the information; convert the file to g2o"
+_SLAMPP_3D = "SLAM++ weighs the rotation of a 3D edge in its own parameters; convert the file to g2o"
 
 TORO = Dialect(
     "toro",
@@ -139,4 +175,17 @@ ISAM = Dialect(
     one_numbering=False,
 )
 
-DIALECTS = {dialect.name: dialect for dialect in (G2O, TORO, ISAM)}
+SLAMPP = Dialect(
+    "slam++",
+    vertices={"VERTEX2": Vertex("se2"), "VERTEX": Vertex("se2")},
+    edges={
+        "ODOMETRY": Edge("between_se2"),
+        "EDGE2": Edge("between_se2"),
+        "EDGE": Edge("between_se2"),
+        "LANDMARK": Edge("landmark_se2"),
+        "LANDMARK2": Edge("landmark_se2"),
+    },
+    refused={"EDGE3": _SLAMPP_3D, "EDGE3:AXISANGLE": _SLAMPP_3D},
+)
+
+DIALECTS = {dialect.name: dialect for dialect in (G2O, TORO, ISAM, SLAMPP)}

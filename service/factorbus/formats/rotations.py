@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.formats.errors import refuse_first
-from factorbus.formats.weights import packed_upper, squared, unpacked_triangle
+from factorbus.formats.weights import packed_upper, squared, unpacked_symmetric, unpacked_triangle
 from factorbus.proto.arrays import F64, I64
 
 _NORM_TOLERANCE = 0.02  # two digits of each component are not far more exact than that
@@ -43,15 +43,14 @@ def isam_edges3(ids: I64, measured: F64, root: F64) -> tuple[I64, F64, F64]:
     """
     back = ids[:, 0] > ids[:, 1]
     poses = np.concatenate([measured[:, :3], quat_xyzw(measured[:, 3:])], axis=1)
-    poses[back] = _inverse(poses[back])
+    poses[back] = inverse(poses[back])
     angles = measured[:, 3:].copy()
     angles[back] = _roll_pitch_yaw(poses[back, 3:])
     ids = np.where(back[:, None], ids[:, ::-1], ids)
 
     R = unpacked_triangle(root, 6)
     R[:, [3, 3, 3, 4, 4, 5], [3, 4, 5, 4, 5, 5]] = R[:, [5, 4, 3, 4, 3, 3], [5, 5, 5, 4, 4, 3]]
-    information = unpacked_triangle(squared(packed_upper(R), 6), 6)
-    information += np.swapaxes(np.triu(information, 1), 1, 2)
+    information = unpacked_symmetric(squared(packed_upper(R), 6), 6)
     information = information[:, _RPY_FROM_YPR][:, :, _RPY_FROM_YPR]
     J = np.tile(np.eye(6), (len(ids), 1, 1))
     J[:, 3:, 3:] = 2 * _angle_rates(angles)
@@ -86,9 +85,35 @@ def rotated(quat: F64, vectors: F64) -> F64:
     return vectors + w * t + np.cross(u, t)
 
 
-def _inverse(poses: F64) -> F64:
+def inverse(poses: F64) -> F64:
+    """The inverse of each pose: (n, 3) x y theta, or (n, 7) x y z qx qy qz qw."""
+    if poses.shape[1] == 3:
+        back = np.einsum("nji,nj->ni", matrices(poses), poses[:, :2])
+        return np.concatenate([-back, -poses[:, 2:]], axis=1)
     conjugate = poses[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
     return np.concatenate([-rotated(conjugate, poses[:, :3]), conjugate], axis=1)
+
+
+def product(a: F64, b: F64) -> F64:
+    """a b for each pair of poses, both (n, 3) or both (n, 7)."""
+    if a.shape[1] == 3:
+        places = a[:, :2] + np.einsum("nij,nj->ni", matrices(a), b[:, :2])
+        return np.concatenate([places, a[:, 2:] + b[:, 2:]], axis=1)
+    (u, v), (s, t) = (a[:, 3:6], b[:, 3:6]), (a[:, 6:], b[:, 6:])
+    vector = s * v + t * u + np.cross(u, v)
+    scalar = s * t - np.sum(u * v, axis=1, keepdims=True)
+    quat = np.concatenate([vector, scalar], axis=1)
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    return np.concatenate([a[:, :3] + rotated(a[:, 3:], b[:, :3]), quat], axis=1)
+
+
+def matrices(poses: F64) -> F64:
+    """The rotation of each pose: (n, 2, 2) of (n, 3), (n, 3, 3) of (n, 7)."""
+    if poses.shape[1] == 3:
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        return np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
+    columns = [rotated(poses[:, 3:], np.broadcast_to(axis, (len(poses), 3))) for axis in np.eye(3)]
+    return np.stack(columns, axis=2)
 
 
 def _roll_pitch_yaw(quat: F64) -> F64:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.formats.errors import FormatError
-from factorbus.proto.arrays import I64
+from factorbus.formats.parallax import composed, delay_points
+from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import format_symbol
@@ -68,12 +69,15 @@ def roster(file: str, batch: Batch) -> Roster:
     )
 
 
-def scheduled(file: str, batch: Batch, names: Roster) -> Schedule:
+def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) -> Schedule:
     """When every variable enters.  Raises FormatError when the graph is in parts or has no beginning.
+
+    use_values: poses are at the values of the file, not where composed odometry has them.
 
     A pose enters at its own turn (by key) if an edge joins it to a pose that is in, else with the first pose that
     makes such a chain.  Where nothing is fixed and no pose has a prior, the first pose is the root; otherwise the
-    replay begins at those poses.  A point enters with the first pose that sees it.
+    replay begins at those poses.  A point enters with the first pose that sees it, one that only bearings see with the
+    pose whose bearing tells where it is (`parallax`).
     """
     if not len(names.pose_at):
         raise FormatError(file, None, "no pose", "at least one pose to replay")
@@ -88,6 +92,11 @@ def scheduled(file: str, batch: Batch, names: Roster) -> Schedule:
     if entry is None:
         entry, given = _flooded(batch, names, seeds)
     _enter_points(batch, names, entry)
+    if any(group.kind == "bearing_se2" for group in batch.factors):
+        known = _known_poses(batch, names, root, given, use_values)
+        delay_points(
+            batch, names.ends, names.rank, names.fixed, composed(batch, names.ends, names.rank, entry, known), entry
+        )
     if (entry < 0).any():
         raise _unreached(file, batch, names, entry)
     return Schedule(entry, root, given)
@@ -173,6 +182,25 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64, I64]:
                 given.append(late)
                 candidates += enter(turn, late)
     return entry, np.array(given, np.int64)
+
+
+def _known_poses(batch: Batch, names: Roster, root: int, given: I64, use_values: bool) -> dict[int, F64]:
+    """Values of the 2D poses that do not come from composed odometry, by row."""
+    values, first = {}, 0
+    for group in batch.variables:
+        if group.kind == "se2" and group.values is not None:
+            values |= dict(enumerate(group.values, first))
+        first += len(group.keys)
+    chosen = {root, *given.tolist(), *np.flatnonzero(names.fixed).tolist()}
+    known = {row: value for row, value in values.items() if use_values or row in chosen}
+    for group, ends in zip(batch.factors, names.ends, strict=True):
+        if group.kind == "prior_se2":
+            known |= {
+                row: value for row, value in zip(ends[:, 0].tolist(), group.measured, strict=True) if row not in known
+            }
+    if names.is_pose.any():
+        known.setdefault(int(names.pose_at[0]) if root < 0 else root, np.zeros(3))
+    return known
 
 
 def _neighbours(pairs: I64) -> dict[int, list[int]]:

@@ -84,7 +84,7 @@ class Steps(Sequence[Batch]):
 def planned(file: str, batch: Batch, lines: Sequence[I64], use_values: bool) -> Steps:
     """The steps of `batch`, whose factors stand on `lines`.  Raises FormatError."""
     names = roster(file, batch)
-    return _cut(batch, lines, names, scheduled(file, batch, names), use_values)
+    return _cut(batch, lines, names, scheduled(file, batch, names, use_values), use_values)
 
 
 def planned_whole(file: str, batch: Batch, lines: Sequence[I64], use_values: bool) -> Batch:

@@ -1,20 +1,27 @@
-"""The poses of a graph in the order of time, as trajectory files list them."""
+"""The poses of a graph in the order of time, one trajectory for each robot, as trajectory files list them."""
 
 import math
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
 
 from factorbus.formats.errors import FormatError
 from factorbus.proto.messages import Batch
+from factorbus.proto.problems import SeveralRobots
 from factorbus.proto.symbols import format_symbol, symbol_parts
 
+# (time stamp, x y z qx qy qz qw)
+Stamped = tuple[int, list[float]]
 
-def stamped_poses(batch: Batch, form: str) -> list[tuple[int, list[float]]]:
-    """(time stamp, x y z qx qy qz qw) of every pose of `batch`, in the order of the stamps.
 
-    The time stamp is the index of the key (x12 → 12), or the place in the order of the keys when two share an index.
-    2D poses lie in the plane z = 0.  Points are left out.  Raises FormatError, which speaks of `form`, for a pose
-    without a value.
+def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
+    """The poses of each robot of `batch`, in the order of the stamps, by its letter ("" for keys without one).
+
+    A robot is the letter of its keys, and a time stamp the number of a key (x12 → 12), which is all of a key without a
+    letter.  2D poses lie in the plane z = 0.  Points are left out.  Raises FormatError, which speaks of `form`, for a
+    pose without a value.
     """
-    poses: dict[int, list[float]] = {}
+    robots: dict[str, list[Stamped]] = defaultdict(list)
     for group in batch.variables:
         if group.kind in ("se2", "se3"):
             if group.values is None:
@@ -22,12 +29,45 @@ def stamped_poses(batch: Batch, form: str) -> list[tuple[int, list[float]]]:
                     form, None, f"{format_symbol(int(group.keys[0]))} has no value", "a value for every pose"
                 )
             lift = _lifted if group.kind == "se2" else list
-            poses.update(zip(group.keys.tolist(), map(lift, group.values.tolist()), strict=True))
-    keys = sorted(poses)
-    stamps = [symbol_parts(key)[1] for key in keys]
-    if len(set(stamps)) < len(stamps):
-        stamps = list(range(len(keys)))
-    return sorted(zip(stamps, (poses[key] for key in keys), strict=True), key=lambda row: row[0])
+            for key, value in zip(group.keys.tolist(), group.values.tolist(), strict=True):
+                letter, number = symbol_parts(key)
+                robots[letter].append((number, lift(value)))
+    return {letter: sorted(robots[letter], key=lambda row: row[0]) for letter in sorted(robots)}
+
+
+def one_trajectory(batch: Batch, form: str, robot: str | None = None) -> list[Stamped]:
+    """The poses of `robot`, a letter or ""; of the only robot without it.
+
+    Raises FormatError, SeveralRobots: there are others, and none was chosen, or the one chosen is not among them.
+    """
+    found = trajectories(batch, form)
+    if robot is None and len(found) <= 1:
+        return next(iter(found.values()), [])
+    if robot not in found:
+        raise SeveralRobots(robot, tuple(found))
+    return found[robot]
+
+
+def write_trajectories(
+    path: Path, batch: Batch, form: str, text: Callable[[list[Stamped]], str], robot: str | None
+) -> list[Path]:
+    """Write the trajectory of `robot`, or of every robot into a file of its own, and give the files.
+
+    The one robot's is `path`; of several each has its letter added: out.tum becomes out-a.tum and out-b.tum, and stays
+    out.tum for keys without a letter.  Raises FormatError, SeveralRobots, OSError; nothing is written before both.
+    """
+    if robot is not None:
+        found = {"": one_trajectory(batch, form, robot)}
+    else:
+        found = trajectories(batch, form)
+        if len(found) <= 1:
+            found = {"": next(iter(found.values()), [])}
+    files = []
+    for letter, rows in found.items():
+        file = path.with_name(f"{path.stem}-{letter}{path.suffix}") if letter else path
+        file.write_text(text(rows), encoding="ascii")
+        files.append(file)
+    return files
 
 
 def _lifted(pose: list[float]) -> list[float]:

@@ -60,6 +60,12 @@ def unpacked_triangle(packed: F64, dim: int) -> F64:
     return full
 
 
+def unpacked_symmetric(packed: F64, dim: int) -> F64:
+    """Symmetric matrices (n, dim, dim) of their packed upper triangles."""
+    full = unpacked_triangle(packed, dim)
+    return full + np.swapaxes(np.triu(full, 1), 1, 2)
+
+
 def packed_upper(full: F64) -> F64:
     """Upper triangles (n, dim (dim + 1) / 2), row by row, of matrices (n, dim, dim)."""
     rows, columns = np.triu_indices(full.shape[1])

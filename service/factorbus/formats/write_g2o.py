@@ -2,46 +2,72 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 
 from factorbus.formats.errors import FormatError
-from factorbus.formats.records import G2O
+from factorbus.formats.left_out import LeftOut, shown
+from factorbus.formats.numbering import numbered
+from factorbus.formats.records import G2O, Edge
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.symbols import format_symbol, symbol_parts
+from factorbus.proto.symbols import format_symbol
 
 _VERTEX_NAMES = {record.kind: name for name, record in G2O.vertices.items()}
-_EDGE_NAMES = {record.kind: name for name, record in G2O.edges.items()}
+# The first record of each kind that is read is the one to write, as long as it says nothing but the factor.
+_EDGES: dict[str, tuple[str, Edge]] = {}
+for _name, _record in G2O.edges.items():
+    if not _record.lead:
+        _EDGES.setdefault(_record.kind, (_name, _record))
 _OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
 
 
-def write_g2o(path_or_file: str | os.PathLike[str] | TextIO, batch: Batch) -> None:
-    """Write `batch` to a path or an open text file: vertices, FIX, edges, each in the order of the batch.
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The text of a file; notes: what was left out of it, for people; left_out: the same, counted by kind."""
 
-    An id is the index of the variable's key (x12 → 12) when no two keys share one; otherwise variables are numbered
-    in order.  Variables without a value get no vertex line.  Raises FormatError for what g2o has no record for
-    (bearings, ranges, positions, headings, attitudes, linear factors, priors on 2D points, sights, features of inverse
-    depth, losses), before anything is written.
-    """
-    text = g2o_text(batch)
+    text: str
+    notes: tuple[str, ...]
+    left_out: dict[str, int]
+
+
+def write_g2o(
+    path_or_file: str | os.PathLike[str] | TextIO, batch: Batch, strict: bool = False, ids: str = "auto"
+) -> tuple[str, ...]:
+    """Write `batch` to a path or an open text file, as `as_g2o` makes it; returns its notes.  Raises FormatError."""
+    written = as_g2o(batch, strict, ids)
     if isinstance(path_or_file, str | os.PathLike):
-        Path(path_or_file).write_text(text, encoding="ascii")
+        Path(path_or_file).write_text(written.text, encoding="ascii")
     else:
-        path_or_file.write(text)
+        path_or_file.write(written.text)
+    return written.notes
 
 
-def g2o_text(batch: Batch) -> str:
-    """The same as text."""
-    _refuse_unwritable(batch)
-    keys, ids = _numbering(batch)
-    return "\n".join([*_lines(batch, keys, ids), ""])
+def g2o_text(batch: Batch, strict: bool = False, ids: str = "auto") -> str:
+    """The text alone.  Raises FormatError."""
+    return as_g2o(batch, strict, ids).text
+
+
+def as_g2o(batch: Batch, strict: bool = False, ids: str = "auto") -> Written:
+    """`batch` as g2o text: parameters, vertices, FIX, edges, each in the order of the batch.
+
+    What g2o has no record for is left out and said: losses (the edge stays, without), factors and variables of other
+    kinds, variables without a value that no edge names.  With `strict` it is refused instead.  Variables without a
+    value get no vertex line.  ids: how keys become ids (`numbering.numbered`).  Raises FormatError, before anything is
+    written.
+    """
+    left = LeftOut("g2o", strict)
+    kept = _writable(batch, left)
+    keys, names = numbered(kept, ids, left)
+    text = "\n".join([*_lines(kept, keys, names), ""])
+    return Written(text, tuple(left.notes), dict(left.counts))
 
 
 def _lines(batch: Batch, keys: I64, ids: I64) -> Iterator[str]:
-    if any(G2O.edges[_EDGE_NAMES[group.kind]].offset for group in batch.factors):
+    if any(_EDGES[group.kind][1].parameters for group in batch.factors):
         yield _OFFSET
     for group in batch.variables:
         yield from _vertex_lines(group, ids[np.searchsorted(keys, group.keys)])
@@ -60,9 +86,9 @@ def _vertex_lines(group: Variables, ids: I64) -> Iterator[str]:
 
 
 def _edge_lines(group: Factors, ids: I64) -> Iterator[str]:
-    name = _EDGE_NAMES[group.kind]
-    offset = " 0" if G2O.edges[name].offset else ""
-    numbers = np.concatenate([group.measured, group.information], axis=1)
+    name, record = _EDGES[group.kind]
+    offset = " 0" if record.parameters else ""
+    numbers = np.concatenate([group.measured[:, : record.measured], group.information], axis=1)
     for ends, row in zip(ids.tolist(), numbers.tolist(), strict=True):
         yield f"{name} {' '.join(map(str, ends))}{offset} {_plain(row)}"
 
@@ -72,40 +98,53 @@ def _plain(numbers: Iterable[float]) -> str:
     return " ".join([repr(number).removesuffix(".0") for number in numbers])
 
 
-def _refuse_unwritable(batch: Batch) -> None:
-    for group in batch.factors:
-        if group.kind not in _EDGE_NAMES:
-            raise FormatError(
-                "g2o", None, f"{len(group.keys)} factor(s) of kind {group.kind}", f"only {', '.join(_EDGE_NAMES)}"
-            )
-        if group.loss:
-            raise FormatError(
-                "g2o", None, f"{len(group.keys)} factor(s) {group.kind} with the loss {group.loss}", "none with a loss"
-            )
-    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
+def _writable(batch: Batch, left: LeftOut) -> Batch:
+    """What of `batch` g2o has records for.  Raises FormatError for a factor of a variable that is not there."""
+    _refuse_unknown(batch)
+    variables = []
     for group in batch.variables:
-        if group.kind not in _VERTEX_NAMES:
-            raise FormatError(
-                "g2o", None, f"{len(group.keys)} variable(s) of kind {group.kind}", f"only {', '.join(_VERTEX_NAMES)}"
-            )
-        if group.values is None and not np.isin(group.keys, named).all():
-            lost = group.keys[~np.isin(group.keys, named)][0]
-            raise FormatError(
-                "g2o", None, f"{format_symbol(int(lost))} has neither a value nor a factor", "one of them"
-            )
+        if group.kind in _VERTEX_NAMES:
+            variables.append(group)
+        else:
+            left.drop(group.kind, len(group.keys), "g2o has no record for such variables")
+    gone = np.concatenate(
+        [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in _VERTEX_NAMES)]
+    )
+    factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, left)) is not None]
+    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in factors)])
+    return Batch(tuple(_told(variables, named, left)), tuple(factors))
+
+
+def _writable_factors(group: Factors, gone: I64, left: LeftOut) -> Factors | None:
+    if group.kind not in _EDGES or np.isin(group.keys, gone).any():
+        left.drop(group.kind, len(group.keys), "g2o has no record for such factors")
+        return None
+    kept = np.ones(len(group.keys), bool)
+    if group.kind in ("position_se2", "position_se3"):
+        kept = (group.measured[:, _EDGES[group.kind][1].measured :] == 0.0).all(axis=1)
+        left.drop(group.kind, int((~kept).sum()), "g2o has no record for an antenna beside its pose")
+    if group.loss:
+        left.drop(f"{group.kind} loss", len(group.keys), f"g2o has no losses: written without their {group.loss}")
+    if not kept.any():
+        return None
+    return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
+
+
+def _told(variables: list[Variables], named: I64, left: LeftOut) -> Iterator[Variables]:
+    """The variables that a vertex line or an edge tells of."""
+    for group in variables:
+        told = np.isin(group.keys, named) if group.values is None else np.ones(len(group.keys), bool)
+        lost = [format_symbol(key) for key in group.keys[~told].tolist()]
+        left.drop("variables", len(lost), f"neither a value nor an edge tells of {shown(lost)}")
+        if told.any():
+            yield group if told.all() else group._replace(keys=group.keys[told])
+
+
+def _refuse_unknown(batch: Batch) -> None:
     known = np.concatenate([np.empty(0, np.int64), *(group.keys for group in batch.variables)])
+    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
     if not np.isin(named, known).all():
         lost = named[~np.isin(named, known)][0]
         raise FormatError(
             "g2o", None, f"a factor of {format_symbol(int(lost))}, which is not in the graph", "all variables"
         )
-
-
-def _numbering(batch: Batch) -> tuple[I64, I64]:
-    """(keys, sorted, and the id of each)."""
-    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in batch.variables)])
-    ids = np.array([symbol_parts(key)[1] for key in keys.tolist()], np.int64)
-    if len(np.unique(ids)) < len(ids) or (ids < 0).any():
-        ids = np.arange(len(keys))
-    order = np.argsort(keys)
-    return keys[order], ids[order]

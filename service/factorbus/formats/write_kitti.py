@@ -3,27 +3,27 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
 
-from factorbus.formats.trajectory import stamped_poses
+from factorbus.formats.trajectory import Stamped, one_trajectory, write_trajectories
 from factorbus.proto.messages import Batch
 
 
-def write_kitti(path_or_file: str | os.PathLike[str] | TextIO, batch: Batch) -> None:
-    """Write the poses of `batch`, as `stamped_poses` orders them, to a path or an open text file.
+def write_kitti(path: str | os.PathLike[str], batch: Batch, robot: str | None = None) -> list[Path]:
+    """Write the poses of `robot`, or a file for each robot (`trajectory.write_trajectories`); gives the files.
 
-    The form has no time stamps: two files are compared line by line.  Axes stay those of the map.  Raises FormatError.
+    The form has no time stamps: two files are compared line by line.  Axes stay those of the map.  Raises FormatError
+    for a pose without a value, SeveralRobots for a robot that there is not.
     """
-    text = kitti_text(batch)
-    if isinstance(path_or_file, str | os.PathLike):
-        Path(path_or_file).write_text(text, encoding="ascii")
-    else:
-        path_or_file.write(text)
+    return write_trajectories(Path(path), batch, "KITTI", _text, robot)
 
 
-def kitti_text(batch: Batch) -> str:
-    """The same as text."""
-    return "".join(f"{' '.join(map(repr, _matrix(pose)))}\n" for _, pose in stamped_poses(batch, "KITTI"))
+def kitti_text(batch: Batch, robot: str | None = None) -> str:
+    """The trajectory of `robot`, or of the only one, as text.  Raises FormatError, SeveralRobots."""
+    return _text(one_trajectory(batch, "KITTI", robot))
+
+
+def _text(rows: list[Stamped]) -> str:
+    return "".join(f"{' '.join(map(repr, _matrix(pose)))}\n" for _, pose in rows)
 
 
 def _matrix(pose: Sequence[float]) -> list[float]:

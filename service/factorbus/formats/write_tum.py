@@ -2,24 +2,23 @@
 
 import os
 from pathlib import Path
-from typing import TextIO
 
-from factorbus.formats.trajectory import stamped_poses
+from factorbus.formats.trajectory import Stamped, one_trajectory, write_trajectories
 from factorbus.proto.messages import Batch
 
 
-def write_tum(path_or_file: str | os.PathLike[str] | TextIO, batch: Batch) -> None:
-    """Write the poses of `batch`, as `stamped_poses` lists them, to a path or an open text file.
+def write_tum(path: str | os.PathLike[str], batch: Batch, robot: str | None = None) -> list[Path]:
+    """Write the poses of `robot`, or a file for each robot (`trajectory.write_trajectories`); gives the files.
 
-    Raises FormatError for a pose without a value.
+    Raises FormatError for a pose without a value, SeveralRobots for a robot that there is not.
     """
-    text = tum_text(batch)
-    if isinstance(path_or_file, str | os.PathLike):
-        Path(path_or_file).write_text(text, encoding="ascii")
-    else:
-        path_or_file.write(text)
+    return write_trajectories(Path(path), batch, "TUM", _text, robot)
 
 
-def tum_text(batch: Batch) -> str:
-    """The same as text."""
-    return "".join(f"{stamp} {' '.join(map(repr, pose))}\n" for stamp, pose in stamped_poses(batch, "TUM"))
+def tum_text(batch: Batch, robot: str | None = None) -> str:
+    """The trajectory of `robot`, or of the only one, as text.  Raises FormatError, SeveralRobots."""
+    return _text(one_trajectory(batch, "TUM", robot))
+
+
+def _text(rows: list[Stamped]) -> str:
+    return "".join(f"{stamp} {' '.join(map(repr, pose))}\n" for stamp, pose in rows)

@@ -25,12 +25,13 @@ from factorbus.solver.errors import SolverError
 from factorbus.solver.repair import repair
 
 _FORMATS = ("g2o", "tum", "kitti")
+_IDS = ("auto", "ids", "keys", "counted")
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export.
-    ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
+    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format, robot, strict,
+    ids: of export.  ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
     """
 
     name: str
@@ -38,6 +39,9 @@ class Question:
     batch: bool = False
     timeout_s: float = 60.0
     format: str = "g2o"
+    robot: str | None = None
+    strict: bool = False
+    ids: str = "auto"
     ask: Any = None
 
 
@@ -87,9 +91,21 @@ def parse(name: str, payload: bytes) -> Question:
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
         return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
-    if name == "export" and content.get("format", "g2o") not in _FORMATS:
-        raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {content['format']!r:.40}")
-    return Question(name, format=content.get("format", "g2o"))
+    return _export(content) if name == "export" else Question(name)
+
+
+def _export(content: dict[str, Any]) -> Question:
+    """The question for a file.  Raises UnknownQuestion, BadMessage."""
+    format, ids, robot = content.get("format", "g2o"), content.get("ids", "auto"), content.get("robot")
+    if format not in _FORMATS:
+        raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {format!r:.40}")
+    if ids not in _IDS:
+        raise UnknownQuestion("export", f"ids of {', '.join(_IDS)}, not {ids!r:.40}")
+    if robot is not None and not (isinstance(robot, str) and len(robot) <= 1):
+        raise BadMessage("question.robot", f"is {robot!r:.40}", "one letter, or an empty string")
+    if robot is not None and format == "g2o":
+        raise UnknownQuestion("export", "robot of a trajectory (tum, kitti): g2o has the whole map")
+    return Question("export", format=format, robot=robot, strict=_flag(content, "strict"), ids=ids)
 
 
 def snapshot(
@@ -150,14 +166,9 @@ def answer(question: Question, taken: Snapshot) -> bytes:
         return codec.encode_chi2(Chi2(taken.epoch, taken.revision, taken.chi2))
     if question.name == "graph":
         return codec.encode_graph(taken.graph)
-    return codec.encode_map(
-        {
-            "epoch": taken.epoch,
-            "revision": taken.revision,
-            "format": question.format,
-            "text": _text(question.format, taken.graph.batch),
-        }
-    )
+    text, notes = _text(question, taken.graph.batch)
+    told = {"epoch": taken.epoch, "revision": taken.revision, "format": question.format}
+    return codec.encode_map({**told, "text": text, "notes": notes})
 
 
 def _repaired(taken: Snapshot, ask: AskRepair) -> bytes:
@@ -206,10 +217,14 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     return tuple(chosen)
 
 
-def _text(kind: str, batch: Batch) -> str:
-    from factorbus.formats import g2o_text, kitti_text, tum_text  # only who asks for an export pays for it
+def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
+    """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
+    from factorbus.formats import as_g2o, kitti_text, tum_text  # only who asks for an export pays for it
 
-    return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[kind](batch)
+    if question.format == "g2o":
+        written = as_g2o(batch, question.strict, question.ids)
+        return written.text, list(written.notes)
+    return {"tum": tum_text, "kitti": kitti_text}[question.format](batch, question.robot), []
 
 
 def _flag(content: dict[str, Any], name: str) -> bool:

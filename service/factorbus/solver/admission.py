@@ -15,6 +15,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
 from factorbus.solver.kernels.reach import reach
+from factorbus.solver.triangulation import place_by_bearings
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
 _I64 = np.dtype(np.int64)
@@ -120,6 +121,8 @@ def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
 
 def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
     missing = _find_missing(graph, first, first_factor, reached)
+    if missing >= 0 and place_by_bearings(graph, first, first_factor, reached):
+        missing = _find_missing(graph, first, first_factor, reached)
     if missing >= 0:
         raise errors.Uninitialised(int(graph.keys[missing]))
 

@@ -13,7 +13,7 @@ import math
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, inline_kernel, part
 from factorbus.solver.kernels.se2 import wrap
-from factorbus.solver.kernels.se3 import quat_product, rotation
+from factorbus.solver.kernels.se3 import quat_product, rotation, turn_slope
 from factorbus.solver.kernels.sizes import dim_of, linear_dim, linear_ends, size_of
 
 
@@ -77,6 +77,7 @@ def add_se3(rows: int, x: F64, i: int, p: F64, y: int, h: int, r: F64, J: F64) -
     vx, vy, vz, w = quat_product(-p[y + 3], -p[y + 4], -p[y + 5], p[y + 6], x[i + 3], x[i + 4], x[i + 5], x[i + 6])
     if w < 0.0:
         vx, vy, vz, w = -vx, -vy, -vz, -w
+    w = turn_slope(w)
     for a in range(rows):
         n = h + 6 * a
         r[a] += p[n] * e0 + p[n + 1] * e1 + p[n + 2] * e2 + 2.0 * (p[n + 3] * vx + p[n + 4] * vy + p[n + 5] * vz)

@@ -7,6 +7,8 @@ import math
 
 from factorbus.solver.kernels._jit import F64, inline_kernel
 
+HALF_TURN = 1e-6  # an error quaternion with less than that for w is one of 180°
+
 
 @inline_kernel
 def rotation(q: F64, k: int) -> tuple:
@@ -37,6 +39,16 @@ def quat_product(ax: float, ay: float, az: float, aw: float, bx: float, by: floa
 
 
 @inline_kernel
+def turn_slope(w: float) -> float:
+    """w, that by which half a turn counts along the axis of an error quaternion (v, w); at 180° what to put there.
+
+    At w = 0 the residual v is longest, so its derivative along its axis is 0: a variable that a single factor holds
+    would seem free.  There the slope is that of the chord to v = 0, which is half a turn away: 2/π.  MATH (3.6)
+    """
+    return w if w > HALF_TURN else 0.6366197723675814
+
+
+@inline_kernel
 def prior_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """r = z⁻¹ x: R_zᵀ (t − t_z), vector part of q_z⁻¹ ⊗ q with w ≥ 0.  MATH (3.5)
 
@@ -51,6 +63,7 @@ def prior_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) 
     if w < 0.0:
         vx, vy, vz, w = -vx, -vy, -vz, -w
     r[3], r[4], r[5] = vx, vy, vz
+    w = turn_slope(w)
     A[:, :] = 0.0
     a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
     A[0, 0], A[0, 1], A[0, 2] = z0 * a0 + z3 * a3 + z6 * a6, z0 * a1 + z3 * a4 + z6 * a7, z0 * a2 + z3 * a5 + z6 * a8
@@ -89,7 +102,7 @@ def between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
     A[0, 3], A[0, 4], A[0, 5] = z3 * dz - z6 * dy, z6 * dx - z0 * dz, z0 * dy - z3 * dx
     A[1, 3], A[1, 4], A[1, 5] = z4 * dz - z7 * dy, z7 * dx - z1 * dz, z1 * dy - z4 * dx
     A[2, 3], A[2, 4], A[2, 5] = z5 * dz - z8 * dy, z8 * dx - z2 * dz, z2 * dy - z5 * dx
-    h, hx, hy, hz = 0.5 * w, 0.5 * vx, 0.5 * vy, 0.5 * vz
+    h, hx, hy, hz = 0.5 * turn_slope(w), 0.5 * vx, 0.5 * vy, 0.5 * vz
     A[3, 3], A[3, 4], A[3, 5] = -h * z0 - hz * z1 + hy * z2, -h * z3 - hz * z4 + hy * z5, -h * z6 - hz * z7 + hy * z8
     A[4, 3], A[4, 4], A[4, 5] = hz * z0 - h * z1 - hx * z2, hz * z3 - h * z4 - hx * z5, hz * z6 - h * z7 - hx * z8
     A[5, 3], A[5, 4], A[5, 5] = -hy * z0 + hx * z1 - h * z2, -hy * z3 + hx * z4 - h * z5, -hy * z6 + hx * z7 - h * z8

@@ -1,0 +1,52 @@
+"""What of a file, or of a graph, is left out: counted, said, and refused where nothing may be."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from factorbus.formats.errors import FormatError
+from factorbus.proto.arrays import I64
+
+_SHOWN = 5
+
+
+@dataclass(slots=True)
+class LeftOut:
+    """Collects what is left out of one file.
+
+    counts: by the name of the record, or of the kind.  notes: sentences for people, one for each reason.  strict:
+    refuse instead.  Only what the file says and the graph does not is left out; what becomes something else is a note.
+    """
+
+    file: str
+    strict: bool = False
+    counts: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def leave(self, name: str, lines: I64 | list[int], why: str) -> None:
+        """`name`, which stands on `lines`, is left out.  Raises FormatError when strict."""
+        if not len(lines):
+            return
+        if self.strict:
+            raise FormatError(
+                self.file, int(np.min(lines)), f"{name}, {why}", "nothing that would have to be left out (strict)"
+            )
+        self.counts[name] = self.counts.get(name, 0) + len(lines)
+        self.notes.append(f"{len(lines)} {name} left out: {why}")
+
+    def drop(self, name: str, count: int, why: str) -> None:
+        """The same for what stands on no line.  Raises FormatError when strict."""
+        if count and self.strict:
+            raise FormatError(self.file, None, f"{count} {name}, {why}", "nothing that would be left out (strict)")
+        if count:
+            self.counts[name] = self.counts.get(name, 0) + count
+            self.notes.append(f"{count} {name} left out: {why}")
+
+    def say(self, note: str) -> None:
+        """Nothing is left out, but somebody may want to know."""
+        self.notes.append(note)
+
+
+def shown(names: list[str]) -> str:
+    """The first few."""
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")

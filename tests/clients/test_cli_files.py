@@ -1,0 +1,118 @@
+"""Graph files on the command line: what is left out is said once, in the document too, and options decide."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from factorbus.cli import reading
+from factorbus.cli.exits import BAD_FILE, OK, REFUSED, USAGE
+from factorbus.cli.main import main
+from factorbus.formats import DIALECTS, IDS, read
+from factorbus.proto.symbols import symbol
+
+INFO3 = "1 0 0 1 0 1"
+LOOP = "".join(f"EDGE_SE2 {k} {(k + 1) % 4} 1 0 1.5 {INFO3}\n" for k in range(4))
+MORE = LOOP + "ROBOTLASER1 0 1 2\nROBOTLASER1 1 1 2\nVERTEX_SE2 9 0 0 0\n"
+SLAMPP = "".join(f"EDGE2 {i} {j} 1 0 1.57 45 0 0 45 0 400\n" for i, j in ((0, 1), (1, 2), (0, 2)))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def robots() -> str:
+    """a0 a2 a4 and b1 b3 b5, each in a row, as GTSAM numbers them."""
+    lines = []
+    for letter, first, y in (("a", 0, 0), ("b", 1, 100)):
+        keys = [symbol(letter, first + 2 * k) for k in range(3)]
+        lines += [f"VERTEX_SE2 {key} {k} {y} 0" for k, key in enumerate(keys)]
+        lines += [f"EDGE_SE2 {keys[k]} {keys[k + 1]} 1 0 0 {INFO3}" for k in range(2)]
+    return "\n".join(lines) + "\n"
+
+
+def test_the_options_are_those_of_the_reader_and_the_writer() -> None:
+    assert set(reading.DIALECTS) == set(DIALECTS)
+    assert set(reading.IDS) == set(IDS) - {"apart"}
+
+
+def test_convert_says_what_it_leaves_out(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.g2o").write_text(MORE)
+    assert main(["convert", "a.g2o", "b.g2o", "--json"]) == OK
+    shown = capsys.readouterr()
+    assert "a.g2o: 2 ROBOTLASER1 left out: " in shown.err
+    assert "a.g2o: 1 vertices left out: no edge names x9" in shown.err
+    told = json.loads(shown.out)
+    assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
+    assert told["read"]["notes"] == [line[7:] for line in shown.err.splitlines() if line.startswith("a.g2o: ")]
+    assert (told["files"], told["poses"], told["factors"]) == (["b.g2o"], 5, 4)
+
+
+def test_strict_refuses_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.g2o").write_text(MORE)
+    assert main(["convert", "a.g2o", "b.g2o", "--strict"]) == BAD_FILE
+    assert "a.g2o:5: ROBOTLASER1, no g2o record that is read; wanted nothing that would have" in capsys.readouterr().err
+    (folder / "c.graph").write_text("EDGE2 0 1 1 0 0 1 0 1 1 0 0\nBR 1 5 0.1 2 0.1 0.1\n")
+    assert main(["convert", "c.graph", "b.g2o", "--strict"]) == BAD_FILE
+    assert "1 bearing_range_se2, g2o has no record for such factors" in capsys.readouterr().err
+    assert not (folder / "b.g2o").exists()
+    assert main(["convert", "c.graph", "b.g2o"]) == OK
+    assert "b.g2o: 1 bearing_range_se2 left out: g2o has no record for such factors" in capsys.readouterr().err
+
+
+def test_a_trajectory_for_each_robot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "ab.g2o").write_text(robots())
+    for form in ("tum", "kitti"):
+        assert main(["convert", "ab.g2o", f"out.{form}"]) == OK
+        assert f"out-a.{form}, out-b.{form}: 6 poses" in capsys.readouterr().err
+        assert not (folder / f"out.{form}").exists()
+        assert main(["convert", "ab.g2o", f"b.{form}", "--robot", "b"]) == OK
+        assert (folder / f"b.{form}").read_text() == (folder / f"out-b.{form}").read_text()
+    assert [line.split()[:3] for line in (folder / "out-b.tum").read_text().splitlines()] == [
+        ["1", "0.0", "100.0"],
+        ["3", "1.0", "100.0"],
+        ["5", "2.0", "100.0"],
+    ]
+    capsys.readouterr()
+    assert main(["convert", "ab.g2o", "c.tum", "--robot", "c"]) == REFUSED
+    assert "there are a, b, and none is 'c'" in capsys.readouterr().err
+    assert main(["convert", "ab.g2o", "c.g2o", "--robot", "a"]) == USAGE
+
+
+def test_ids_come_out_as_they_went_in_unless_asked(folder: Path) -> None:
+    (folder / "ab.g2o").write_text(robots())
+    assert main(["convert", "ab.g2o", "c.g2o"]) == OK
+    assert sorted((folder / "c.g2o").read_text().splitlines()) == sorted((folder / "ab.g2o").read_text().splitlines())
+    assert main(["convert", "ab.g2o", "d.g2o", "--ids", "counted"]) == OK
+    assert "EDGE_SE2 3 4 1 0 0" in (folder / "d.g2o").read_text()
+
+
+def test_the_dialect_can_be_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.txt").write_text(SLAMPP)
+    assert main(["convert", "a.txt", "b.g2o"]) == OK
+    assert "a.txt: read as isam text" in capsys.readouterr().err
+    assert main(["convert", "a.txt", "c.g2o", "--dialect", "slam++"]) == OK
+    assert "read as" not in capsys.readouterr().err
+    one, other = (read(folder / name).batch.factors[0].information for name in ("b.g2o", "c.g2o"))
+    assert (one[0, 0], other[0, 0]) == (45.0**2, 45.0)
+
+
+def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.g2o").write_text(MORE)
+    asked = ["replay", "a.g2o", "--in-process", "--json", "--mode", "inc-l", "--tum", "t.tum", "--out", "o.g2o"]
+    assert main(asked) == OK
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
+    assert "a.g2o: 2 ROBOTLASER1 left out" in shown.err
+    assert (told["written"], told["poses"]) == (["o.g2o", "t.tum"], 4)
+    assert main([*asked, "--strict"]) == BAD_FILE
+    assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {"file": "a.g2o", "line": 5}
+    (folder / "a.txt").write_text(SLAMPP)
+    chi2 = []
+    for more in ([], ["--dialect", "slam++"]):
+        assert main(["replay", "a.txt", "--in-process", "--json", "--mode", "inc-l", *more]) == OK
+        chi2.append(json.loads(capsys.readouterr().out)["chi2"])
+    assert chi2[0] > 40 * chi2[1]
