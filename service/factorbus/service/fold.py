@@ -4,6 +4,8 @@
     2  one step for all of them
     3  if the step fails, nobody knows yet whose fault it is: the solver has taken all of them back, and they are
        tried again one at a time, so that only the guilty are refused
+    4  a step that left anything that is not finite, or beyond its bounds, has failed as well (`divergence`); it is
+       undone in another solver, which is a step of its own
 
 An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
 the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
@@ -30,7 +32,8 @@ from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Ou
 from factorbus.service.holding import Broken, Holding
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
-from factorbus.solver.errors import SolverError
+from factorbus.solver.divergence import check_step, is_sound
+from factorbus.solver.errors import Diverged, SolverError
 
 # The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
 _ALONE_BYTES = 48 << 10
@@ -124,6 +127,7 @@ class Folder(Holding):
             solver, first_factor, report, counted = self._solver.with_changes(
                 content.changes, content.batch, content.settle
             )
+            check_step(solver, report)
         except (Problem, SolverError) as problem:
             yield Judged((Outcome(insert, problem),))
             return
@@ -161,6 +165,8 @@ class Folder(Holding):
             return self.fold((insert,))
         try:
             changed, graph = solver.pick_changed()
+            if not is_sound(changed, graph, report):
+                return self._diverged_alone(insert, report)
             account = report.as_dict()
             account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
             answer, delta = write_messages(
@@ -181,6 +187,22 @@ class Folder(Holding):
             insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
             report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(),
         )  # fmt: skip
+
+    def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:
+        """The step of one insert left what cannot be kept: it is refused."""
+        cpu_s = time.thread_time()
+        problem = self._find_diverged(report)
+        yield Judged((Outcome(insert, problem or Internal("a step that was sound")),))
+        yield from self._go_back(report)
+        yield self._folded(cpu_s)
+
+    def _find_diverged(self, report: Any) -> Diverged | None:
+        """What the last step left beyond its bounds."""
+        try:
+            check_step(self._solver, report)
+        except Diverged as diverged:
+            return diverged
+        return None
 
     def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Judged | Stepped | Folded]:
         """The rest of `fold`, after the step."""
@@ -221,8 +243,15 @@ class Folder(Holding):
                 raise _TakenBack from None
             report = None
             outcomes = [Outcome(inserts[0], Internal(reference))]
+        diverged = None if report is None else self._find_diverged(report)
         if report is None:
             yield Judged(tuple(outcomes))
+        elif diverged is not None:
+            if len(staged) == 1:
+                yield Judged((*outcomes, Outcome(staged[0].insert, diverged)))
+            yield from self._go_back(report)
+            if len(staged) > 1:
+                raise _TakenBack
         else:
             yield from self._stepped(staged, outcomes, report, started)
             if below := max((s.points_below for s in staged), default=0.0):
@@ -304,6 +333,7 @@ class Folder(Holding):
             return
         try:
             solver, report = self._solver.with_points(keys)
+            check_step(solver, report)
         except SolverError as problem:
             log.warning("%d features stay features: as points %s", keys.size, problem)
             return

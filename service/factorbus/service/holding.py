@@ -21,6 +21,7 @@ from factorbus.service.config import Limits
 from factorbus.service.events import Stepped
 from factorbus.service.questions import Copied, Question, Snapshot, snapshot
 from factorbus.service.uncertain import Uncertain
+from factorbus.solver.divergence import check_step, undone
 
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
 # each up to twice what the solver has in use, as arrays double when they grow (measured: 1.7 times for 10,000 poses).
@@ -119,7 +120,9 @@ class Holding:
         Takes as long as all of the map takes to eliminate, on any thread.  Raises SolverError.
         """
         made = type(self)(self._make, self._epoch, self._limits, self._options)
-        made._account = made._solver.order_anew(content["graph"]).as_dict()
+        report = made._solver.order_anew(content["graph"])
+        check_step(made._solver, report)
+        made._account = report.as_dict()
         made._revision, made._held = int(content["revision"]), tuple(content["held"])
         return made
 
@@ -186,6 +189,28 @@ class Holding:
         except Exception:
             self._broken = reference
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
+
+    def _go_back(self, report: Any) -> Iterator[Stepped]:
+        """The last step, which gave `report`, does not count: what was there before it, in a new solver.
+
+        That is a step of its own, whose delta has everything; the revision of the one that does not count was not used.
+        """
+        started = time.perf_counter()
+        try:
+            solver, own = undone(self._solver, report, *self._held)
+        except Exception:
+            self._broken = secrets.token_hex(4)
+            log.exception("fault %s: a step could not be undone; the map is broken", self._broken)
+            return
+        self._solver = solver
+        if not any(self._held):
+            return
+        account = own.as_dict() | {
+            "strategy": "full", "because": "a step that diverged was undone", "new_variables": 0, "new_factors": 0,
+            "solver_ms": (time.perf_counter() - started) * 1e3,
+        }  # fmt: skip
+        self._next(account)
+        yield self._told(account)
 
     def _rebuild(self) -> dict[str, Any] | None:
         """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""

@@ -34,7 +34,7 @@ _new = tuple.__new__
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
-    NOT_KEPT = ("_graph", "_options")
+    NOT_KEPT = ("_graph", "_options", "before_batch")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
@@ -42,6 +42,7 @@ class TreeSteps:
         self._mark = graph.mark()
         self._first_new, self._batched = 0, False
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
+        self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
     @property
     def tree(self) -> Tree:
@@ -135,7 +136,7 @@ class TreeSteps:
 
         before: the values as they were before the step
         """
-        options = self._options
+        options, self.before_batch = self._options, before
         system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
