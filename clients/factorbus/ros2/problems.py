@@ -19,7 +19,7 @@ class Unusable(Problem):
 
     def __init__(self, topic: str, fault: Exception) -> None:
         super().__init__(
-            f"{topic}: the bridge failed on a message ({type(fault).__name__}: {fault}); it is not used, and the others "
+            f"{topic}: the bridge failed on a message ({type(fault).__name__}: {fault}); it is not used, others "
             "are. Report this, with the log",
             topic=topic,
         )

@@ -76,7 +76,7 @@ class Track:
         return self._keyframes[-1] if self._keyframes else None
 
     def add(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, twist: F64, unknown: F64) -> Sample:
-        """An odometry that is later than the last.  twist (6, 6): covariance of its velocities; unknown: as in Sample."""
+        """An odometry later than the last.  twist (6, 6): covariance of its velocities; unknown: as in Sample."""
         last = self.latest
         way = np.zeros((6, 6))
         if last is not None:

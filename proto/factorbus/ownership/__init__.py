@@ -3,6 +3,6 @@
 Standard library alone, so that everything may import it.
 """
 
-from factorbus.ownership.folders import UnsafeFolder, check_file, check_folder, make_private, why_unsafe
+from factorbus.ownership.folders import UnsafeFolder, check_file, check_folder, make_private, private_file, why_unsafe
 
-__all__ = ["UnsafeFolder", "check_file", "check_folder", "make_private", "why_unsafe"]
+__all__ = ["UnsafeFolder", "check_file", "check_folder", "make_private", "private_file", "why_unsafe"]

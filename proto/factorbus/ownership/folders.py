@@ -8,6 +8,9 @@ A folder is safe if
 - no folder above it lets others put another one in its place: each belongs to this user or root, and is not writable
   by others, unless it is sticky (as /tmp is) or a mount point (a volume of a container).
 
+On a file system that is mounted read-only nobody can write, so everything there is safe: keys and settings come to a
+container so.
+
 A file is safe if its owner is this user or root, and nobody else can write to it.  Where the system does not tell
 users apart (Windows) everything is safe.
 """
@@ -17,7 +20,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-_PRIVATE_FOLDER = 0o700
+_PRIVATE_FOLDER, _PRIVATE_FILE = 0o700, 0o600
 _ROOT = 0
 
 
@@ -51,8 +54,13 @@ def make_private(what: str, path: Path) -> None:
     check_folder(what, path)
 
 
+def private_file(path: str, flags: int) -> int:
+    """An `opener` for `open`: a file that is made is for this user alone."""
+    return os.open(path, flags, _PRIVATE_FILE)
+
+
 def check_file(what: str, path: Path, status: os.stat_result) -> None:
-    """Raises UnsafeFolder if somebody else may have written the file `path`, whose `status` is that of its descriptor."""
+    """Raises UnsafeFolder if somebody else may have written the file `path`; `status`: of its open descriptor."""
     reason, mend = _why_unsafe_itself(path, status, groups=set())
     if reason:
         raise UnsafeFolder(what, path, reason, mend)
@@ -63,6 +71,8 @@ def why_unsafe(path: Path) -> tuple[str, str]:
     if not hasattr(os, "geteuid"):
         return "", ""
     path = path.resolve()
+    if _is_read_only(path):
+        return "", ""
     found = _why_unsafe_itself(path, path.stat(), _groups())
     for above in path.parents:
         if found[0]:
@@ -93,6 +103,10 @@ def _why_unsafe_above(path: Path, above: Path, status: os.stat_result) -> tuple[
     if writable and not os.path.ismount(above):
         return f"it is in {above}, which everybody can write to", f"chmod o-w {above}, or name a folder elsewhere"
     return "", ""
+
+
+def _is_read_only(path: Path) -> bool:
+    return bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
 def _groups() -> set[int]:

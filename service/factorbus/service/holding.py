@@ -21,7 +21,7 @@ from factorbus.service.config import Limits
 from factorbus.service.events import Stepped
 from factorbus.service.questions import Copied, Question, Snapshot, snapshot
 from factorbus.service.uncertain import Uncertain
-from factorbus.solver.divergence import check_step, undone
+from factorbus.solver.divergence import check_step, is_usual, undone
 
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
 # each up to twice what the solver has in use, as arrays double when they grow (measured: 1.7 times for 10,000 poses).
@@ -56,6 +56,7 @@ class Holding:
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._held = (0, 0)  # variables and factors that were accepted
         self._broken = ""
+        self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
@@ -101,10 +102,11 @@ class Holding:
 
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
-        self._solver, self._revision, self._broken = self._make(), 0, ""
+        self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
         self._held = 0, 0
         if state is not None:
             self._solver.load(state["solver"])
+            self._wary = not is_usual(self._solver)
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 

@@ -145,8 +145,8 @@ class OutOfBounds(SolverError):
     def __init__(self, where: str, seen: float, least: float, most: float) -> None:
         wanted = f"at most {most:g} in magnitude" if least <= 0.0 else f"{least:g} to {most:g}"
         super().__init__(
-            f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; choose "
-            "units and an origin near the data, or a larger sigma",
+            f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; "
+            "choose units and an origin near the data, or a larger sigma",
             where=where,
             seen=seen,
             least=least,

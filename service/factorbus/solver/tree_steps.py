@@ -49,6 +49,11 @@ class TreeSteps:
         """For tests."""
         return self._tree
 
+    @property
+    def mark(self) -> Mark:
+        """How much of the graph there was after the last step."""
+        return self._mark
+
     def step(self, settle: bool) -> StepReport:
         """As `Solver.step`."""
         clock = self._options.clock

@@ -22,7 +22,7 @@ Python counts other negative ones from the end; a kernel does not look for them,
 With every index checked they are errors.
 
 FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).  What is in them is run as code, so it
-is used only if nobody but this user and root can write there, to a folder or a file; what is made is for this user alone.
+is used only if nobody but this user and root can write there, to a folder or a file; what is made is for them alone.
 NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
 """
 

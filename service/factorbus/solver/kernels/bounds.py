@@ -5,8 +5,8 @@ docs/decisions/0001-number-bounds.md says why these.
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel
-from factorbus.solver.kernels.places import floats, int_rows
-from factorbus.solver.kernels.sizes import size_of
+from factorbus.solver.kernels.places import floats, int_rows, ints
+from factorbus.solver.kernels.sizes import information_at, residual_dim, size_of
 
 # Of every number of a value or a measurement: metres, radians, pixels, 1/metre.
 MOST_NUMBER = 1e12
@@ -14,6 +14,8 @@ MOST_NUMBER = 1e12
 MOST_INFORMATION, LEAST_INFORMATION = 1e24, 1e-24
 # Of the scale of a loss, in standard deviations; it is at most MOST_NUMBER.
 LEAST_SCALE = 1e-12
+# Beyond these, though admitted, a number may lead out of bounds in a step.
+USUAL_NUMBER, LEAST_USUAL_INFORMATION, MOST_USUAL_INFORMATION = 1e8, 1e-10, 1e16
 # Of H and b of a linear factor: rows of R, which have √Ω and a lever arm in them.
 MOST_LINEAR = 1e24
 
@@ -51,3 +53,24 @@ def find_escaped(picked: I64, graph: I64) -> int:
         if not are_within(MOST_NUMBER, var[v, at.V_AT], size_of(var[v, at.V_KIND]), values):
             return v
     return -1
+
+
+@kernel("boolean(int64, int64, int64[::1])")
+def are_usual(v0: int, f0: int, graph: I64) -> bool:
+    """Whether the values of the variables from v0 on, and the numbers of the factors from f0 on, are of usual sizes."""
+    var, values, fac = int_rows(graph, at.T_VAR), floats(graph, at.T_VALUES), int_rows(graph, at.T_FAC)
+    payload, counts = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS)
+    for v in range(v0, counts[at.VARIABLES]):
+        if not are_within(USUAL_NUMBER, var[v, at.V_AT], size_of(var[v, at.V_KIND]), values):
+            return False
+    for f in range(f0, counts[at.FACTORS]):
+        kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
+        size, dim = information_at(kind), residual_dim(kind)
+        if not are_within(USUAL_NUMBER, p, size, payload):
+            return False
+        p += size
+        for a in range(dim):
+            if not (abs(payload[p]) >= LEAST_USUAL_INFORMATION and abs(payload[p]) <= MOST_USUAL_INFORMATION):
+                return False
+            p += dim - a
+    return True
