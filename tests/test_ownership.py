@@ -1,4 +1,4 @@
-"""What others can write to is not trusted: the kernel cache, which is code, and journals; and what is made is private."""
+"""What others can write to is not trusted: the kernel cache, which is code, and journals.  What is made is private."""
 
 import os
 import shutil

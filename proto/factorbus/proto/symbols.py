@@ -7,6 +7,7 @@ from factorbus.proto.problems import BadSymbol
 
 _INDEX_BITS = 56
 MAX_INDEX = (1 << _INDEX_BITS) - 1
+_MOST_SHOWN = 80
 
 
 def symbol(letter: str, index: int) -> int:
@@ -22,8 +23,10 @@ def parse_symbol(text: str) -> int:
     """The key that prints as `text`: "x12", "l3", or "7" for a key without a letter.  Raises BadSymbol."""
     letter, digits = (text[:1], text[1:]) if text[:1].isalpha() else ("", text)
     if not (digits.isascii() and digits.isdigit()):
-        raise BadSymbol(text, "a letter and a number, such as x12, or a number")
-    return symbol(letter, int(digits))
+        raise BadSymbol(text[:_MOST_SHOWN], "a letter and a number, such as x12, or a number")
+    if len(digits.lstrip("0")) > len(str(MAX_INDEX)):  # Python itself refuses to read very long numbers
+        raise BadSymbol(text[:_MOST_SHOWN], f"an index from 0 to {MAX_INDEX}")
+    return symbol(letter, int(digits.lstrip("0") or "0"))
 
 
 def format_symbol(key: int) -> str:
