@@ -64,7 +64,7 @@ def request(numbers: random.Random, port: int) -> bytes:
         head += numbers.choice(HEADERS).replace("{port}", str(port)) + "\r\n"
     if numbers.random() < 0.3:
         head += UPGRADE.format(key=numbers.choice((KEY, "", "short", KEY * 3)))
-    data = (head + "\r\n").encode(numbers.choice(("utf-8", "latin-1")))
+    data = (head + "\r\n").encode(numbers.choice(("utf-8", "latin-1")), "replace")
     if numbers.random() < 0.1:
         data = bytearray(data)
         data[numbers.randrange(len(data))] = numbers.randrange(256)

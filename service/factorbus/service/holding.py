@@ -50,7 +50,7 @@ class Holding:
     ) -> None:
         self._options = dict(options or {})
         self._make, self._epoch, self._limits = make_solver, epoch, limits
-        self._solver = make_solver()
+        self._solver: Any = make_solver()
         self._revision = 0
         self._account: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
