@@ -185,3 +185,16 @@ def test_the_reported_case_is_refused_by_name() -> None:
     )
     assert tried.insert(batch) == "out_of_bounds"
     assert tried.folder.size == (1, 0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_run_again_from_a_journal_it_comes_to_the_same_bits(mode: str) -> None:
+    tried, again = start(mode), start(mode)
+    arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0), far(1e9), near(2.0))]
+    for one in arrived:
+        events, _ = tried.folder.fold_whole([one])
+        assert not any(event.rebuilt for event in events if isinstance(event, Stepped)), "no fault of the solver"
+        list(again.folder.fold_again([one], rebuilt=False))
+        assert (tried.folder.revision, tried.folder.size) == (again.folder.revision, again.folder.size)
+        assert tried.estimate() == again.estimate()
+    assert tried.folder.size == (1, 4)
