@@ -20,7 +20,7 @@ from factorbus.proto.symbols import MAX_INDEX, parse_symbol
 
 pytest.importorskip("starlette")
 
-REQUESTS, PATIENCE_S = 800, 2.0
+REQUESTS, PATIENCE_S = 600, 2.0
 # What the gateway may answer with: done, wrong, not there, not that way, refused, too long, away.
 DOCUMENTED = {200, 304, 400, 404, 405, 409, 414, 431, 503}
 UPGRADE = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\n"

@@ -61,7 +61,7 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         f"{one}/export": _export,
         f"{one}/variables/{{key}}": _variable,
     }
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/", lambda _: FileResponse(_PAGE / "index.html")),
             *(Route(path, partial(answer, maps)) for path, answer in answers.items()),
@@ -72,6 +72,8 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
         exception_handlers={Problem: _problem},
     )
+    app.router.redirect_slashes = False  # an address that the table above does not have is not there
+    return app
 
 
 async def _list(maps: Maps, _: Request) -> Response:
