@@ -142,7 +142,7 @@ async def _variable(maps: Maps, request: Request) -> Response:
 
 async def _live(maps: Maps, socket: WebSocket) -> None:
     """Only for pages of ours: a browser says where its page is from."""
-    with contextlib.suppress(WebSocketDisconnect):
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # the latter: it was closed before for what it sent
         await socket.accept()
         if not _is_ours(socket.headers.get("origin"), socket.headers.get("host")):
             await socket.close(_FOREIGN, "this page is not from here")
