@@ -58,6 +58,8 @@ def request(numbers: random.Random, port: int) -> bytes:
     if numbers.random() < 0.7:
         path = f"/api/maps/{numbers.choice(PIECES)}/{numbers.choice(PIECES)}"
         path += f"/{numbers.choice(PIECES)}" if numbers.random() < 0.4 else ""
+    if numbers.random() < 0.3:
+        path = "/api/maps/fuzzed/" + numbers.choice(("estimate", "graph", "stats", "closures", "ellipses", "export"))
     head = f"{numbers.choice(METHODS)} {path}{numbers.choice(QUERIES)} HTTP/1.1\r\n"
     if numbers.random() < 0.8:
         head += f"Host: 127.0.0.1:{port}\r\n"
@@ -123,8 +125,8 @@ def test_fuzzed_requests_get_documented_answers_and_leave_no_traceback(
     record_property("answers", {str(status): count for status, count in seen.items()})
     log = process.errors()
     assert "Traceback" not in log, log[log.index("Traceback") - 500 :][:4000]
-    assert seen[200] > 50
-    assert seen[404] > 50
+    assert seen[200] > 10
+    assert seen[404] > 10
 
 
 @pytest.mark.parametrize("text", ["9" * 5000, "x" + "9" * 5000, str(MAX_INDEX + 1), "x" + "9" * 18])
