@@ -115,7 +115,7 @@ def test_what_cannot_be_a_covariance_is_refused(bad: list[float]) -> None:
     elsewhere = np.zeros(36)
     elsewhere[14] = bad[0]  # z, which does not count in the plane
     if len(bad) == 1:
-        assert not checked("/odom", elsewhere, (0, 1, 5)).any()
+        assert not checked("/odom", elsewhere, (0, 1, 5)).whole.any()
 
 
 def test_the_first_odometry_begins_the_map_and_the_next_makes_keyframes() -> None:

@@ -202,6 +202,21 @@ def test_a_folder_that_cannot_be_written_is_said_and_replaced(kernels, tmp_path)
     assert run(kernels, FACTORBUS_CACHE=str(tmp_path / "file")).stdout.split()[1] == "True"
 
 
+def test_a_kernel_that_somebody_else_may_have_written_is_not_run(kernels, tmp_path):
+    assert results(kernels)[1]
+    files = [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".nbi", ".nbc"}
+    assert not any(path.stat().st_mode & 0o077 for path in [tmp_path / "cache", *(tmp_path / "cache").rglob("*")])
+    for suffix in (".nbi", ".nbc"):
+        (file,) = [path for path in files if path.suffix == suffix and "four_times" in path.name]
+        file.chmod(0o666)
+        done = run(kernels)
+        assert done.returncode == 1
+        assert f"UnsafeFolder: the compiled kernel {file} is not used: everybody can write to it" in done.stderr
+        file.chmod(0o600)
+    assert results(kernels)[:2] == (4.0, False)
+
+
 def test_old_folders_go_and_the_newest_stay(kernels, tmp_path):
     base = tmp_path / "cache" / "kernels"
     for age in range(10):

@@ -45,6 +45,12 @@ def sight(z: float = 5.0, model: float = 1.0) -> Batch:
     )
 
 
+def sight_with(k2: float) -> Batch:
+    batch = sight()
+    batch.factors[0].measured[0, 9] = k2
+    return batch
+
+
 # What every map of these tests holds: pose 0 (fixed), pose 1, landmark 100, and a pose in space 200.
 REFUSED = {
     "unknown variable kind": ("unknown_kind", Batch((Variables("se4", np.array([2])),))),
@@ -64,7 +70,20 @@ REFUSED = {
     "infinite value": ("not_finite", Batch((poses(2, values=np.array([[np.inf, 0, 0]])),))),
     "NaN measurement": ("not_finite", Batch((), (edge(0, 1, (np.nan, 0, 0)),))),
     "NaN information": ("not_finite", Batch((), (edge(0, 1, info=nan_info()),))),
-    "χ² beyond numbers is found in the step": ("not_finite", Batch((), (edge(0, 1, (1e200, 0, 0)),))),
+    "value that squares to more than numbers": ("out_of_bounds", Batch((poses(2, values=np.array([[0, 1e200, 0]])),))),
+    "value just beyond its bound": ("out_of_bounds", Batch((poses(2, values=np.array([[0, 0, -1.001e12]])),))),
+    "measurement beyond its bound": ("out_of_bounds", Batch((), (edge(0, 1, (1e13, 0, 0)),))),
+    "values composed to beyond their bound": (
+        "out_of_bounds", Batch((poses(2)._replace(values=None), poses(3)._replace(values=None)),
+                               (edge(0, 2, (9e11, 0, 0)), edge(2, 3, (9e11, 0, 0)))),
+    ),
+    "information beyond its bound": ("out_of_bounds", Batch((), (edge(0, 1, info=1e25 * I3),))),
+    "information below its bound": ("out_of_bounds", Batch((), (edge(0, 1, info=1e-25 * I3),))),
+    "H of a linear factor beyond its bound": (
+        "out_of_bounds",
+        Batch((), (Factors("linear_point2", np.array([[100]]), np.array([[0, 0, 1, 0, 0, 1e25, 0, 0]]), I2),)),
+    ),
+    "lens beyond its bound": ("out_of_bounds", sight_with(k2=1e300)),
     "indefinite information": ("not_positive_definite", Batch((), (edge(0, 1, info=I3 + np.eye(6)[1:2] * 2),))),
     "singular information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.ones((1, 6))),))),
     "zero information": ("not_positive_definite", Batch((), (edge(0, 1, info=np.zeros((1, 6))),))),
@@ -84,6 +103,9 @@ REFUSED = {
     "point behind the camera": ("bad_sight", sight(z=-5.0)),
     "lens of no model": ("bad_lens", sight(model=9.0)),
     "loss of no kind": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="welsch", scale=np.ones(1)),))),
+    "loss with a scale beyond its bound": (
+        "bad_loss", Batch((), (edge(0, 1)._replace(loss="dcs", scale=np.full(1, 1e13)),)),
+    ),
     "loss with a scale of zero": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="huber", scale=np.zeros(1)),))),
     "variable without value that nothing reaches": (
         "uninitialised", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
@@ -193,7 +215,7 @@ def test_bad_batches_are_refused_whole(name: str, mode: str) -> None:
 
 def test_every_code_is_in_the_table() -> None:
     codes = {error.code for error in errors.SolverError.__subclasses__()}
-    elsewhere = {"unknown_mode", "bad_option", "no_backend", "unknown_factor"}
+    elsewhere = {"unknown_mode", "bad_option", "no_backend", "unknown_factor", "diverged"}
     elsewhere |= {"in_use", "bad_weight", "too_connected", "bad_order", "bad_direction"}  # changes, other kinds
     assert codes - elsewhere == {code for code, _ in REFUSED.values()}
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from factorbus.cli.exits import EXTRAS, Stopped, lacking
 from factorbus.cli.options import USUAL_ENDPOINT
 from factorbus.cli.version import LIBRARIES, installed
+from factorbus.ownership import UnsafeFolder, check_folder, make_private
 from factorbus.proto.problems import Problem
 from factorbus.proto.version import __version__
 
@@ -72,8 +73,12 @@ def cache() -> Finding:
     """the cache of compiled kernels"""
     folder = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_private("the cache of compiled kernels", folder)
+        for inside in (path for path in folder.glob("*/*") if path.is_dir()):
+            check_folder("the cache of compiled kernels", inside)
         tempfile.TemporaryFile(dir=folder).close()
+    except UnsafeFolder as unsafe:
+        return Finding("kernel cache", "fail", unsafe.message, "compiled kernels are code: who can write there runs it")
     except OSError as error:
         mend = "make it writable, or set FACTORBUS_CACHE to a folder that is; until then every start compiles"
         return Finding("kernel cache", "fail", f"{folder}: {error.strerror}", mend)

@@ -11,6 +11,7 @@
 """
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -22,14 +23,14 @@ from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from factorbus.client import Bus, Problem
 from factorbus.client.questions import logged
-from factorbus.gateway.documents import estimate, groups
+from factorbus.gateway.documents import Document, estimate, groups
 from factorbus.gateway.explain import explain
 from factorbus.gateway.live import follow
 from factorbus.gateway.maps import Maps
@@ -44,6 +45,7 @@ _STATUS = {
 }  # fmt: skip
 # Codes of a WebSocket that is closed, from the range that is the application's.
 _FOREIGN, _PROBLEM = 4403, 4404
+_MOST_REASON = 120  # bytes of it, of 123 that a WebSocket has room for
 
 
 def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Starlette:
@@ -60,7 +62,7 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         f"{one}/export": _export,
         f"{one}/variables/{{key}}": _variable,
     }
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/", lambda _: FileResponse(_PAGE / "index.html")),
             *(Route(path, partial(answer, maps)) for path, answer in answers.items()),
@@ -71,16 +73,18 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts))],
         exception_handlers={Problem: _problem},
     )
+    app.router.redirect_slashes = False  # an address that the table above does not have is not there
+    return app
 
 
 async def _list(maps: Maps, _: Request) -> Response:
     rows = await asyncio.to_thread(maps.bus.maps)
-    return JSONResponse({"maps": [asdict(row) | {"epoch": str(row.epoch)} for row in rows]})
+    return Document({"maps": [asdict(row) | {"epoch": str(row.epoch)} for row in rows]})
 
 
 async def _estimate(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
-        return JSONResponse(estimate(joined.map.estimate.snapshot()))
+        return Document(estimate(joined.map.estimate.snapshot()))
 
 
 async def _graph(maps: Maps, request: Request) -> Response:
@@ -96,7 +100,7 @@ async def _graph(maps: Maps, request: Request) -> Response:
         for group in graph.batch.factors
     ]
     at = {"epoch": str(graph.epoch), "revision": graph.revision}
-    return JSONResponse(at | {"variables": groups(graph.batch.variables), "factors": factors})
+    return Document(at | {"variables": groups(graph.batch.variables), "factors": factors})
 
 
 async def _closures(maps: Maps, request: Request) -> Response:
@@ -104,7 +108,7 @@ async def _closures(maps: Maps, request: Request) -> Response:
         graph = await maps.graph(joined)
     found = await asyncio.to_thread(closures_of, graph.batch.variables, graph.batch.factors)
     keys = [[format_symbol(key) for key in pair] for pair in found.keys.tolist()]
-    return JSONResponse({"revision": graph.revision, "keys": keys, "misfit": found.misfit.tolist()})
+    return Document({"revision": graph.revision, "keys": keys, "misfit": found.misfit.tolist()})
 
 
 async def _ellipses(maps: Maps, request: Request) -> Response:
@@ -113,13 +117,13 @@ async def _ellipses(maps: Maps, request: Request) -> Response:
         revision, spread = await maps.spread(joined)
     keys = [format_symbol(key) for key in spread.keys.tolist()]
     upper = spread.covariances.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-    return JSONResponse({"revision": revision, "keys": keys, "covariances": upper.tolist()})
+    return Document({"revision": revision, "keys": keys, "covariances": upper.tolist()})
 
 
 async def _stats(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         stats = await asyncio.wrap_future(joined.map.ask.stats(None))
-    return JSONResponse(stats | {"epoch": str(stats["epoch"])})
+    return Document(stats | {"epoch": str(stats["epoch"])})
 
 
 async def _export(maps: Maps, request: Request) -> Response:
@@ -135,26 +139,35 @@ async def _variable(maps: Maps, request: Request) -> Response:
     key = parse_symbol(request.path_params["key"])
     async with maps.using(request.path_params["name"]) as joined:
         why = await asyncio.wrap_future(joined.map.doubt.ask.why(AskWhy(key), None))
-    return JSONResponse(explain(why))
+    return Document(explain(why))
 
 
 async def _live(maps: Maps, socket: WebSocket) -> None:
     """Only for pages of ours: a browser says where its page is from."""
-    origin = socket.headers.get("origin")
-    await socket.accept()
-    if origin is not None and urlsplit(origin).netloc != socket.headers.get("host"):
-        await socket.close(_FOREIGN, "this page is not from here")
-        return
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # the latter: it was closed before for what it sent
+        await socket.accept()
+        if not _is_ours(socket.headers.get("origin"), socket.headers.get("host")):
+            await socket.close(_FOREIGN, "this page is not from here")
+            return
+        try:
+            async with maps.using(socket.path_params["name"]) as joined:
+                await follow(socket, joined.map.estimate)
+        except Problem as problem:
+            reason = problem.message.encode()[:_MOST_REASON].decode(errors="ignore")
+            await socket.close(_PROBLEM, reason)
+
+
+def _is_ours(origin: str | None, host: str | None) -> bool:
+    """Whether a page from `origin`, if it is one, was fetched from here."""
     try:
-        async with maps.using(socket.path_params["name"]) as joined:
-            await follow(socket, joined.map.estimate)
-    except Problem as problem:
-        await socket.close(_PROBLEM, problem.message[:120])
+        return origin is None or urlsplit(origin).netloc == host
+    except ValueError:  # it is no address at all
+        return False
 
 
 async def _problem(_: Request, problem: Exception) -> Response:
     code, message = getattr(problem, "code", "internal"), getattr(problem, "message", str(problem))
     detail: Any = getattr(problem, "detail", {})
-    return JSONResponse(
+    return Document(
         {"problem": {"code": code, "message": message, "detail": detail}}, status_code=_STATUS.get(code, 409)
     )

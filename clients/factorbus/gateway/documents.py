@@ -4,9 +4,31 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from starlette.responses import JSONResponse
+
 from factorbus.client import Snapshot
 from factorbus.proto.messages import Variables
 from factorbus.proto.symbols import format_symbol
+
+
+class Document(JSONResponse):
+    """An answer as JSON, which has no word for what is not a finite number: null."""
+
+    def render(self, content: Any) -> bytes:
+        try:
+            return super().render(content)
+        except ValueError:
+            return super().render(_finite(content))
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, dict):
+        return {str(name): _finite(value) for name, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_finite(value) for value in content]
+    return content
 
 
 def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:

@@ -49,7 +49,7 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
         "kind": factor["kind"],
         "keys": [format_symbol(key) for key in factor["keys"]],
         "chi2": factor["chi2"],
-        "misfit": math.sqrt(factor["chi2"] / factor["dims"]),
+        "misfit": math.sqrt(max(factor["chi2"], 0.0) / factor["dims"]),  # pieces of one factor may have less than 0
         "known": factor["influence"] / factor["dims"],
         "without": factor["without"],
     }

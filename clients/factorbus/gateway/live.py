@@ -30,7 +30,7 @@ async def follow(socket: WebSocket, mirror: Mirror) -> None:
     leaving = asyncio.ensure_future(_leaves(socket))
     try:
         snapshot = mirror.snapshot()
-        await socket.send_json({"type": "estimate", **estimate(snapshot)})
+        await _send(socket, {"type": "estimate", **estimate(snapshot)})
         at = (snapshot.epoch, snapshot.revision)
         while not leaving.done():
             waiting = asyncio.ensure_future(news.wait())
@@ -40,13 +40,21 @@ async def follow(socket: WebSocket, mirror: Mirror) -> None:
             deltas = [d for d in iter(stream.try_take, None) if d.epoch != at[0] or d.revision > at[1]]
             if deltas:
                 at = (deltas[-1].epoch, deltas[-1].revision)
-                await socket.send_json(_together(deltas))
+                await _send(socket, _together(deltas))
                 await asyncio.sleep(_LEAST_PAUSE_S)
     except WebSocketDisconnect:
         pass
     finally:
         leaving.cancel()
         stream.close()
+
+
+async def _send(socket: WebSocket, document: dict[str, Any]) -> None:
+    """Raises WebSocketDisconnect when the browser has left, or was closed for what it sent: the server says that so."""
+    try:
+        await socket.send_json(document)
+    except RuntimeError as closed:
+        raise WebSocketDisconnect(1006) from closed
 
 
 async def _leaves(socket: WebSocket) -> None:

@@ -14,10 +14,10 @@ from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display
 from factorbus.ros2.front_end import FrontEnd
-from factorbus.ros2.messages import DETECTIONS, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
+from factorbus.ros2.messages import DETECTIONS, LATEST_S, MARKERS, ODOMETRY, PATH, POSE, TRANSFORMS, Messages
 from factorbus.ros2.names import Topic
 from factorbus.ros2.node import Node
-from factorbus.ros2.problems import BadRosMessage
+from factorbus.ros2.problems import BadRosMessage, Unusable
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 
@@ -40,6 +40,8 @@ class Bridge:
         self._out: deque[Ticket] = deque()
         self._tolerance_ns = int(1e9 * settings.tolerance_s)
         self.counts: Counter[str] = Counter()
+        self._told: Counter[tuple[str, str]] = Counter()
+        self._remarked: set[tuple[str, str]] = set()
         self._front_end = FrontEnd(settings, *self._place_in_map())
         self._transforms = node.publisher(self._topic(settings.transforms, TRANSFORMS, 100))
         self._path = node.publisher(self._topic(settings.path, PATH, 1))
@@ -106,11 +108,16 @@ class Bridge:
             message = self._messages.read(topic, type_name, data)
             draft = self._draft(topic, type_name, message)
         except BadRosMessage as bad:
-            self._tell(bad)
+            self._tell(bad, topic)
             return
-        for bad in self._front_end.refused:
-            self._tell(bad)
-        self._front_end.refused.clear()
+        except Exception as fault:
+            # Whatever a driver sends, the others go on.
+            if not self.counts["internal"]:
+                log.exception("a message on %s could not be used", topic)
+            self._tell(Unusable(topic, fault), topic)
+            return
+        finally:
+            self._say_what_was_done()
         if draft is not None:
             self._send(stop, draft)
         elif type_name == ODOMETRY:
@@ -123,6 +130,18 @@ class Bridge:
             return self._front_end.pose(topic, message)
         return self._front_end.detections(topic, message)
 
+    def _say_what_was_done(self) -> None:
+        """With messages that waited and could not be used, and with covariances that were taken otherwise."""
+        for bad in self._front_end.refused:
+            self._tell(bad, str(bad.detail["topic"]))
+        for topic, remark in self._front_end.remarks:
+            self.counts["remarks"] += 1
+            if (topic, remark) not in self._remarked:
+                self._remarked.add((topic, remark))
+                log.warning("%s: %s (said once)", topic, remark)
+        self._front_end.refused.clear()
+        self._front_end.remarks.clear()
+
     def _send(self, stop: threading.Event, draft: Draft) -> None:
         """Until it is on its way: while the service is away, odometry waits in the inbox."""
         while not stop.is_set():
@@ -131,6 +150,8 @@ class Bridge:
             except Unavailable as unavailable:
                 self._tell(unavailable)
                 continue
+            except Problem as problem:  # it could not even be sent: larger than a message may be, say
+                self._recover(problem)
             return
 
     def _collect(self) -> None:
@@ -141,7 +162,7 @@ class Bridge:
             except Refused as refused:
                 self._recover(refused)
 
-    def _recover(self, refused: Refused) -> None:
+    def _recover(self, refused: Problem) -> None:
         """Those after a refused insert lean on it: see them all answered, then go on from what is in the map."""
         log.error("the map refused an insert: %s [%s]", refused.message, refused.code)
         self.counts["refused"] += 1
@@ -173,7 +194,7 @@ class Bridge:
 
         T_map_odom = self._front_end.try_correction(value_of)
         if T_map_odom is not None:
-            stamp_ns = self._front_end.stamp_ns + self._tolerance_ns
+            stamp_ns = min(self._front_end.stamp_ns + self._tolerance_ns, LATEST_S * 10**9)
             frame = self._front_end.odometry_frame
             self._transforms.publish(display.transform(self._messages, self._settings, frame, T_map_odom, stamp_ns))
             self.counts["transforms"] += 1
@@ -191,8 +212,9 @@ class Bridge:
             drawn = snapshot.epoch, snapshot.revision
             pause_s = max(self._settings.display_s, (time.perf_counter() - start) / _DRAWING)
 
-    def _tell(self, problem: Problem) -> None:
-        """The first of a kind, then every hundredth."""
+    def _tell(self, problem: Problem, topic: str = "") -> None:
+        """The first of a kind on a topic, then every hundredth."""
         self.counts[problem.code] += 1
-        if self.counts[problem.code] % 100 == 1:
-            log.warning("%s [%s] (%d so far)", problem.message, problem.code, self.counts[problem.code])
+        self._told[problem.code, topic] += 1
+        if (count := self._told[problem.code, topic]) % 100 == 1:
+            log.warning("%s [%s] (%d so far)", problem.message, problem.code, count)

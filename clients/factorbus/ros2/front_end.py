@@ -15,9 +15,9 @@ import numpy as np
 from factorbus.client.draft import Draft
 from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
-from factorbus.ros2.certainty import checked, floored, information
-from factorbus.ros2.geometry import Transform, carried, from_pose, local
-from factorbus.ros2.messages import Stamp
+from factorbus.ros2.certainty import Checked, checked, floored, information
+from factorbus.ros2.geometry import FARTHEST_M, Transform, carried, from_pose, local
+from factorbus.ros2.messages import LATEST_S, Stamp
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
@@ -28,7 +28,8 @@ _ALL_AXES = (0, 1, 2, 3, 4, 5)
 
 
 class FrontEnd:
-    """One robot's.  `refused` collects what was not used and why; whoever drives this empties it.
+    """One robot's.  `refused` collects what was not used and why, `remarks` what was taken otherwise than it came, as
+    (topic, what was done); whoever drives this empties both.
 
     first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
     """
@@ -38,6 +39,7 @@ class FrontEnd:
         self._track = Track()
         self._waiting: deque[tuple[int, str, Any]] = deque(maxlen=_WAITING)
         self.refused: list[BadRosMessage] = []
+        self.remarks: list[tuple[str, str]] = []
         self.odometry_frame, self.base_frame = "", ""
         self.begin_again(first, landmarks, wait_for_pose)
 
@@ -100,14 +102,15 @@ class FrontEnd:
             raise BadRosMessage(topic, f"frames {frames}", f"{self.odometry_frame, self.base_frame} as before")
         if not all(frames):
             raise BadRosMessage(topic, f"frames {frames}", "names of both the odometry and the base frame")
-        stamp_ns = Stamp.of(message.header.stamp).ns
+        stamp_ns = self._stamp(topic, message)
         if self._track.latest is not None and stamp_ns <= self.stamp_ns:
             raise BadRosMessage(topic, f"a stamp of {stamp_ns} ns", f"one after the last, {self.stamp_ns} ns")
-        T = self._transform(topic, message.pose.pose)
-        covariance = checked(topic, message.pose.covariance, self._space.axes)
-        twist = checked(topic, message.twist.covariance, self._space.axes)
+        T = self._space.fitted(self._transform(topic, message.pose.pose))
+        covariance = self._checked(topic, "pose", message.pose.covariance, self._space.axes)
+        twist = self._checked(topic, "twist", message.twist.covariance, self._space.axes)
         self.odometry_frame, self.base_frame = frames
-        return self._track.add(stamp_ns, self._space.fitted(T), local(covariance, self._space.fitted(T).R), twist)
+        known, unknown = local(covariance.known, T.R), local(covariance.spread, T.R)
+        return self._track.add(stamp_ns, T, known, twist.whole, unknown)
 
     def _is_far(self, sample: Sample) -> bool:
         T = self._track.place_of(sample).T
@@ -136,7 +139,7 @@ class FrontEnd:
         )
 
     def _take(self, topic: str, message: Any) -> Draft | None:
-        stamp_ns = Stamp.of(message.header.stamp).ns
+        stamp_ns = self._stamp(topic, message)
         if self._track.latest is None or stamp_ns > self.stamp_ns:
             self._waiting.append((stamp_ns, topic, message))
             return None
@@ -163,7 +166,8 @@ class FrontEnd:
 
     def _use_pose(self, draft: Draft, stamp_ns: int, topic: str, message: Any) -> None:
         T_map_base = self._space.fitted(self._transform(topic, message.pose.pose))
-        covariance = local(checked(topic, message.pose.covariance, self._space.axes), T_map_base.R)
+        covariance = self._checked(topic, "pose", message.pose.covariance, self._space.axes).whole
+        covariance = local(covariance, T_map_base.R)
         covariance = self._space.floored(covariance, self._floors.pose_m, self._floors.pose_rad)
         begins = self.waits_for_pose
         if begins:
@@ -201,7 +205,7 @@ class FrontEnd:
         q = T p', p' = R p + t with T the keyframe's way, (R, t) the mount: Σ_q = R_q Σ_p R_qᵀ + J Σ_T Jᵀ with
         R_q = R_T R and J = R_T [I, −[p']ₓ].
         """
-        position, covariance = _position(topic, seen)
+        position, covariance = self._position(topic, seen)
         mount = self._mount(topic, seen.header.frame_id or message.header.frame_id)
         p = mount.R @ position + mount.t
         R = place.T.R @ mount.R
@@ -211,6 +215,35 @@ class FrontEnd:
         weight = information(floored(spread, np.full(len(axes), self._floors.landmark_m)))
         key = symbol(self._settings.landmark_letter, landmark_index(_identity(topic, seen)))
         return key, (place.T.R @ p + place.T.t)[axes], weight
+
+    def _position(self, topic: str, seen: Any) -> tuple[F64, F64]:
+        """Where it is in the sensor's frame, (3,), and the covariance of that, (3, 3)."""
+        best = _best(seen)
+        if best is None:
+            where, covariance = seen.bbox.center.position, np.zeros((3, 3))
+        else:
+            where = best.pose.pose.position
+            numbers = _translation_only(best.pose.covariance)
+            covariance = self._checked(topic, "position", numbers, _ALL_AXES).whole[:3, :3]
+        position = np.array([where.x, where.y, where.z], np.float64)
+        if not (np.abs(position) <= FARTHEST_M).all():
+            raise BadRosMessage(topic, f"a position of {position.tolist()}", f"at most {FARTHEST_M:g} m in each axis")
+        return position, covariance
+
+    def _checked(self, topic: str, what: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
+        """A covariance that can be one; what was done with it is noted.  Raises BadRosMessage."""
+        made = checked(topic, numbers, axes)
+        if made.unknown:
+            self.remarks.append((topic, f"{what}: {made.remark()}"))
+        return made
+
+    def _stamp(self, topic: str, message: Any) -> int:
+        """Of its header, nanoseconds.  Raises BadRosMessage."""
+        stamp = message.header.stamp
+        if not (0 <= stamp.sec <= LATEST_S and 0 <= stamp.nanosec < 1_000_000_000):
+            wanted = f"0 to {LATEST_S} s and less than 10⁹ ns"
+            raise BadRosMessage(topic, f"a stamp of {stamp.sec} s and {stamp.nanosec} ns", wanted)
+        return Stamp.of(stamp).ns
 
     def _mount(self, topic: str, frame: str) -> Transform:
         if frame == self.base_frame:
@@ -224,7 +257,8 @@ class FrontEnd:
         try:
             return from_pose(pose)
         except ValueError as error:
-            raise BadRosMessage(topic, str(error), "finite numbers and a unit quaternion") from None
+            wanted = f"numbers up to {FARTHEST_M:g} m and a unit quaternion"
+            raise BadRosMessage(topic, str(error), wanted) from None
 
 
 def landmark_index(identity: str) -> int:
@@ -247,20 +281,6 @@ def _identity(topic: str, seen: Any) -> str:
     if not identity:
         raise BadRosMessage(topic, "a detection without id or class", "one that says which landmark it is")
     return identity
-
-
-def _position(topic: str, seen: Any) -> tuple[F64, F64]:
-    """Where it is in the sensor's frame, (3,), and the covariance of that, (3, 3)."""
-    best = _best(seen)
-    if best is None:
-        where, covariance = seen.bbox.center.position, np.zeros((3, 3))
-    else:
-        where = best.pose.pose.position
-        covariance = checked(topic, _translation_only(best.pose.covariance), _ALL_AXES)[:3, :3]
-    position = np.array([where.x, where.y, where.z], np.float64)
-    if not np.isfinite(position).all():
-        raise BadRosMessage(topic, f"a position of {position.tolist()}", "finite numbers")
-    return position, covariance
 
 
 def _translation_only(numbers: F64) -> F64:

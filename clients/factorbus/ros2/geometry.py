@@ -13,6 +13,9 @@ import numpy as np
 
 from factorbus.proto.arrays import F64
 
+# A place beyond this is none, metres: a double there is exact to a tenth of a micrometre.
+FARTHEST_M = 1e9
+
 
 @dataclass(frozen=True, slots=True)
 class Transform:
@@ -48,12 +51,12 @@ def from_plane(x: float, y: float, yaw: float) -> Transform:
 
 
 def from_quaternion(t: Sequence[float], quat_xyzw: Sequence[float]) -> Transform:
-    """From a translation and a quaternion, which is normalised.  Raises ValueError for one that cannot be."""
+    """From a translation and a quaternion, which is normalised.  Raises ValueError: it cannot be, or is too far."""
     numbers = np.array([*t, *quat_xyzw], np.float64)
     if numbers.shape != (7,):
         raise ValueError(f"{len(numbers)} numbers")
-    norm = float(np.linalg.norm(numbers[3:]))
-    if not np.isfinite(numbers).all() or not 0.5 < norm < 2.0:
+    norm = math.hypot(*numbers[3:].tolist())
+    if not (np.abs(numbers[:3]) <= FARTHEST_M).all() or not 0.5 < norm < 2.0:
         raise ValueError(f"translation {list(t)} and quaternion {list(quat_xyzw)}")
     x, y, z, w = numbers[3:] / norm
     R = [

@@ -5,6 +5,7 @@ an identity, a position in metres and a covariance (AprilTag's own message has c
 drawing).  It is in no type store, so its definition stands here, as it is since ROS 2 Humble.
 """
 
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,9 @@ DETECTIONS = "vision_msgs/msg/Detection3DArray"
 PATH = "nav_msgs/msg/Path"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 MARKERS = "visualization_msgs/msg/MarkerArray"
+
+# The last second that a stamp may have: time in messages is a signed 32-bit count, and transforms are stamped ahead.
+LATEST_S = (1 << 31) - 2
 
 # What stands in keys for a hash where the distribution has none.
 NO_HASH = "TypeHashNotSupported"
@@ -88,5 +92,5 @@ class Messages:
         """A message from CDR of either byte order.  Raises BadRosMessage."""
         try:
             return self._store.deserialize_cdr(data, type_name)
-        except (SerdeError, IndexError, OverflowError, MemoryError) as error:
+        except (SerdeError, LookupError, ValueError, ArithmeticError, MemoryError, struct.error) as error:
             raise BadRosMessage(topic, f"{len(data)} bytes that cannot be read ({error})", f"a {type_name}") from None

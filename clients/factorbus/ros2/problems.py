@@ -12,6 +12,19 @@ class BadRosMessage(Problem):
         super().__init__(f"{topic}: {found}; wanted {wanted}; the message is not used", topic=topic)
 
 
+class Unusable(Problem):
+    """A message on which the bridge itself fails."""
+
+    code = "internal"
+
+    def __init__(self, topic: str, fault: Exception) -> None:
+        super().__init__(
+            f"{topic}: the bridge failed on a message ({type(fault).__name__}: {fault}); it is not used, others "
+            "are. Report this, with the log",
+            topic=topic,
+        )
+
+
 class BadRosName(Problem):
     """A topic, namespace, node or mount that cannot be."""
 

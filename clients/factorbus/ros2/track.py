@@ -3,7 +3,7 @@
 import bisect
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,13 +26,17 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One odometry: when, T_odom_base, its covariance (6, 6, local), its keyframe and the covariance of the way."""
+    """One odometry: when, T_odom_base, its covariance (6, 6, local), its keyframe and the covariance of the way.
+
+    unknown (6, 6, local): what is taken for the axes in which the robot says that it does not know its pose
+    """
 
     stamp_ns: int
     T_odom_base: Transform
     covariance: F64
     keyframe: Keyframe | None
     way: F64
+    unknown: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +53,7 @@ class Track:
 
     The covariance of a way is the sum of Σ Δt² over its samples, carried along, Σ being the covariance of each sample's
     twist: errors of one sample and the next are taken as independent.  Where all twists say zero, it is by what the
-    covariance of the pose has grown.
+    covariance of the pose has grown; in the axes of which the robot says that it does not know them, that is unknown.
     """
 
     def __init__(self) -> None:
@@ -71,13 +75,13 @@ class Track:
         """The last one."""
         return self._keyframes[-1] if self._keyframes else None
 
-    def add(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, twist: F64) -> Sample:
-        """An odometry that is later than the last.  twist (6, 6): covariance of its velocities."""
+    def add(self, stamp_ns: int, T_odom_base: Transform, covariance: F64, twist: F64, unknown: F64) -> Sample:
+        """An odometry later than the last.  twist (6, 6): covariance of its velocities; unknown: as in Sample."""
         last = self.latest
         way = np.zeros((6, 6))
         if last is not None:
             way = _extended(last, T_odom_base, stamp_ns, twist)
-        made = Sample(stamp_ns, T_odom_base, covariance, self.keyframe, way)
+        made = Sample(stamp_ns, T_odom_base, covariance, self.keyframe, way, unknown)
         self._samples.append(made)
         return made
 
@@ -124,7 +128,7 @@ class Track:
             way = last.way
             for left in reversed(dropped):
                 way = carried(left.way, left.T_odom_base.inverse() @ last.T_odom_base) + way
-            self._samples.append(Sample(last.stamp_ns, last.T_odom_base, last.covariance, self.keyframe, way))
+            self._samples.append(replace(last, keyframe=self.keyframe, way=way))
 
     def forget(self) -> None:
         """Everything."""
@@ -146,7 +150,7 @@ def _since(keyframe: Keyframe, at: Sample, sample: Sample) -> Sample:
     if sample.stamp_ns < at.stamp_ns:
         return sample
     way = sample.way - carried(at.way, at.T_odom_base.inverse() @ sample.T_odom_base)
-    return Sample(sample.stamp_ns, sample.T_odom_base, sample.covariance, keyframe, way)
+    return replace(sample, keyframe=keyframe, way=way)
 
 
 def _extended(last: Sample, T_odom_base: Transform, stamp_ns: int, twist: F64) -> F64:
@@ -158,4 +162,4 @@ def _extended(last: Sample, T_odom_base: Transform, stamp_ns: int, twist: F64) -
 def _or_growth(way: F64, sample: Sample, T: Transform) -> F64:
     if way.any() or sample.keyframe is None:
         return way
-    return sample.covariance - carried(sample.keyframe.covariance, T)
+    return sample.covariance - carried(sample.keyframe.covariance, T) + sample.unknown

@@ -8,6 +8,7 @@ from factorbus.proto.problems import BadSymbol
 _INDEX_BITS = 56
 MAX_INDEX = (1 << _INDEX_BITS) - 1
 MAX_KEY = (1 << 63) - 1
+_MOST_SHOWN = 80
 
 
 def symbol(letter: str, index: int) -> int:
@@ -25,13 +26,12 @@ def parse_symbol(text: str) -> int:
     A number alone is the key itself, also one above MAX_INDEX, as a time stamp in nanoseconds is.
     """
     letter, digits = (text[:1], text[1:]) if text[:1].isalpha() else ("", text)
-    if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
-        raise BadSymbol(text, "a letter and a number, such as x12, or a number")
-    if letter:
-        return symbol(letter, int(digits))
-    if int(digits) > MAX_KEY:
-        raise BadSymbol(text, f"a number from 0 to {MAX_KEY}")
-    return int(digits)
+    if not (digits.isascii() and digits.isdigit()):
+        raise BadSymbol(text[:_MOST_SHOWN], "a letter and a number, such as x12, or a number")
+    most, digits = (MAX_INDEX if letter else MAX_KEY), digits.lstrip("0") or "0"
+    if len(digits) > len(str(most)) or int(digits) > most:  # Python itself refuses to read very long numbers
+        raise BadSymbol(text[:_MOST_SHOWN], f"{'an index' if letter else 'a number'} from 0 to {most}")
+    return symbol(letter, int(digits)) if letter else int(digits)
 
 
 def format_symbol(key: int) -> str:

@@ -8,10 +8,11 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-from factorbus.journal.folders import IMPORTING, sync_folder
+from factorbus.journal.folders import IMPORTING, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
 from factorbus.journal.snapshots import file_of
 from factorbus.journal.store import NAME, open_store, what_reading_failed_with
+from factorbus.ownership import private_file
 
 _PIECE = 32 << 20
 _TABLE = "CREATE TABLE piece (fold INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
@@ -57,12 +58,13 @@ def import_map(file: Path, folder: Path) -> None:
     beside = folder.with_name(f"{IMPORTING}{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:
-        beside.mkdir(parents=True)
-        shutil.copyfile(file, beside / NAME)
+        make_beside(beside)
+        with file.open("rb") as source, open(beside / NAME, "xb", opener=private_file) as target:
+            shutil.copyfileobj(source, target)
         open_store(beside, read_only=True).close()
         with _opened(beside / NAME) as database:
             for fold, content in _pieces(database):
-                with file_of(beside, fold).open("ab") as snapshot:
+                with open(file_of(beside, fold), "ab", opener=private_file) as snapshot:
                     snapshot.write(content)
             database.execute("DROP TABLE IF EXISTS piece")
             database.execute("UPDATE header SET value = ? WHERE name = 'map'", (folder.name,))

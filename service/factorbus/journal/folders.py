@@ -4,8 +4,12 @@ import os
 import re
 from pathlib import Path
 
+from factorbus.journal.problems import UnsafeJournal
+from factorbus.ownership import UnsafeFolder, check_folder, make_private
+
 # What begins so is on its way: made and not finished, dropped and not yet gone, being imported.  No map's name does.
 UNFINISHED, GONE, IMPORTING = ".making-", ".dropped-", ".importing-"
+_WHAT = "the journal"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -17,6 +21,28 @@ def maps_in(folder: Path, file: str) -> list[str]:
 def left_behind(folder: Path) -> list[Path]:
     """What somebody who was killed began to make or to remove; an import may still be under way."""
     return [path for path in folder.glob(".*") if path.name.startswith((UNFINISHED, GONE))]
+
+
+def make_own(folder: Path) -> None:
+    """Make `folder` for this user alone, or check the one that is there.  Raises UnsafeJournal, OSError."""
+    try:
+        make_private(_WHAT, folder)
+    except UnsafeFolder as unsafe:
+        raise UnsafeJournal(unsafe) from None
+
+
+def check_own(folder: Path) -> None:
+    """Raises UnsafeJournal if others can change what is in `folder`; OSError."""
+    try:
+        check_folder(_WHAT, folder)
+    except UnsafeFolder as unsafe:
+        raise UnsafeJournal(unsafe) from None
+
+
+def make_beside(folder: Path) -> None:
+    """Make the folder of a map that is on its way, for this user alone.  Raises UnsafeJournal, OSError."""
+    make_own(folder.parent)
+    folder.mkdir(mode=0o700)
 
 
 def sync_folder(folder: Path) -> None:

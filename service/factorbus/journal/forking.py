@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from factorbus.journal.folders import UNFINISHED, sync_folder
+from factorbus.journal.folders import UNFINISHED, make_beside, sync_folder
 from factorbus.journal.problems import JournalFailed
 from factorbus.journal.records import Epoch
 from factorbus.journal.snapshots import file_of, write_snapshot
@@ -27,7 +27,7 @@ def fork_journal(
     beside = target.with_name(f"{UNFINISHED}{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:
-        beside.mkdir(parents=True)
+        make_beside(beside)
         _copy(source, beside)
         _begin(beside, target.name, fold, epoch, _saved(beside, fold, state, fingerprint))
         sync_folder(beside)

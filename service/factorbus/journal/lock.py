@@ -1,11 +1,13 @@
 """Who owns a folder of journals: a lock that ends with the process that has it, however that ends."""
 
+import contextlib
 import fcntl
 import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from factorbus.journal.folders import check_own, make_own
 from factorbus.journal.problems import JournalInUse
 
 NAME = "owner.lock"
@@ -38,7 +40,7 @@ def own(
     """Own `folder`, which is made if it is not there.
 
     wait: stand by until the present owner is gone, or this is set (then None); `waiting` is told who that is.
-    Raises JournalInUse when it has an owner and nobody wants to wait; OSError.
+    Raises JournalInUse when it has an owner and nobody wants to wait; UnsafeJournal: others can write to it; OSError.
     """
     descriptor = _open(folder)
     try:
@@ -61,10 +63,15 @@ def own(
 
 
 def _open(folder: Path) -> int:
+    """Whoever can open the file can take the lock, and keep the service from starting: so it is for this user alone."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        return os.open(folder / NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        make_own(folder)
+        descriptor = os.open(folder / NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        with contextlib.suppress(PermissionError):  # root's, or a volume that has no owners
+            os.fchmod(descriptor, 0o600)
+        return descriptor
     except OSError:
+        check_own(folder)
         # A disk that is read-only has owners, too.
         return os.open(folder / NAME, os.O_RDONLY | os.O_CLOEXEC)
 

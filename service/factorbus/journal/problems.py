@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
 
 
@@ -30,6 +31,15 @@ class JournalInUse(Problem):
             "this one a folder of its own, or start it with --standby to take over when the other ends",
             owner=owner,
         )
+
+
+class UnsafeJournal(Problem):
+    """Others could change the journal, or what takes its place."""
+
+    code = "unsafe_folder"
+
+    def __init__(self, unsafe: UnsafeFolder) -> None:
+        super().__init__(unsafe.message, **unsafe.detail)
 
 
 class JournalDamaged(Problem):

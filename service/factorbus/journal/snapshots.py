@@ -19,6 +19,7 @@ import msgpack
 import numpy as np
 
 from factorbus.journal.folders import sync_folder
+from factorbus.ownership import private_file
 
 _MAGIC = b"FBSNAP01"
 _BLOCK = 1 << 20
@@ -43,7 +44,7 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
     _check_room(path, len(head) + sum(map(len, packed)))
     digest, size = blake2b(digest_size=32), 0
     try:
-        with beside.open("wb") as file:
+        with open(beside, "wb", opener=private_file) as file:
             for part in (_MAGIC, len(head).to_bytes(8, "little"), head, *packed):
                 digest.update(part)
                 file.write(part)

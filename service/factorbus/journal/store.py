@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 
 from factorbus.journal import chain
 from factorbus.journal.digest import digest_of
-from factorbus.journal.folders import UNFINISHED, sync_folder
+from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
 from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
+from factorbus.ownership import private_file
 
 NAME = "journal.db"
 FORM = 2  # 1: an entry's digest was of its message only
@@ -225,8 +226,9 @@ class Store:
     def copy_to(self, path: Path) -> None:
         """A copy in one file, consistent also while somebody writes.  Raises JournalFailed."""
         try:
+            open(path, "xb", opener=private_file).close()  # into an empty file it writes as into none
             self._db.execute("VACUUM INTO ?", (str(path),))
-        except sqlite3.Error as error:
+        except (OSError, sqlite3.Error) as error:
             raise JournalFailed(path, str(error)) from None
 
     def close(self) -> None:
@@ -302,7 +304,7 @@ def create(folder: Path, name: str, mode: str, options: dict[str, Any], epoch: i
     beside = folder.with_name(f"{UNFINISHED}{folder.name}")
     try:
         shutil.rmtree(beside, ignore_errors=True)
-        beside.mkdir(parents=True)
+        make_beside(beside)
         _fill(beside / NAME, name, mode, options, epoch, durability)
         sync_folder(beside)
         beside.rename(folder)
@@ -316,11 +318,13 @@ def create(folder: Path, name: str, mode: str, options: dict[str, Any], epoch: i
 def open_store(folder: Path, durability: str = "commit", read_only: bool = False) -> Store:
     """The journal in `folder`.  One that cannot be written is opened for reading: `writable` says so.
 
-    Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable.
+    Raises NoJournal, UnsafeJournal, JournalDamaged, JournalVersion, JournalUnreadable.
     """
     path, ways = folder / NAME, _WAYS_TO_READ if read_only else ("rw", *_WAYS_TO_READ)
     if not path.is_file():
         raise NoJournal(path)
+    if not read_only:
+        check_own(folder)
     why = ""
     for way in ways:
         if way == _AS_IT_IS and _has_log(path):
@@ -348,6 +352,7 @@ def _replaced(fold: Fold) -> int:
 
 
 def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:
+    open(path, "xb", opener=private_file).close()  # SQLite gives its log the same rights
     store = Store(path, _connect(path, "rwc", durability), True)
     try:
         with store._writing():

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
 from factorbus.service.config import DURABILITIES, Config, checked, load
 
@@ -24,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         serve(_config(options), lambda endpoints: print("ready", *endpoints, flush=True), stop)
-    except (Problem, OSError) as problem:
+    except (Problem, UnsafeFolder, OSError) as problem:
         print(f"factorbus: {problem}", file=sys.stderr)
         return 2
     return 0

@@ -4,6 +4,7 @@
     2  one step for all of them
     3  if the step fails, nobody knows yet whose fault it is: the solver has taken all of them back, and they are
        tried again one at a time, so that only the guilty are refused
+    4  a step that left anything that is not finite, or beyond its bounds, has failed as well (`divergence`)
 
 An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
 the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
@@ -30,7 +31,8 @@ from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Ou
 from factorbus.service.holding import Broken, Holding
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
-from factorbus.solver.errors import SolverError
+from factorbus.solver.divergence import check_step, copied, is_sound, is_usual, unstage
+from factorbus.solver.errors import Diverged, SolverError
 
 # The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
 _ALONE_BYTES = 48 << 10
@@ -124,6 +126,7 @@ class Folder(Holding):
             solver, first_factor, report, counted = self._solver.with_changes(
                 content.changes, content.batch, content.settle
             )
+            check_step(solver, report)
         except (Problem, SolverError) as problem:
             yield Judged((Outcome(insert, problem),))
             return
@@ -132,7 +135,7 @@ class Folder(Holding):
             log.exception("fault %s: the solver failed in a change; the map goes on without it", reference)
             yield Judged((Outcome(insert, Internal(reference)),))
             return
-        self._solver = solver
+        self._solver, self._wary = solver, not is_usual(solver)
         staged = _Staged(insert, first_factor, content.settle, content.points_below)
         yield from self._stepped([staged], [], report, started, counted)
         if content.points_below:
@@ -153,6 +156,9 @@ class Folder(Holding):
             first_factor = solver.try_stage(content.message, content.groups)
             if first_factor is None:
                 return self.fold((insert,))
+            if self._wary or not is_usual(solver, variables, factors):
+                unstage(solver)
+                return self.fold((insert,))
             report = solver.step(content.settle)
         except SolverError:
             return self.fold((insert,))  # it was taken back, and is now refused in the usual way
@@ -161,6 +167,8 @@ class Folder(Holding):
             return self.fold((insert,))
         try:
             changed, graph = solver.pick_changed()
+            if not is_sound(changed, graph, report):
+                return self._diverged_alone(insert, report)
             account = report.as_dict()
             account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
             answer, delta = write_messages(
@@ -182,6 +190,22 @@ class Folder(Holding):
             report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(),
         )  # fmt: skip
 
+    def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:
+        """The step of one insert left what cannot be kept: it is refused."""
+        cpu_s = time.thread_time()
+        problem = self._find_diverged(report)
+        yield Judged((Outcome(insert, problem or Internal("a step that was sound")),))
+        yield from self._go_back(report)
+        yield self._folded(cpu_s)
+
+    def _find_diverged(self, report: Any) -> Diverged | None:
+        """What the last step left beyond its bounds."""
+        try:
+            check_step(self._solver, report)
+        except Diverged as diverged:
+            return diverged
+        return None
+
     def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Judged | Stepped | Folded]:
         """The rest of `fold`, after the step."""
         cpu_s = time.thread_time()
@@ -200,6 +224,7 @@ class Folder(Holding):
         staged: list[_Staged] = []
         outcomes: list[Outcome] = []
         doubt, self._doubt = self._doubt, None
+        kept: Any = None  # the solver as it was, where inserts are tried on a copy
         try:
             if doubt is not None:
                 raise doubt
@@ -208,22 +233,38 @@ class Folder(Holding):
                     staged.append(self._stage(insert))
                 except (Problem, SolverError) as problem:
                     outcomes.append(Outcome(insert, problem))
+            if staged and (self._wary or not is_usual(self._solver, *self._held)):
+                kept, self._solver = self._solver, copied(self._solver)
+                staged = [self._stage(each.insert) for each in staged]
             report = self._solver.step(settle=any(s.settle for s in staged)) if staged else None
         except SolverError as problem:
+            self._solver = kept or self._solver
             if len(staged) > 1:
                 raise _TakenBack from problem
             report = None
             outcomes.append(Outcome(staged[0].insert, problem))
         except Exception:
+            self._solver = kept or self._solver
             reference = self._fault()
             yield from self._replace_solver(reference)
             if len(inserts) > 1:
                 raise _TakenBack from None
             report = None
             outcomes = [Outcome(inserts[0], Internal(reference))]
+        diverged = None if report is None else self._find_diverged(report)
         if report is None:
             yield Judged(tuple(outcomes))
+        elif diverged is not None:
+            if len(staged) == 1:
+                yield Judged((*outcomes, Outcome(staged[0].insert, diverged)))
+            if kept is not None:
+                self._solver = kept
+            else:
+                yield from self._go_back(report)
+            if len(staged) > 1:
+                raise _TakenBack
         else:
+            self._wary = self._wary or kept is not None
             yield from self._stepped(staged, outcomes, report, started)
             if below := max((s.points_below for s in staged), default=0.0):
                 yield from self._ripen(below)
@@ -304,6 +345,7 @@ class Folder(Holding):
             return
         try:
             solver, report = self._solver.with_points(keys)
+            check_step(solver, report)
         except SolverError as problem:
             log.warning("%d features stay features: as points %s", keys.size, problem)
             return

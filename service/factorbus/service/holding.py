@@ -21,6 +21,7 @@ from factorbus.service.config import Limits
 from factorbus.service.events import Stepped
 from factorbus.service.questions import Copied, Question, Snapshot, snapshot
 from factorbus.service.uncertain import Uncertain
+from factorbus.solver.divergence import check_step, is_usual, undone
 
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
 # each up to twice what the solver has in use, as arrays double when they grow (measured: 1.7 times for 10,000 poses).
@@ -49,12 +50,13 @@ class Holding:
     ) -> None:
         self._options = dict(options or {})
         self._make, self._epoch, self._limits = make_solver, epoch, limits
-        self._solver = make_solver()
+        self._solver: Any = make_solver()
         self._revision = 0
         self._account: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._held = (0, 0)  # variables and factors that were accepted
         self._broken = ""
+        self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
@@ -100,10 +102,11 @@ class Holding:
 
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
-        self._solver, self._revision, self._broken = self._make(), 0, ""
+        self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
         self._held = 0, 0
         if state is not None:
             self._solver.load(state["solver"])
+            self._wary = not is_usual(self._solver)
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
 
@@ -119,7 +122,9 @@ class Holding:
         Takes as long as all of the map takes to eliminate, on any thread.  Raises SolverError.
         """
         made = type(self)(self._make, self._epoch, self._limits, self._options)
-        made._account = made._solver.order_anew(content["graph"]).as_dict()
+        report = made._solver.order_anew(content["graph"])
+        check_step(made._solver, report)
+        made._account = report.as_dict()
         made._revision, made._held = int(content["revision"]), tuple(content["held"])
         return made
 
@@ -186,6 +191,28 @@ class Holding:
         except Exception:
             self._broken = reference
             log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
+
+    def _go_back(self, report: Any) -> Iterator[Stepped]:
+        """The last step, which gave `report`, does not count: what was there before it, in a new solver.
+
+        That is a step of its own, whose delta has everything; the revision of the one that does not count was not used.
+        """
+        started = time.perf_counter()
+        try:
+            solver, own = undone(self._solver, report, *self._held)
+        except Exception:
+            self._broken = secrets.token_hex(4)
+            log.exception("fault %s: a step could not be undone; the map is broken", self._broken)
+            return
+        self._solver = solver
+        if not any(self._held):
+            return
+        account = own.as_dict() | {
+            "strategy": "full", "because": "a step that diverged was undone", "new_variables": 0, "new_factors": 0,
+            "solver_ms": (time.perf_counter() - started) * 1e3,
+        }  # fmt: skip
+        self._next(account)
+        yield self._told(account)
 
     def _rebuild(self) -> dict[str, Any] | None:
         """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""

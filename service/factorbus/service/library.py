@@ -173,7 +173,7 @@ class Kept:
 def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> Library | None:
     """The library that `config` names, owned by this process; None if `stop` was set while standing by.
 
-    Raises JournalInUse, JournalFailed.
+    Raises JournalInUse, UnsafeJournal, JournalFailed.
     """
     folder = Path(config.journal)
     try:

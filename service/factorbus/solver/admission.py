@@ -14,6 +14,14 @@ from factorbus.solver.joints import SINGLE, check_joints
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.admit import admit_factors, admit_variables
+from factorbus.solver.kernels.bounds import (
+    LEAST_INFORMATION,
+    LEAST_SCALE,
+    MOST_INFORMATION,
+    MOST_LINEAR,
+    MOST_NUMBER,
+    find_first_outside,
+)
 from factorbus.solver.kernels.reach import reach
 from factorbus.solver.triangulation import place_by_bearings
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
@@ -31,8 +39,8 @@ def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
     whole: a linear factor of one variable may have a negative definite Ω where those that came together make a form
     that is positive semidefinite (`joints`); else it may not.
 
-    Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, BadQuaternion,
-    BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialised; `graph` then
+    Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, OutOfBounds,
+    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialised; `graph` then
     holds a part of the batch and must go back to its mark.
     """
     counts = graph.counts.tolist()
@@ -101,7 +109,8 @@ def _admit_factors(graph: Graph, group: FactorsLike, whole: bool) -> bool:
         graph.payload, graph.counts,
     )  # fmt: skip
     if wrong == at.BAD_SCALE:
-        raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", "more than 0, standard deviations")
+        wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
+        raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", wanted)
     if wrong != at.GOOD:
         raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
     for begin in (graph.fac[first + negative, at.F_AT] + kind.size).tolist():
@@ -125,6 +134,24 @@ def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
         missing = _find_missing(graph, first, first_factor, reached)
     if missing >= 0:
         raise errors.Uninitialised(int(graph.keys[missing]))
+    outside = find_first_outside(first, int(graph.counts[at.VARIABLES]), graph.var, graph.values)
+    if outside >= 0:
+        raise value_out_of_bounds(graph, outside)
+
+
+def value_out_of_bounds(graph: Graph, v: int) -> errors.SolverError:
+    """The error that names the variable with index v, whose value is NaN, infinite or too large."""
+    kind, start = VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])], int(graph.var[v, at.V_AT])
+    where = f"the value of {kind} {errors.printed(int(graph.keys[v]))}"
+    return out_of_bounds(where, graph.values[start : start + kind.size])
+
+
+def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER) -> errors.SolverError:
+    """The error for the first of `numbers` that is NaN, infinite, or beyond `most`."""
+    bad = np.flatnonzero(~(np.abs(numbers) <= most))
+    if not np.isfinite(numbers).all() or not bad.size:
+        return errors.NotFinite(where)
+    return errors.OutOfBounds(where, float(numbers[bad[0]]), -most, most)
 
 
 def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> int:
@@ -152,7 +179,7 @@ def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.
         return errors.DuplicateVariable(key)
     if wrong == at.BAD_QUATERNION and value is not None:
         return errors.BadQuaternion(where, float(np.linalg.norm(value[3:])))
-    return errors.NotFinite(f"the value of {where}")
+    return out_of_bounds(f"the value of {where}", np.zeros(0) if value is None else value)
 
 
 def _bad_factor(
@@ -178,4 +205,16 @@ def _bad_factor(
         matrix = np.zeros((kind.dim, kind.dim))
         matrix[np.triu_indices(kind.dim)] = information
         return errors.NotPositiveDefinite(where, float(np.linalg.eigvalsh(matrix, UPLO="U")[0]))
-    return errors.NotFinite(f"the measurement or information of {where}")
+    return _number_out_of_bounds(kind, where, measured, information)
+
+
+def _number_out_of_bounds(kind: FactorKind, where: str, measured: F64, information: F64) -> errors.SolverError:
+    """Of a measurement or an information matrix."""
+    plain = sum(end.size for end in kind.connects) if kind.name.startswith("linear") else kind.size
+    for numbers, most in ((measured[:plain], MOST_NUMBER), (measured[plain:], MOST_LINEAR)):
+        if not (np.abs(numbers) <= most).all():
+            return out_of_bounds(f"the measurement of {where}", numbers, most)
+    if not (np.abs(information) <= MOST_INFORMATION).all():
+        return out_of_bounds(f"the information of {where}", information, MOST_INFORMATION)
+    least = float(information[np.cumsum([0, *range(kind.dim, 1, -1)])].min())
+    return errors.OutOfBounds(f"the diagonal of the information of {where}", least, LEAST_INFORMATION, MOST_INFORMATION)

@@ -22,12 +22,14 @@ from typing import Protocol
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.admission import out_of_bounds
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import FactorGroup
 from factorbus.solver.joints import check_kept
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.bounds import LEAST_INFORMATION, LEAST_SCALE, MOST_INFORMATION, MOST_NUMBER
 from factorbus.solver.marginal import marginals
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
@@ -85,7 +87,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
     Raises UnknownKind, UnknownFactor, NotInMap, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
-    NotFinite, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
+    NotFinite, OutOfBounds, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
     """
     edits = unchanged(graph)
     before = edits.free.copy()
@@ -153,8 +155,8 @@ def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarra
         if change.loss not in LOSSES:
             raise errors.BadLoss("change loss", f"the loss {change.loss!r:.40}", f"none, or one of {', '.join(LOSSES)}")
         scale = _numbers("loss", "scale", change.scale, rows.size)
-        if (bad := np.flatnonzero(~(np.isfinite(scale) & (scale > 0.0)))).size:
-            wanted = "a finite number above 0, standard deviations"
+        if (bad := np.flatnonzero(~((scale >= LEAST_SCALE) & (scale <= MOST_NUMBER)))).size:
+            wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
             raise errors.BadLoss(f"change loss of factor {_id(graph, rows, bad)}", f"{scale[bad[0]]:g}", wanted)
         code, edits.scale[rows] = LOSSES[change.loss], scale
     edits.loss[rows] = code
@@ -167,7 +169,22 @@ def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) 
     if (bad := np.flatnonzero(~(np.isfinite(weight) & (weight > 0.0)))).size:
         raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]))
     np.multiply.at(edits.weight, rows, weight)
+    _check_weighed(graph, edits, rows)
     touched[rows] = True
+
+
+def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
+    """Is Ω of these factors still within its bounds?  Raises BadWeight."""
+    fac = graph.fac[rows]
+    for code in np.unique(fac[:, at.F_KIND]).tolist():
+        kind, of = FACTOR_KIND_OF_CODE[code], rows[fac[:, at.F_KIND] == code]
+        omega = np.abs(graph.payload[graph.fac[of, at.F_AT, None] + kind.size + np.arange(kind.triangle)])
+        diagonal = omega[:, np.cumsum([0, *range(kind.dim, 1, -1)])]
+        least, most = LEAST_INFORMATION / diagonal.min(axis=1), MOST_INFORMATION / omega.max(axis=1)
+        bad = np.flatnonzero(~((least <= edits.weight[of]) & (edits.weight[of] <= most)))
+        if bad.size:
+            seen = float(edits.weight[of[bad[0]]])
+            raise errors.BadWeight(_id(graph, of, bad), seen, float(least[bad[0]]), float(most[bad[0]]))
 
 
 def _fix(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
@@ -194,10 +211,10 @@ def _place(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> Non
 
 
 def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
-    """Values as variables keep them.  Raises NotFinite, BadQuaternion."""
+    """Values as variables keep them.  Raises NotFinite, OutOfBounds, BadQuaternion."""
     keys, values = graph.keys[picked], values.copy()
-    for row in np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist():
-        raise errors.NotFinite(f"the value of {kind} {errors.printed(int(keys[row]))}")
+    for row in np.flatnonzero(~(np.abs(values) <= MOST_NUMBER).all(axis=1)).tolist():
+        raise out_of_bounds(f"the value of {kind} {errors.printed(int(keys[row]))}", values[row])
     if kind == "se3":
         norms = np.linalg.norm(values[:, 3:], axis=1)
         for row in np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE).tolist():

@@ -11,6 +11,8 @@
     ├── KindMismatch           kind_mismatch           a factor on a variable of a kind it does not connect
     ├── SelfLoop               self_loop               a factor between a variable and itself
     ├── NotFinite              not_finite              a NaN or an infinity, given or arising
+    ├── OutOfBounds            out_of_bounds           a number that double precision cannot compute with
+    ├── Diverged               diverged                a step that leaves its bounds, or what is finite
     ├── BadQuaternion          bad_quaternion          a quaternion that is not of unit length
     ├── BadRange               bad_range               a range that is not positive
     ├── BadDirection           bad_direction           a direction that is no vector of some length
@@ -31,6 +33,7 @@
 `code`, `message` and `detail` (plain types) are what a service needs to pass any of them on.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -134,6 +137,35 @@ class NotFinite(SolverError):
 
     def __init__(self, where: str) -> None:
         super().__init__(f"{where} holds or leads to a NaN or an infinity; wanted finite numbers", where=where)
+
+
+class OutOfBounds(SolverError):
+    code = "out_of_bounds"
+
+    def __init__(self, where: str, seen: float, least: float, most: float) -> None:
+        wanted = f"at most {most:g} in magnitude" if least <= 0.0 else f"{least:g} to {most:g}"
+        super().__init__(
+            f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; "
+            "choose units and an origin near the data, or a larger sigma",
+            where=where,
+            seen=seen,
+            least=least,
+            most=most,
+        )
+
+
+class Diverged(SolverError):
+    code = "diverged"
+
+    def __init__(self, what: str, seen: float, most: float, key: int | None = None) -> None:
+        super().__init__(
+            f"the step would leave {what} at {seen:.6g}, wanted at most {most:g}: what was inserted does not determine "
+            "it, or contradicts the map; the map is as it was. Leave the factor out, or add a prior",
+            where=what,
+            seen=seen,
+            most=most,
+            **({} if key is None else {"key": key}),
+        )
 
 
 class BadQuaternion(SolverError):
@@ -267,10 +299,10 @@ class BadOrder(SolverError):
 class BadWeight(SolverError):
     code = "bad_weight"
 
-    def __init__(self, factor: int, seen: float) -> None:
+    def __init__(self, factor: int, seen: float, least: float = 0.0, most: float = math.inf) -> None:
+        wanted = f"{least:g} to {most:g}, which keeps its information in bounds" if least else "a finite number above 0"
         super().__init__(
-            f"weight of factor {factor}: seen {seen:g}, wanted a finite number above 0; to count it for nothing, "
-            "remove it",
+            f"weight of factor {factor}: seen {seen:g}, wanted {wanted}; to count it for nothing, remove it",
             factor=factor,
         )
 

@@ -10,6 +10,7 @@ from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64
 from factorbus.solver.kernels.admit_sights import find_lost
+from factorbus.solver.kernels.bounds import MOST_NUMBER
 from factorbus.solver.lenses import layout as lens_at
 from factorbus.solver.lenses.limits import limit_of
 
@@ -24,11 +25,11 @@ REASONS = {
 def with_limits(kind: FactorKind, measured: F64) -> F64:
     """A copy of measurements (m, size) with the limits of their lenses: no further out than these are one to one.
 
-    Raises BadLens.  What is not finite is left for others to find.
+    Raises BadLens.  What is not finite, or out of bounds, is left for others to find.
     """
     start = LENS_AT[kind.name]
     lenses = measured[:, start : start + 1 + lens_at.LENS_SIZE]
-    if not len(measured) or not np.isfinite(lenses).all():
+    if not len(measured) or not (np.abs(lenses) <= MOST_NUMBER).all():
         return measured
     measured = measured.copy()
     different, which = lenses[:1], np.zeros(len(lenses), np.int64)

@@ -43,7 +43,7 @@ _new = tuple.__new__
 class TreeSteps:
     """Solves for what is new in a graph, step by step."""
 
-    NOT_KEPT = ("_graph", "_options")
+    NOT_KEPT = ("_graph", "_options", "before_batch")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
@@ -51,11 +51,17 @@ class TreeSteps:
         self._mark = graph.mark()
         self._first_new, self._batched, self._held, self._at_end = 0, False, False, True
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
+        self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
     @property
     def tree(self) -> Tree:
         """For tests."""
         return self._tree
+
+    @property
+    def mark(self) -> Mark:
+        """How much of the graph there was after the last step."""
+        return self._mark
 
     def step(self, settle: bool) -> StepReport:
         """As `Solver.step`."""
@@ -163,7 +169,7 @@ class TreeSteps:
 
         before: the values as they were before the step
         """
-        options = self._options
+        options, self.before_batch = self._options, before
         system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Sequence
 
+from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
 from factorbus.workers.config import Config, checked
 
@@ -22,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         work(_config(options), lambda name: print("ready", name, flush=True), stop)
-    except (Problem, OSError) as problem:
+    except (Problem, UnsafeFolder, OSError) as problem:
         print(f"factorbus: {problem}", file=sys.stderr)
         return 2
     return 0

@@ -21,22 +21,26 @@ An index is 0 or more, or a constant that is written where it is used, as in `a[
 Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.
 With every index checked they are errors.
 
-FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).
+FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).  What is in them is run as code, so it
+is used only if nobody but this user and root can write there, to a folder or a file; what is made is for them alone.
 NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
 """
 
 import atexit
+import contextlib
 import functools
 import hashlib
 import os
+import pickle
 import platform
+import secrets
 import shutil
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import llvmlite
 import llvmlite.binding
@@ -47,6 +51,8 @@ from llvmlite import ir
 from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
 from numpy.typing import NDArray
+
+from factorbus.ownership import check_file, make_private
 
 # From beside this file: a copy of all three elsewhere is one by itself.
 from . import _compile_time, _lowering
@@ -127,7 +133,7 @@ class KernelFolder:
         return self._linked(function)
 
     def path(self) -> Path:
-        """The cache folder, made when it is first asked for."""
+        """The cache folder, made when it is first asked for.  Raises UnsafeFolder: others can write to it."""
         if self._path is None:
             self._path = self._make()
         return self._path
@@ -163,7 +169,7 @@ class KernelFolder:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
         path = base / self._family / sources_hash(self._sources, *self._also)
         try:
-            path.mkdir(parents=True, exist_ok=True)
+            make_private("the cache of compiled kernels", path)
             tempfile.TemporaryFile(dir=path).close()
             os.utime(path)
         except OSError as problem:
@@ -317,7 +323,62 @@ def _cache_in(folder: KernelFolder) -> type[caching.FunctionCache]:
     class Cache(caching.FunctionCache):
         _impl_class = Content
 
+        def __init__(self, function: Callable[..., Any]) -> None:
+            super().__init__(function)
+            # As numba makes it, but for how files are opened.
+            content = self._impl
+            self._cache_file = _OwnFiles(self._cache_path, content.filename_base, content.locator.get_source_stamp())
+
     return Cache
+
+
+class _OwnFiles(caching.IndexDataCacheFile):
+    """The files of one function: written for this user alone, and read only if nobody else can have written them.
+
+    Folders are checked once, when a process begins; a file is checked as it is opened, so that none can be put in its
+    place in between.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            with _opened(self._index_path) as file:
+                version, data = pickle.load(file), file.read()
+        except FileNotFoundError:
+            return {}
+        if version != self._version:
+            return {}
+        stamp, overloads = pickle.loads(data)
+        return overloads if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        with _opened(self._data_path(name)) as file:
+            return pickle.loads(file.read())
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
+        beside = f"{filepath}.tmp.{secrets.token_hex(8)}"
+        try:
+            with open(beside, "xb", opener=_for_us_alone) as file:
+                yield file
+            os.replace(beside, filepath)
+        except Exception:
+            Path(beside).unlink(missing_ok=True)
+            raise
+
+
+def _opened(path: str) -> IO[bytes]:
+    """A file of the cache, to be read.  Raises UnsafeFolder: somebody else may have written it; OSError."""
+    file = open(path, "rb")  # noqa: SIM115
+    try:
+        check_file("the compiled kernel", Path(path), os.fstat(file.fileno()))
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _for_us_alone(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 _COMPILATIONS = _Compilations()

@@ -11,6 +11,14 @@ import numpy as np
 
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.bounds import (
+    LEAST_INFORMATION,
+    LEAST_SCALE,
+    MOST_INFORMATION,
+    MOST_LINEAR,
+    MOST_NUMBER,
+    are_within,
+)
 from factorbus.solver.kernels.se2 import wrap
 from factorbus.solver.kernels.sizes import dim_of, kinds_of_ends, linear_ends, residual_dim, size_of
 
@@ -105,7 +113,7 @@ def admit_factors(
             return m, wrong
         numbers = size + triangle
         if loss != at.NO_LOSS:
-            if not (scale[m] > 0.0 and scale[m] < math.inf):
+            if not (scale[m] >= LEAST_SCALE and scale[m] <= MOST_NUMBER):
                 return m, at.BAD_SCALE
             payload[p + numbers] = scale[m]
             numbers += 1
@@ -116,9 +124,8 @@ def admit_factors(
 @inline_kernel
 def check_value(kind: int, x: int, size: int, values: F64) -> int:
     """What is wrong with the new value that starts at x; it is brought into its normal form."""
-    for c in range(size):
-        if not math.isfinite(values[x + c]):
-            return at.NOT_FINITE
+    if not are_within(MOST_NUMBER, x, size, values):
+        return at.OUT_OF_BOUNDS
     if kind == at.SE2:
         values[x + 2] = wrap(values[x + 2])
     if kind == at.IDP:
@@ -173,9 +180,8 @@ def find_ends(kind: int, a: int, b: int, table: I64, keys: I64, var: I64) -> tup
 @inline_kernel
 def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scratch: F64) -> int:
     """What is wrong with the new measurement that starts at p, or with its information."""
-    for c in range(size + triangle):
-        if not math.isfinite(payload[p + c]):
-            return at.NOT_FINITE
+    if not (are_within_kind(kind, p, size, payload) and are_within(MOST_INFORMATION, p + size, triangle, payload)):
+        return at.OUT_OF_BOUNDS
     if size == 7 and not make_unit(payload, p + 3):
         return at.BAD_QUATERNION
     if kind == at.BEARING_RANGE_SE2 and not payload[p + 1] > 0.0:
@@ -184,9 +190,25 @@ def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scr
         wrong = check_other(kind, p, payload)
         if wrong != at.GOOD:
             return wrong
-    if not is_positive_definite(residual_dim(kind), payload, p + size, scratch):
+    dim = residual_dim(kind)
+    if not is_positive_definite(dim, payload, p + size, scratch):
         return at.NOT_POSITIVE_DEFINITE
+    c = p + size
+    for a in range(dim):
+        if payload[c] < LEAST_INFORMATION:
+            return at.OUT_OF_BOUNDS
+        c += dim - a
     return at.GOOD
+
+
+@inline_kernel
+def are_within_kind(kind: int, p: int, size: int, payload: F64) -> bool:
+    """Whether the measurement that starts at p is within bounds; H and b of a linear factor are what R may hold."""
+    if kind < at.LINEAR_SE2:
+        return are_within(MOST_NUMBER, p, size, payload)
+    first, second = linear_ends(kind)
+    y = size_of(first) + (size_of(second) if second >= 0 else 0)
+    return are_within(MOST_NUMBER, p, y, payload) and are_within(MOST_LINEAR, p + y, size - y, payload)
 
 
 @part

@@ -17,6 +17,7 @@ from factorbus.solver.kernels.admit import (
     remove_keys,
     slot_of,
 )
+from factorbus.solver.kernels.bounds import find_outside
 from factorbus.solver.kernels.places import floats, int_rows, ints
 from factorbus.solver.kernels.reach import reach
 
@@ -36,7 +37,8 @@ def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
         if count_missing(groups) == 0:
             return f0
         reached = list_given(groups, counts[at.VARIABLES] - v0)
-        if reach(True, v0, f0, counts[at.FACTORS], var, fac, values, payload, reached) < 0:
+        missing = reach(True, v0, f0, counts[at.FACTORS], var, fac, values, payload, reached)
+        if missing < 0 and find_outside(v0, counts[at.VARIABLES], var, values) < 0:
             return f0
     remove_keys(v0, counts[at.VARIABLES], table, keys)
     for k in range(counts.size):

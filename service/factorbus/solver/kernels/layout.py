@@ -105,7 +105,7 @@ R_SIZE = 7
 # What an admission kernel found wrong with a row.
 GOOD = 0
 DUPLICATE = 1
-NOT_FINITE = 2
+OUT_OF_BOUNDS = 2  # NaN, infinite, or not within its bounds (`bounds`)
 BAD_QUATERNION = 3
 UNKNOWN_FIRST = 4
 UNKNOWN_SECOND = 5

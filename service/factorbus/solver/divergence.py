@@ -1,0 +1,90 @@
+"""Did a step leave everything within its bounds?  If not: what was there before it.  MATH §2.5.
+
+What comes in is within bounds (`admission`), but what follows from it need not be: a landmark whose bearings are all
+but parallel, or a distance of nothing in a denominator.  A map that holds one value that is not finite is lost to all
+who share it, so such a step does not count.
+
+A step of the tree cannot be taken back when it is done.  So what is of unusual sizes is tried on a copy, and everything
+on a map that has such numbers; where a step diverges all the same, the values are put back and eliminated anew.
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import I64
+from factorbus.solver.kernels.bounds import MOST_NUMBER, are_usual, find_escaped
+from factorbus.solver.report import StepReport
+from factorbus.solver.solver import Solver
+from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+
+
+def is_sound(changed: I64, graph: Graph, report: StepReport) -> bool:
+    """Whether the last step, which `changed` these variables, left them and χ² within bounds."""
+    return find_escaped(changed, graph.places) < 0 and math.isfinite(report.chi2) and math.isfinite(report.chi2_before)
+
+
+def check_step(solver: Solver, report: StepReport) -> None:
+    """Raises Diverged if the last step of `solver`, which gave `report`, left anything out of bounds."""
+    changed, graph = solver.pick_changed()
+    if is_sound(changed, graph, report):
+        return
+    v = find_escaped(changed, graph.places)
+    if v < 0:
+        raise errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
+    kind, start, key = (
+        VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])],
+        int(graph.var[v, at.V_AT]),
+        int(graph.keys[v]),
+    )
+    value = graph.values[start : start + kind.size]
+    seen = float(value[np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))[0]])
+    raise errors.Diverged(f"{kind} {errors.printed(key)}", seen, MOST_NUMBER, key)
+
+
+def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:
+    """Whether all numbers are of usual sizes, but for those of the first so many variables and factors."""
+    return bool(are_usual(variables, factors, solver._graph.places))
+
+
+def unstage(solver: Solver) -> None:
+    """Forget what was staged since the last step."""
+    solver._graph.forget(solver._done.graph if solver._tree is None else solver._tree.mark)
+
+
+def copied(solver: Solver) -> Solver:
+    """The same solver again, as of its last step: it goes on with the same bits.  What is staged is forgotten."""
+    unstage(solver)
+    made = Solver(solver._options)
+    made.load(solver.dump())
+    return made
+
+
+def undone(solver: Solver, report: StepReport, variables: int, factors: int) -> tuple[Solver, StepReport]:
+    """A new solver with the first so many variables and factors of `solver`, and the values they had before its last
+    step, which gave `report`; and the report of its own first step, which eliminates everything at these values.
+
+    `solver` is of no use then.  Raises SolverError.
+    """
+    _restore(solver, report)
+    made = Solver(solver._options)
+    report = made.renew(solver, variables, factors)
+    check_step(made, report)
+    return made, report
+
+
+def _restore(solver: Solver, report: StepReport) -> None:
+    """The values from before the last step, in the arena of the graph."""
+    graph, before = solver._graph, None
+    if solver._tree is None:
+        before = None if report.strategy == "extend" else solver._system._before
+    elif report.strategy == "batch":
+        before = solver._tree.before_batch
+    else:
+        solver._tree.tree.exchange()
+    if before is not None:
+        used = int(graph.counts[at.VALUES])
+        graph.values[:used] = before[:used]

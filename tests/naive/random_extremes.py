@@ -1,0 +1,144 @@
+"""Inserts with numbers from everywhere in what a map admits: the smallest, the largest, and the same place twice."""
+
+import numpy as np
+from naive.random_sightings import CAMERAS
+from naive.random_sights import SIGHTS, measurement
+
+from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.symbols import symbol
+
+MOST, MOST_INFORMATION = 1e12, 1e24
+SIZES = {"se2": 3, "se3": 7, "point2": 2, "point3": 3, "idp": 6}
+ENDS = {"se2": "se2", "se3": "se3", "point2": "point2", "point3": "point3", "idp": "idp"}
+LOSSES = ("", "", "", "huber", "cauchy", "geman-mcclure", "tukey", "dcs")
+LETTERS = {"se2": "x", "se3": "y", "point2": "l", "point3": "p", "idp": "f"}
+
+
+def number(rng: np.random.Generator) -> float:
+    """Any size that is admitted: often an ordinary one, or one of the ends."""
+    how = rng.random()
+    if how < 0.35:
+        return float(rng.normal(0, 3))
+    if how < 0.45:
+        return float(rng.choice([0.0, -0.0, MOST, -MOST, 5e-324, 1.0]))
+    exponent = rng.uniform(-320, 12) if how < 0.7 else rng.uniform(-12, 12)
+    return float(rng.choice([-1.0, 1.0]) * min(10.0**exponent, MOST))
+
+
+def numbers(count: int, rng: np.random.Generator) -> np.ndarray:
+    return np.array([number(rng) for _ in range(count)])
+
+
+def quaternion(rng: np.random.Generator) -> np.ndarray:
+    q = rng.normal(size=4) if rng.random() < 0.5 else rng.permutation([1.0, 1e-9, 0.0, -1e-200])
+    return q / np.linalg.norm(q)
+
+
+def value(kind: str, others: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Of a variable; at times where another one is, or next to it."""
+    made = numbers(SIZES[kind], rng)
+    if others and rng.random() < 0.3:
+        near = others[int(rng.integers(len(others)))]
+        n = min(2 if kind.endswith("2") else 3, near.size)
+        made[:n] = near[:n] + rng.choice([0.0, 1e-200, 1e-12, 1.0]) * rng.normal(size=n)
+    if kind == "se3":
+        made[3:] = quaternion(rng)
+    return np.clip(made, -MOST, MOST)
+
+
+def information(dim: int, rng: np.random.Generator) -> np.ndarray:
+    """The upper triangle of a positive definite matrix: σ from 1e-12 to 1e12, each by itself or all alike."""
+    exponents = rng.uniform(-11.9, 11.9, dim) if rng.random() < 0.5 else np.full(dim, rng.uniform(-11.9, 11.9))
+    if rng.random() < 0.3:
+        exponents[:] = rng.uniform(-2, 3)
+    root = 10.0**exponents
+    correlation = np.eye(dim)
+    if rng.random() < 0.5:
+        J = rng.normal(size=(dim, dim))
+        S = J @ J.T + np.eye(dim)
+        correlation = S / np.sqrt(np.outer(S.diagonal(), S.diagonal()))
+    return (correlation * np.outer(root, root))[np.triu_indices(dim)]
+
+
+def measured(kind: str, rng: np.random.Generator) -> np.ndarray:
+    if kind in SIGHTS:
+        z = measurement(kind, CAMERAS["radtan"], np.zeros(2), number(rng) if kind == "idp_first" else 0.0)
+        z[:2] = rng.uniform(0, 500, 2) if rng.random() < 0.7 else numbers(2, rng)
+        return z
+    z = numbers(FACTOR_KINDS[kind].size, rng)
+    if kind.startswith(("range", "bearing_range")):
+        z[-1] = abs(z[-1]) or 1.0
+    at = 0
+    for end in connects(kind) if kind.startswith("linear") else ["se3"] if z.size == 7 else []:
+        if end == "se3":
+            z[at + 3 : at + 7] = quaternion(rng)
+        at += SIZES[end]
+    return z
+
+
+def connects(kind: str) -> list[str]:
+    """The kinds of variables that a kind of factor is on."""
+    if kind.startswith("linear"):
+        ends = kind.removeprefix("linear_").removeprefix("pair_").split("_")
+        return ends * 2 if "pair" in kind and len(ends) == 1 else ends
+    if kind.startswith("prior_"):
+        return [kind.removeprefix("prior_")]
+    if kind.startswith(("position", "heading", "attitude")):
+        return [kind.rpartition("_")[2]]
+    if kind.startswith("between"):
+        return [kind.removeprefix("between_")] * 2
+    if kind in SIGHTS:
+        return ["se3", "point3" if kind == "point_seen" else "idp"]
+    return [kind.rpartition("_")[2], "point2" if kind.endswith("se2") else "point3"]
+
+
+class Extremes:
+    """One map: its inserts in turn.  `known` has what was accepted; tell it with `accept`."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.known: dict[str, list[int]] = {kind: [] for kind in SIZES}
+        self.values: list[np.ndarray] = []
+        self._count = 0
+
+    def begin(self) -> Batch:
+        """Something of every kind, held where it is."""
+        return Batch(tuple(self._variable(kind, fixed=True) for kind in SIZES))
+
+    def next(self) -> Batch:
+        """One or two new variables, and factors between what there is."""
+        rng = self.rng
+        kinds = rng.choice(list(SIZES), int(rng.integers(0, 3)), replace=False)
+        variables = tuple(self._variable(str(kind), fixed=False) for kind in kinds)
+        new = {group.kind: int(group.keys[0]) for group in variables}
+        factors = [self._factor(f"prior_{kind}", new) for kind in new if kind != "idp" and rng.random() < 0.7]
+        factors += [self._factor("linear_idp", new) for kind in new if kind == "idp" and rng.random() < 0.7]
+        factors += [self._factor(str(kind), new) for kind in rng.choice(list(FACTOR_KINDS), int(rng.integers(0, 4)))]
+        return Batch(variables, tuple(factor for factor in factors if factor is not None))
+
+    def accept(self, batch: Batch) -> None:
+        for group in batch.variables:
+            self.known[group.kind] += group.keys.tolist()
+            if group.values is not None:
+                self.values.append(group.values[0])
+
+    def _variable(self, kind: str, fixed: bool) -> Variables:
+        self._count += 1
+        key = np.array([symbol(LETTERS[kind], self._count)])
+        given = fixed or self.rng.random() < 0.8
+        return Variables(kind, key, value(kind, self.values, self.rng)[None] if given else None, fixed)
+
+    def _factor(self, kind: str, new: dict[str, int]) -> Factors | None:
+        rng, keys = self.rng, list[int]()
+        for end in connects(kind):
+            there = [key for key in self.known[end] if key not in keys]
+            there = [new[end]] if end in new and new[end] not in keys and rng.random() < 0.8 else there
+            if not there:
+                return None
+            keys.append(there[int(rng.integers(len(there)))])
+        made = Factors(
+            kind, np.array([keys]), measured(kind, rng)[None], information(FACTOR_KINDS[kind].dim, rng)[None]
+        )
+        loss = str(rng.choice(LOSSES))
+        return made._replace(loss=loss, scale=np.array([10.0 ** rng.uniform(-12, 12)])) if loss else made

@@ -1,0 +1,200 @@
+"""Whatever is admitted, a map never holds a number that is not finite, and what would lead there is refused by name."""
+
+import math
+import random
+import warnings
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from naive.random_extremes import MOST, Extremes
+
+from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.service.arrival import read_insert
+from factorbus.service.config import Limits
+from factorbus.service.events import Arrived, Judged, Stepped
+from factorbus.service.fold import Folder
+from factorbus.service.questions import Question
+from factorbus.solver import Options, Solver
+
+POINT = symbol("l", 0)
+MODES = ("tree", "inc-l", "all-batch")
+# What an insert within its bounds may be refused for.
+REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialised", "out_of_bounds", "bad_sight",
+           "bad_direction", "not_positive_definite", "bad_range"}  # fmt: skip
+
+
+class Map:
+    """A map as the service has it, asked after every insert whether everything in it is a number."""
+
+    def __init__(self, mode: str) -> None:
+        self.folder = Folder(lambda: Solver(Options(mode=mode)), 9, Limits())
+        self.values: dict[int, np.ndarray] = {}
+        self.sequence = 0
+
+    def insert(self, batch: Batch, changes: tuple[Change, ...] = (), settle: bool = False) -> str:
+        """Code of the answer."""
+        events, _ = self.folder.fold_whole([self.arrived(batch, changes, settle)])
+        (answer,) = [o.answer for e in events if isinstance(e, Judged) for o in e.outcomes]
+        for event in events:
+            if isinstance(event, Stepped):
+                self._follow(codec.decode_delta(event.delta))
+        if isinstance(answer, bytes):
+            return "accepted"
+        return str(getattr(answer, "code", answer))
+
+    def arrived(self, batch: Batch, changes: tuple[Change, ...] = (), settle: bool = False) -> Arrived:
+        """The next insert, as it comes from the bus."""
+        self.sequence += 1
+        message = codec.encode_insert(Insert(self.sequence, batch, settle, changes=changes))
+        arrived = read_insert(None, "a", message, REQUEST_LIMITS, 0.0)
+        assert isinstance(arrived, Arrived), arrived
+        return arrived._replace(askers=[])
+
+    def _follow(self, delta: codec.Delta) -> None:
+        assert all(math.isfinite(number) for number in delta.report.values() if isinstance(number, float)), delta.report
+        for group in delta.variables:
+            assert group.values is not None
+            assert (np.abs(group.values) <= MOST).all(), (group.kind, group.values)
+            self.values |= dict(zip(group.keys.tolist(), group.values, strict=True))
+
+    def estimate(self) -> dict[int, bytes]:
+        taken = self.folder.snapshot([Question("estimate")])
+        return {int(k): row.tobytes() for g in taken.variables for k, row in zip(g.keys, g.values, strict=True)}  # type: ignore[arg-type]
+
+
+def fuzz(mode: str, seed: int, inserts: int) -> Counter[str]:
+    """One map with so many inserts; how they were answered."""
+    rng = np.random.default_rng(seed)
+    world, tried, codes = Extremes(rng), Map(mode), Counter[str]()
+    batch = world.begin()
+    assert tried.insert(batch) == "accepted"
+    world.accept(batch)
+    for _ in range(inserts):
+        batch, before = world.next(), dict(tried.values)
+        code = tried.insert(batch, settle=bool(rng.random() < 0.2))
+        codes[code] += 1
+        assert code in REASONS, f"seed {seed}"
+        assert math.isfinite(tried.folder.chi2()), f"seed {seed}"
+        if code == "accepted":
+            world.accept(batch)
+        else:
+            assert tried.values.keys() == before.keys()
+    return codes
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_admissible_extremes_never_poison_a_map(mode: str, record_property: Any) -> None:
+    first = random.randrange(2**32)
+    print("seeds from", first)
+    codes = Counter[str]()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        for seed in range(first, first + 60):
+            codes += fuzz(mode, seed, 25)
+    record_property("codes", dict(codes))
+    assert codes["accepted"] > 100, codes
+
+
+def start(mode: str) -> Map:
+    """A point that is weakly known."""
+    made = Map(mode)
+    prior = Factors("prior_point2", np.array([[POINT]]), np.zeros((1, 2)), np.array([[1e-9, 0, 1e-9]]))
+    assert made.insert(Batch((Variables("point2", np.array([POINT]), np.zeros((1, 2))),), (prior,))) == "accepted"
+    return made
+
+
+def far(b: float) -> Batch:
+    """What puts the point at −b · 10⁵."""
+    measured = np.array([[0, 0, 1e-5, 0, 0, 1e-5, b, 0]])
+    return Batch((), (Factors("linear_point2", np.array([[POINT]]), measured, np.array([[1e15, 0, 1e15]])),))
+
+
+def near(x: float) -> Batch:
+    return Batch((), (Factors("prior_point2", np.array([[POINT]]), np.array([[x, 0.0]]), np.array([[1.0, 0, 1.0]])),))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_step_that_diverges_from_unusual_numbers_leaves_every_bit(mode: str) -> None:
+    tried, other = start(mode), start(mode)
+    before, revision = tried.estimate(), tried.folder.revision
+    assert tried.insert(far(1e9)) == "diverged"  # beyond 1e8 it is tried on a copy
+    assert (tried.estimate(), tried.folder.revision) == (before, revision)
+    for x in (1.0, 2.0):
+        assert (tried.insert(near(x)), other.insert(near(x))) == ("accepted", "accepted")
+        assert tried.estimate() == other.estimate()
+    assert tried.folder.chi2() == other.folder.chi2()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_step_that_diverges_from_usual_numbers_is_undone(mode: str) -> None:
+    tried = start(mode)
+    before = tried.estimate()
+    assert tried.insert(far(9e7)) == "diverged"
+    assert tried.values[POINT].tolist() == [0.0, 0.0]
+    assert tried.estimate() == before
+    assert tried.insert(near(1.0)) == "accepted"
+    np.testing.assert_allclose(tried.values[POINT], [1.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_of_several_inserts_only_the_guilty_is_refused(mode: str) -> None:
+    tried = start(mode)
+    arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0))]
+    events, _ = tried.folder.fold_whole(arrived)
+    answers = [o.answer for e in events if isinstance(e, Judged) for o in e.outcomes]
+    assert [getattr(answer, "code", "accepted") for answer in answers] == ["accepted", "diverged", "accepted"]
+    estimate = tried.folder.snapshot([Question("estimate")]).variables[0].values
+    np.testing.assert_allclose(estimate, [[2.0, 0.0]], atol=1e-6)
+
+
+def test_changes_have_the_same_bounds_and_undo_what_was_far() -> None:
+    tried = start("tree")
+    assert tried.insert(near(1.0)) == "accepted"
+    ids = np.array([1])
+
+    def change(name: str, **more: object) -> str:
+        return tried.insert(Batch(), (Change(name, **more),))  # type: ignore[arg-type]
+
+    assert change("weigh", factors=ids, weight=np.array([1e25])) == "bad_weight"
+    assert change("weigh", factors=ids, weight=np.array([1e-25])) == "bad_weight"
+    assert change("loss", factors=ids, loss="huber", scale=np.array([1e13])) == "bad_loss"
+    place = {"kind": "point2", "keys": np.array([POINT])}
+    assert change("place", **place, values=np.array([[1e13, 0.0]])) == "out_of_bounds"
+    assert change("place", **place, values=np.array([[np.nan, 0.0]])) == "not_finite"
+    assert change("weigh", factors=ids, weight=np.array([1e23])) == "accepted"
+    assert change("remove_factors", factors=ids) == "accepted"
+    np.testing.assert_allclose(tried.values[POINT], [0.0, 0.0], atol=1e-6)
+
+
+def test_the_reported_case_is_refused_by_name() -> None:
+    tried = Map("tree")
+    x0 = Variables("se2", np.array([symbol("x", 0)]), np.zeros((1, 3)), fixed=True)
+    assert tried.insert(Batch((x0,))) == "accepted"
+    ends = np.array([[symbol("x", 0), POINT]])
+    batch = Batch(
+        (Variables("point2", np.array([POINT]), np.array([[-0.248, 1.8557e124]])),),
+        (
+            Factors("bearing_range_se2", ends, np.array([[-0.3937, 1.4403]]), np.array([[3.3608, 1.4943, 7.8659]])),
+            Factors("range_se2", ends, np.array([[0.48218]]), np.array([[0.04454]])),
+        ),
+    )
+    assert tried.insert(batch) == "out_of_bounds"
+    assert tried.folder.size == (1, 0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_run_again_from_a_journal_it_comes_to_the_same_bits(mode: str) -> None:
+    tried, again = start(mode), start(mode)
+    arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0), far(1e9), near(2.0))]
+    for one in arrived:
+        events, _ = tried.folder.fold_whole([one])
+        assert not any(event.rebuilt for event in events if isinstance(event, Stepped)), "no fault of the solver"
+        list(again.folder.fold_again([one], rebuilt=False))
+        assert (tried.folder.revision, tried.folder.size) == (again.folder.revision, again.folder.size)
+        assert tried.estimate() == again.estimate()
+    assert tried.folder.size == (1, 4)
