@@ -20,7 +20,7 @@ from factorbus.cli.screen import document, table
     help="Where the other map's pose (its new key) is, seen from one of NAME: x,y,theta or x,y,z,qx,qy,qz,qw.",
 )
 @click.option("--frame", metavar="T", help="Where the origin of OTHER is in NAME, if there is no anchor; as above.")
-@click.option("--sigmas", metavar="S", help="Standard deviations of anchors or frame: 0.1,0.1,0.05; in space six.")
+@click.option("--sigmas", metavar="S", help="Standard deviations of anchors or frame: 0.1,0.1,0.05; in space six: metres, then radians.")
 @click.option(
     "--absolute",
     type=click.Choice(["refuse", "leave-out", "keep"]),

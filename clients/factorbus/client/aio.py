@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Doubt
 from factorbus.client.changes import Changes
-from factorbus.client.draft import Draft, Key
+from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
+from factorbus.client.key_numbers import Key
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
 from factorbus.client.merging import Merged, fit_into
@@ -217,7 +218,7 @@ class Map:
         """Join the map as it is now and return its epoch; numbering starts again."""
         return await asyncio.to_thread(self._map.rejoin)
 
-    async def ask_estimate(self, of: list[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+    async def ask_estimate(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Estimate:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.estimate(of, timeout_s))
 
@@ -226,7 +227,7 @@ class Map:
         return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s))
 
     async def repair(
-        self, factors: Sequence[int] | None = None, *, probability: float = 0.99, timeout_s: float | None = None
+        self, factors: Sequence[int] | int | None = None, *, probability: float = 0.99, timeout_s: float | None = None
     ) -> Repaired:
         """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))

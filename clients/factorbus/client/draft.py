@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
+from factorbus.client.key_numbers import Key, key_number, key_numbers
 from factorbus.client.linear import linear_pieces
 from factorbus.client.mounted import moved_se2, moved_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadShape, UnknownKind
-from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.proto.symbols import format_symbol
 
-Key: TypeAlias = str | int
 _Kind = TypeVar("_Kind")
 _Row: TypeAlias = NDArray[np.float64]
 
@@ -28,8 +28,9 @@ class Draft:
 
     A key is "x12" or an int64.  A variable without a value gets one from the first factor of the same insert that
     reaches it.  fixed: the variable is held where it is (a map's first pose, say).
-    Every factor needs a certainty: sigmas= or information=.  Raises BadSymbol, BadShape, BadInformation, BadLoss,
-    UnknownKind.
+    Every factor needs a certainty: sigmas=, standard deviations in metres and radians (also of rotations in space), or
+    information=, and may have a loss= (`factorbus.client.certainty.Certainty`).
+    Raises BadSymbol, BadShape, BadInformation, BadLoss, UnknownKind.
     """
 
     def __init__(self) -> None:
@@ -62,7 +63,11 @@ class Draft:
         return self.factor("prior_se2", (key,), measured, **certainty)
 
     def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
-        """Where a pose in space is in the map: x y z (metres), qx qy qz qw."""
+        """Where a pose in space is in the map: x y z (metres), qx qy qz qw.
+
+        Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
+        g2o: 4/s² for s radians.
+        """
         return self.factor("prior_se3", (key,), measured, **certainty)
 
     def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
@@ -91,7 +96,7 @@ class Draft:
         if mount is not None:
             where = self._between(first, second, "between_se2")
             measured, A = moved_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = carried(where, 3, certainty, A)
+            certainty = carried(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -103,14 +108,17 @@ class Draft:
         mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
     ) -> "Draft":
-        """The second pose in the first one's frame: x y z (metres), qx qy qz qw; residual x y z, then half-angles.
+        """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
+
+        Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
+        g2o: 4/s² for s radians.
 
         mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
         """
         if mount is not None:
             where = self._between(first, second, "between_se3")
             measured, A = moved_se3(where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7))
-            certainty = carried(where, 6, certainty, A)
+            certainty = carried(where, 6, certainty, A, "between_se3")
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -205,7 +213,7 @@ class Draft:
         What is of more than two variables, or has more rows than the smaller has scalars, is sent as several factors,
         which sum to it: they stay or go together, and have no loss.
         """
-        numbers = [_number(key) for key in keys]
+        numbers = key_numbers(keys).tolist()
         for pieces in linear_pieces(numbers, values, jacobians, residual, kinds, certainty):
             self._linear.append(pieces)
         return self
@@ -221,7 +229,7 @@ class Draft:
         sigma_rho: float,
         sigma_pixel: float = 1.0,
         sigma_anchor: float = 1e-4,
-        loss: tuple[str, float] | None = None,
+        loss: tuple[str, float] | str | None = None,
     ) -> "Draft":
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
@@ -246,7 +254,7 @@ class Draft:
     def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
-        number = _number(key)
+        number = key_number(key)
         row = None if value is None else _row(f"{kind} {format_symbol(number)}", value, size)
         keys, rows = self._variables.setdefault((kind, row is not None, fixed), ([], []))
         keys.append(number)
@@ -263,13 +271,13 @@ class Draft:
     ) -> "Draft":
         """A factor of any kind of `factorbus.proto.kinds`."""
         of = _known(FACTOR_KINDS, kind)
-        numbers = [_number(key) for key in keys]
+        numbers = key_numbers(keys).tolist()
         where = " ".join([kind, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
         name, scale = loss_of(where, certainty.get("loss"))
-        triangle = triangle_of(where, of.dim, certainty)
+        triangle = triangle_of(where, of.dim, certainty, kind)
         all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
         scales.append(scale)
         all_keys.append(numbers)
@@ -279,7 +287,7 @@ class Draft:
 
     def _between(self, first: Key, second: Key, kind: str) -> str:
         """What an error says it is about."""
-        return " ".join([kind, *(format_symbol(_number(key)) for key in (first, second))])
+        return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
 
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
@@ -311,12 +319,11 @@ def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     return kinds[kind]
 
 
-def _number(key: Key) -> int:
-    return parse_symbol(key) if isinstance(key, str) else int(key)
-
-
 def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
-    row = np.array(numbers, np.float64)
+    try:
+        row = np.array(numbers, np.float64)
+    except (TypeError, ValueError):
+        raise BadShape(where, repr(numbers)[:80], f"({size},) numbers") from None
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")
     return row

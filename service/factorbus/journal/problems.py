@@ -83,6 +83,19 @@ class JournalDiffers(Problem):
         )
 
 
+class JournalOption(Problem):
+    """The solver was set up with an option that this version does not have, or not with such a value."""
+
+    code = "journal_option"
+
+    def __init__(self, name: str, what: str) -> None:
+        super().__init__(
+            f"the journal's map was solved with the option {name!r}: {what}. Other settings would make other steps, so "
+            "it is not opened; open it with the version of factorbus that wrote it",
+            name=name,
+        )
+
+
 class NoJournal(Problem):
     """There is no journal where one was looked for."""
 
