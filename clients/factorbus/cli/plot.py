@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import ModeChoice, ellipses_option, out_option
+from factorbus.cli.options import ModeChoice, ellipses_option, out_option, zenoh_option
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -30,7 +30,9 @@ def command() -> None:
 
 
 def _source(command: F) -> F:
-    return click.argument("source")(click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(command))
+    return click.argument("source")(
+        click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(zenoh_option(command))
+    )
 
 
 def _out(what: str) -> Callable[[F], F]:
@@ -42,7 +44,7 @@ def _out(what: str) -> Callable[[F], F]:
 @click.option("--solve", is_flag=True, help="Draw the optimum of the graph, found here, instead of the file's values.")
 @ellipses_option(0)
 @_out("map")
-def map_command(source: str, connect: str | None, solve: bool, ellipses: int, out: Path | None) -> None:
+def map_command(source: str, connect: str | None, zenoh: str, solve: bool, ellipses: int, out: Path | None) -> None:
     """Trajectory, landmarks, loop closures, and where odometry alone would have led.
 
     \b
@@ -51,13 +53,13 @@ def map_command(source: str, connect: str | None, solve: bool, ellipses: int, ou
     factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
     """
     from factorbus.cli.picture import draw
-    from factorbus.cli.plot_source import graph_of, solved, spread_in
+    from factorbus.cli.plot_source import graph_of, placed, solved, spread_in
     from factorbus.viz import Course
 
-    drawn = _ready(lambda: graph_of(source, connect), out)
-    drawn = solved(drawn) if solve else drawn
+    drawn = _ready(lambda: graph_of(source, connect, zenoh), out)
+    drawn = solved(drawn) if solve else placed(drawn)
     path = drawn.file("map", out)
-    spread = spread_in(drawn, connect, ellipses) if ellipses else None
+    spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
     draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)
     click.echo(path)
 
@@ -107,7 +109,7 @@ def drive_command(source: str, mode: str, every: int | None, out: Path | None) -
 @command.command("sparsity")
 @_source
 @_out("sparsity")
-def sparsity_command(source: str, connect: str | None, out: Path | None) -> None:
+def sparsity_command(source: str, connect: str | None, zenoh: str, out: Path | None) -> None:
     """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
 
     \b
@@ -116,7 +118,7 @@ def sparsity_command(source: str, connect: str | None, out: Path | None) -> None
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot sparsity")
-    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh), out)
     from factorbus.cli.sparsity import pattern_of
     from factorbus.viz import save, sparsity_figure
 
@@ -128,7 +130,7 @@ def sparsity_command(source: str, connect: str | None, out: Path | None) -> None
 @command.command("tree")
 @_source
 @_out("tree")
-def tree_command(source: str, connect: str | None, out: Path | None) -> None:
+def tree_command(source: str, connect: str | None, zenoh: str, out: Path | None) -> None:
     """The elimination tree of Λ, and what of it the last loop closure makes anew.
 
     \b
@@ -137,7 +139,7 @@ def tree_command(source: str, connect: str | None, out: Path | None) -> None:
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot tree")
-    drawn = _ready(lambda: graph_of(source, connect), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh), out)
     from factorbus.cli.sparsity import last_loop, pattern_of
     from factorbus.viz import save, tree_figure
 

@@ -9,6 +9,8 @@ Answers come from the bus's threads straight into futures of the loop; only conn
 are rare, and putting large covariances together borrow a thread of the loop's executor.
 """
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -43,7 +45,7 @@ async def connect(
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
     zenoh: str | PathLike[str] = "",
-) -> AsyncIterator["Bus"]:
+) -> AsyncIterator[Bus]:
     """As `factorbus.client.connect`, in `async with`."""
     bus = await asyncio.to_thread(
         sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings, zenoh=zenoh
@@ -63,7 +65,7 @@ class Bus:
     @asynccontextmanager
     async def map(
         self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True
-    ) -> AsyncIterator["Map"]:
+    ) -> AsyncIterator[Map]:
         """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
         joined = await asyncio.to_thread(self._bus.map, name, mode, window=window, mirror=mirror, create=create)
         try:
@@ -74,7 +76,7 @@ class Bus:
             await asyncio.to_thread(joined.close)
 
     @asynccontextmanager
-    async def features(self, camera: Camera, **prior: Any) -> AsyncIterator["Features"]:
+    async def features(self, camera: Camera, **prior: Any) -> AsyncIterator[Features]:
         """As `factorbus.client.Bus.features`, in `async with`."""
         front = self._bus.features(camera, **prior)
         try:
@@ -98,9 +100,9 @@ class Bus:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""
         return await asyncio.to_thread(self._bus.fork, name, target)
 
-    async def drop(self, name: str) -> None:
-        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
-        await asyncio.to_thread(self._bus.drop, name)
+    async def drop(self, name: str, *, missing_ok: bool = False) -> None:
+        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName, UnknownMap (not if missing_ok)."""
+        await asyncio.to_thread(self._bus.drop, name, missing_ok=missing_ok)
 
 
 class Features:
@@ -166,7 +168,7 @@ class Map:
 
     async def merge(
         self,
-        other: "Graph | Map",
+        other: Graph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -240,9 +242,9 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.stats(timeout_s))
 
-    async def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o" or "tum".  Raises Refused, Unavailable."""
-        return await asyncio.wrap_future(self._map.ask.export(format, timeout_s))
+    async def export(self, format: str = "g2o", timeout_s: float | None = None, *, robot: str | None = None) -> str:
+        """The map as the text of a file: "g2o", "tum" or "kitti", as `Map.export`.  Raises Refused, Unavailable."""
+        return await asyncio.wrap_future(self._map.ask.export(format, timeout_s, robot))
 
     async def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the mirror is at `revision` or later and not stale.  Raises Unavailable."""

@@ -1,5 +1,7 @@
 """What a map can be asked about its uncertainty, for asyncio; see `factorbus.client.uncertainty`."""
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import Sequence
 

@@ -1,5 +1,7 @@
 """How certain a measurement is, as a front end says it: checked, and brought into the form of the wire."""
 
+from __future__ import annotations
+
 import types
 from collections.abc import Mapping
 from typing import TypedDict

@@ -6,6 +6,8 @@ A factor is called by its id: `first_factor` of the answer to the insert that br
 of the batch; `Map.graph` tells the ids of all.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -29,15 +31,15 @@ class Changes:
     def __init__(self) -> None:
         self._changes: list[Change] = []
 
-    def remove_factors(self, factors: Iterable[int] | int) -> "Changes":
+    def remove_factors(self, factors: Iterable[int] | int) -> Changes:
         """These factors go."""
         return self._add(Change("remove_factors", id_numbers("changes", factors)))
 
-    def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> "Changes":
+    def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> Changes:
         """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
         return self._add(Change("remove_variables", keys=_keys(keys), alone=alone))
 
-    def undo(self, batch: Batch | Draft, accepted: Accepted) -> "Changes":
+    def undo(self, batch: Batch | Draft, accepted: Accepted) -> Changes:
         """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
         batch = batch.batch() if isinstance(batch, Draft) else batch
         brought = [group.keys for group in batch.variables]
@@ -45,7 +47,7 @@ class Changes:
         self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
         return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
 
-    def loss(self, factors: Iterable[int] | int, name: str, scale: ArrayLike | None = None) -> "Changes":
+    def loss(self, factors: Iterable[int] | int, name: str, scale: ArrayLike | None = None) -> Changes:
         """These factors have this loss from now on ("": none).
 
         scale: one, or one for each, standard deviations; None: that of `certainty.DEFAULT_SCALES`.
@@ -59,20 +61,20 @@ class Changes:
             raise BadLoss("changes", f"the scale {scale!r}", "finite numbers above 0, standard deviations")
         return self._add(Change("loss", ids, loss=name, scale=scales))
 
-    def weigh(self, factors: Iterable[int] | int, weight: ArrayLike) -> "Changes":
+    def weigh(self, factors: Iterable[int] | int, weight: ArrayLike) -> Changes:
         """The information matrices of these factors are multiplied by this (one, or one for each)."""
         ids = id_numbers("changes", factors)
         return self._add(Change("weigh", ids, weight=_each("weight", weight, ids)))
 
-    def fix(self, *keys: Key | Sequence[Key]) -> "Changes":
+    def fix(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are held where they are."""
         return self._add(Change("fix", keys=_keys(keys)))
 
-    def free(self, *keys: Key | Sequence[Key]) -> "Changes":
+    def free(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are estimated again."""
         return self._add(Change("free", keys=_keys(keys)))
 
-    def marginalise(self, *keys: Key | Sequence[Key]) -> "Changes":
+    def marginalise(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables go; what their factors say of the others is kept, as linear factors.
 
         Refused (too_connected) where what hangs together shares factors with more than 128 variables that stay.  Before
@@ -81,13 +83,13 @@ class Changes:
         """
         return self._add(Change("marginalise", keys=_keys(keys)))
 
-    def place(self, groups: Iterable[Variables]) -> "Changes":
+    def place(self, groups: Iterable[Variables]) -> Changes:
         """Variables go to the values in `groups`, as in an estimate; the map goes on from there."""
         for group in groups:
             self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values))
         return self
 
-    def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> "Changes":
+    def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
         """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
         if loss is None:
             self.remove_factors(repaired.factors.tolist())
@@ -99,7 +101,7 @@ class Changes:
         """What has been put together so far."""
         return tuple(self._changes)
 
-    def _add(self, change: Change) -> "Changes":
+    def _add(self, change: Change) -> Changes:
         self._changes.append(change)
         return self
 

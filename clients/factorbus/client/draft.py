@@ -3,6 +3,8 @@
 Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.02))
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias, TypeVar, Unpack
 
@@ -38,31 +40,31 @@ class Draft:
         self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
         self._linear: list[Factors] = []
 
-    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
         return self.variable("se2", key, value, fixed=fixed)
 
-    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A pose in space: x y z (metres), unit quaternion qx qy qz qw."""
         return self.variable("se3", key, value, fixed=fixed)
 
-    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A point in the plane: x y (metres)."""
         return self.variable("point2", key, value, fixed=fixed)
 
-    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A point in space: x y z (metres)."""
         return self.variable("point3", key, value, fixed=fixed)
 
-    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, fixed=fixed)
 
-    def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
         return self.factor("prior_se2", (key,), measured, **certainty)
 
-    def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in space is in the map: x y z (metres), qx qy qz qw.
 
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
@@ -70,11 +72,11 @@ class Draft:
         """
         return self.factor("prior_se3", (key,), measured, **certainty)
 
-    def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point in the plane is in the map: x y (metres)."""
         return self.factor("prior_point2", (key,), measured, **certainty)
 
-    def prior_point3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_point3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point in space is in the map: x y z (metres)."""
         return self.factor("prior_point3", (key,), measured, **certainty)
 
@@ -86,7 +88,7 @@ class Draft:
         *,
         mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
 
         mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
@@ -107,7 +109,7 @@ class Draft:
         *,
         mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
 
         Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
@@ -127,7 +129,7 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
         return self.factor("landmark_se2", (pose, point), measured, **certainty)
 
@@ -137,7 +139,7 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point3 in the pose's frame: x y z (metres)."""
         return self.factor("landmark_se3", (pose, point), measured, **certainty)
 
@@ -147,13 +149,13 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
 
     def position_se2(
         self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
         return self.factor(
             "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
@@ -161,36 +163,36 @@ class Draft:
 
     def position_se3(
         self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
         return self.factor(
             "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
         )
 
-    def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane looks, in the map: theta (radians)."""
         return self.factor("heading_se2", (key,), [theta], **certainty)
 
     def attitude_se3(
         self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
         both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
         return self.factor("attitude_se3", (key,), both, **certainty)
 
-    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
         """How far a point2 is from the pose (metres)."""
         return self.factor("range_se2", (pose, point), [distance], **certainty)
 
-    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
         """How far a point3 is from the pose (metres)."""
         return self.factor("range_se3", (pose, point), [distance], **certainty)
 
-    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
         return self.factor("bearing_se2", (pose, point), [bearing], **certainty)
 
-    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
         return self.factor("bearing_se3", (pose, point), _row("direction", direction, 3), **certainty)
 
@@ -203,7 +205,7 @@ class Draft:
         *,
         kinds: Sequence[str] | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """What you have linearised yourself, of up to 128 variables: r = sum H (x - y) + b.
 
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
@@ -230,7 +232,7 @@ class Draft:
         sigma_pixel: float = 1.0,
         sigma_anchor: float = 1e-4,
         loss: tuple[str, float] | str | None = None,
-    ) -> "Draft":
+    ) -> Draft:
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
         sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
@@ -241,17 +243,17 @@ class Draft:
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
         return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
 
     def point_seen(
         self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
         return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
 
-    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
         number = key_number(key)
@@ -268,7 +270,7 @@ class Draft:
         keys: Sequence[Key],
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A factor of any kind of `factorbus.proto.kinds`."""
         of = _known(FACTOR_KINDS, kind)
         numbers = key_numbers(keys).tolist()

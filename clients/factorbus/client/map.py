@@ -1,5 +1,7 @@
 """One map, as a client works with it."""
 
+from __future__ import annotations
+
 import os
 import threading
 import time
@@ -71,7 +73,7 @@ class Map:
         self.ask = Questions(courier, self.name, timeout_s)
         self.doubt = Doubt(DoubtQuestions(courier, self.name, timeout_s))
 
-    def __enter__(self) -> "Map":
+    def __enter__(self) -> Map:
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
@@ -126,7 +128,7 @@ class Map:
 
     def merge(
         self,
-        other: "Graph | Map",
+        other: Graph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -236,9 +238,12 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return self.ask.stats(timeout_s).result()
 
-    def export(self, format: str = "g2o", timeout_s: float | None = None) -> str:
-        """The map as the text of a file: "g2o", "tum" or "kitti".  Raises Refused, Unavailable."""
-        return self.ask.export(format, timeout_s).result()
+    def export(self, format: str = "g2o", timeout_s: float | None = None, *, robot: str | None = None) -> str:
+        """The map as the text of a file: "g2o", "tum" or "kitti".  Raises Refused, Unavailable.
+
+        robot: of a trajectory, the letter of the poses' keys; "" for keys without one.
+        """
+        return self.ask.export(format, timeout_s, robot).result()
 
     def close(self) -> None:
         """Leave the map.  What is unanswered fails with Unavailable; `flush` first, or leave `with`, to wait."""

@@ -40,9 +40,10 @@ class Questions:
         """What the service counts and times about the map."""
         return self._ask("stats", codec.encode_map({}), codec.decode_map, timeout_s)
 
-    def export(self, format: str, timeout_s: float | None) -> Future[str]:
-        """The map as the text of a file."""
-        return self._ask("export", codec.encode_map({"format": format}), _text, timeout_s)
+    def export(self, format: str, timeout_s: float | None, robot: str | None = None) -> Future[str]:
+        """The map as the text of a file; of one robot's trajectory, if it is said whose."""
+        asked = {"format": format} | ({} if robot is None else {"robot": robot})
+        return self._ask("export", codec.encode_map(asked), _text, timeout_s)
 
     def repair(
         self, factors: Sequence[int] | int | None, probability: float, timeout_s: float | None

@@ -8,6 +8,8 @@ Covariances are in tangent spaces: of local increments, translation first, metre
 is needed here.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, TypeVar
@@ -17,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft
-from factorbus.client.key_numbers import Key, key_number, key_numbers
+from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.proto import asking_codec, keys
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import (
@@ -176,7 +178,9 @@ def asked_why(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")
-    return AskWhy(None if key is None else key_number(key), factor)
+    return AskWhy(
+        None if key is None else key_number(key), None if factor is None else int(id_numbers("why", factor)[0])
+    )
 
 
 def sightings(

@@ -96,6 +96,19 @@ class JournalOption(Problem):
         )
 
 
+class MapThere(Problem):
+    """A map of that name is in the folder already."""
+
+    code = "map_exists"
+
+    def __init__(self, where: Path) -> None:
+        super().__init__(
+            f"there is a map {where.name!r} in {where.parent} already, and it stays as it is: give the new one another "
+            "name (--as), or drop that one first",
+            map=where.name,
+        )
+
+
 class NoJournal(Problem):
     """There is no journal where one was looked for."""
 

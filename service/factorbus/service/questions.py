@@ -25,12 +25,13 @@ from factorbus.solver.errors import SolverError
 from factorbus.solver.repair import repair
 
 _FORMATS = ("g2o", "tum", "kitti")
+_LETTER_BITS = 56
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export.
-    ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
+    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format, robot: of
+    export.  ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Question:
     batch: bool = False
     timeout_s: float = 60.0
     format: str = "g2o"
+    robot: str | None = None
     ask: Any = None
 
 
@@ -89,7 +91,7 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
     if name == "export" and content.get("format", "g2o") not in _FORMATS:
         raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {content['format']!r:.40}")
-    return Question(name, format=content.get("format", "g2o"))
+    return Question(name, format=content.get("format", "g2o"), robot=_robot(content))
 
 
 def snapshot(
@@ -155,7 +157,7 @@ def answer(question: Question, taken: Snapshot) -> bytes:
             "epoch": taken.epoch,
             "revision": taken.revision,
             "format": question.format,
-            "text": _text(question.format, taken.graph.batch),
+            "text": _text(question, taken.graph.batch),
         }
     )
 
@@ -206,10 +208,40 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     return tuple(chosen)
 
 
-def _text(kind: str, batch: Batch) -> str:
+def _text(question: Question, batch: Batch) -> str:
+    """Raises UnknownQuestion, FormatError."""
     from factorbus.formats import g2o_text, kitti_text, tum_text  # only who asks for an export pays for it
 
-    return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[kind](batch)
+    batch = batch if question.robot is None else _of_robot(batch, question.robot)
+    return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[question.format](batch)
+
+
+def _of_robot(batch: Batch, robot: str) -> Batch:
+    """The poses whose keys have this letter.  Raises UnknownQuestion."""
+    code = ord(robot) if robot else 0
+    poses = [group for group in batch.variables if group.kind in ("se2", "se3") and group.values is not None]
+    chosen = [(group, group.keys >> _LETTER_BITS == code) for group in poses]
+    if not any(rows.any() for _, rows in chosen):
+        letters = np.unique(np.concatenate([np.empty(0, np.int64), *(group.keys >> _LETTER_BITS for group in poses)]))
+        told = ", ".join(chr(letter) if letter else '""' for letter in letters.tolist()) or "none: there is no pose"
+        raise UnknownQuestion("export", f"a robot of {told}, not {robot!r}")
+    variables = [
+        Variables(group.kind, group.keys[rows], group.values[rows], group.fixed)
+        for group, rows in chosen
+        if group.values is not None
+    ]
+    return Batch(tuple(variables))
+
+
+def _robot(content: dict[str, Any]) -> str | None:
+    robot = content.get("robot")
+    if robot is None:
+        return None
+    if not isinstance(robot, str) or len(robot) > 1 or (robot and not (robot.isascii() and robot.isalpha())):
+        raise UnknownQuestion("export", f"one ASCII letter as robot, not {robot!r:.40}")
+    if content.get("format", "g2o") == "g2o":
+        raise UnknownQuestion("export", "no robot with g2o, which has the whole graph")
+    return robot
 
 
 def _flag(content: dict[str, Any], name: str) -> bool:

@@ -47,7 +47,7 @@ RANGES = types.MappingProxyType(
         "tol": _AMOUNT,
         "small_loop": _count(0),
         "big_loop": _count(0),
-        "loop_share": _SHARE,
+        "loop_share": _AMOUNT,
         "negligible": _AMOUNT,
         "max_iterations": _count(0),
         "settle_tolerance": _AMOUNT,

@@ -168,7 +168,7 @@ class TreeSteps:
         return _new(StepReport, (
             "tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
-            because or (f"{relinearised} variables bent too far" if relinearised else _NONE_BENT),
+            because or (_bent(relinearised, rounds) if relinearised else _NONE_BENT),
             course.iterations if course else rounds,
             chi2,  # chi2
             chi2,  # chi2_before
@@ -186,3 +186,10 @@ class TreeSteps:
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip
+
+
+def _bent(relinearised: int, rounds: int) -> str:
+    """Why variables were relinearised.  In several rounds one variable counts as often as it was."""
+    if rounds > 1:
+        return f"variables bent too far: {relinearised} relinearisations in {rounds} rounds"
+    return f"{relinearised} variable{'s' if relinearised > 1 else ''} bent too far"
