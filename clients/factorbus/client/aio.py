@@ -101,7 +101,7 @@ class Bus:
         return await asyncio.to_thread(self._bus.fork, name, target)
 
     async def drop(self, name: str, *, missing_ok: bool = False) -> None:
-        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName, UnknownMap (not if missing_ok)."""
+        """Drop map `name` and everything in it; as `Bus.drop`.  Raises Refused, Unavailable, BadName, UnknownMap."""
         await asyncio.to_thread(self._bus.drop, name, missing_ok=missing_ok)
 
 
