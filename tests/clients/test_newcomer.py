@@ -27,7 +27,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A service with the map `yard` of two robots, of keys without letters, and none else."""
     with processes(tmp_path_factory.mktemp("newcomer")) as start:
         (found,) = start("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()
-        with connect(found, client="robot") as bus, bus.map("yard") as yard:
+        with connect(found, client="robot", timeout_s=60) as bus, bus.map("yard") as yard:
             for letter in ("a", "b", ""):
                 draft = Draft().se2(f"{letter}0", (len(letter), ord(letter or "z"), 0), fixed=True)
                 for i in range(1, 4):
