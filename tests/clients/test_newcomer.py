@@ -96,7 +96,7 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     assert save(str(whole)) == [str(whole)]
     assert whole.read_text().count("EDGE_SE2") == 9
     assert save(str(way), "--robot", "a") == [str(way)]
-    assert [line.split()[2] for line in way.read_text().splitlines()] == ["97"] * 4
+    assert [float(line.split()[2]) for line in way.read_text().splitlines()] == [97.0] * 4
     each = save(str(tmp_path / "all.kitti"))
     assert each == [str(tmp_path / f"all-{name}.kitti") for name in ("none", "a", "b")]
     assert all(len(Path(path).read_text().splitlines()) == 4 for path in each)
