@@ -100,6 +100,23 @@ def test_what_the_manifests_configure_is_a_configuration(tmp_path: Path) -> None
     assert (config.maps, config.journal) == ("shard2-*", "/var/lib/factorbus")
 
 
+@pytest.mark.parametrize("name", ["solver", "worker"])
+def test_kernels_are_kept_where_the_root_file_system_cannot_be_written(name: str) -> None:
+    """What the image has was compiled for another processor: each node compiles its own, into a volume."""
+    yaml = pytest.importorskip("yaml")
+    (cache,) = re.findall(r"FACTORBUS_CACHE=(\S+)", (DEPLOY / "docker" / "Dockerfile").read_text())
+    documents = list(yaml.safe_load_all((DEPLOY / "kubernetes" / f"{name}.yaml").read_text()))
+    (owner,) = (each for each in documents if each["kind"] in ("StatefulSet", "Deployment"))
+    pod = owner["spec"]["template"]["spec"]
+    kept = {volume["name"] for volume in pod["volumes"] if "emptyDir" in volume}
+    kept |= {claim["metadata"]["name"] for claim in owner["spec"].get("volumeClaimTemplates", ())}
+    for container in (*pod.get("initContainers", ()), *pod["containers"]):
+        assert container["securityContext"]["readOnlyRootFilesystem"]
+        mounted = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
+        assert mounted[cache]["name"] in kept
+        assert not mounted[cache].get("readOnly")
+
+
 def test_compose_is_of_one_piece() -> None:
     yaml = pytest.importorskip("yaml")
     compose = yaml.safe_load((DEPLOY / "docker" / "compose.yaml").read_text())

@@ -31,9 +31,10 @@ def test_the_rest_of_the_readme(tmp_path: Path) -> None:
         assert {"town.g2o", "town.png", "town.tum"} == {path.name for path in tmp_path.iterdir()}
         assert len((tmp_path / "town.tum").read_text().splitlines()) == 1000
         run(*serve)
-        before, after = (line.split("at", 1)[1] for line in run(*program).splitlines())
-    assert distance(before) > 0.05
-    assert distance(after) < distance(before) / 10
+        for _ in range(2):  # whoever tries it twice is not met with an error
+            before, after = (line.split("at", 1)[1] for line in run(*program).splitlines())
+            assert distance(before) > 0.05
+            assert distance(after) < distance(before) / 10
 
 
 def test_the_client_librarys_guide(tmp_path: Path) -> None:
@@ -41,6 +42,7 @@ def test_the_client_librarys_guide(tmp_path: Path) -> None:
     assert len(programs) == 6
     with walker(tmp_path) as run:
         run("bash", "factorbus serve")
+        run(*programs[0])
         said = [run(*program) for program in programs]
     assert "unknown_variable" in said[3]
     assert said[4].rstrip().endswith("False")
@@ -49,13 +51,32 @@ def test_the_client_librarys_guide(tmp_path: Path) -> None:
 
 def test_the_filter_front_end_of_the_workers_guide(tmp_path: Path) -> None:
     (program,) = (block for block in blocks("workers/README.md") if block[0] == "python")
+    (console,) = (block for block in blocks("workers/README.md") if block[0] == "console")
     with walker(tmp_path) as run:
         run("bash", "factorbus serve --no-warm")
         first, second, third = run(*program).splitlines()
+        run(*console)
     assert first == "the state has 31 numbers, made by in-place"
     angles, block = (np.array(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", line), float) for line in (second, third))
     np.testing.assert_allclose(angles, [-0.55, 0.33], atol=0.05)
     assert block.size == 4
+
+
+def test_the_services_guide(tmp_path: Path) -> None:
+    from factorbus.service.config import load
+
+    (console,) = (block for block in blocks("service/README.md") if block[0] == "console")
+    with walker(tmp_path) as run:
+        run(*console)
+    (settings,) = (text for language, text in blocks("service/README.md") if language == "toml")
+    (tmp_path / "serve.toml").write_text(settings)
+    assert load(tmp_path / "serve.toml").limits.waiting == 1024
+
+
+def test_every_block_of_every_guide_is_run_or_checked() -> None:
+    """A language that nothing here or in `test_docs.py` runs would go unseen."""
+    guides = ("README.md", "service/README.md", "workers/README.md", "clients/README.md")
+    assert {language for guide in guides for language, _ in blocks(guide)} == {"bash", "console", "python", "toml"}
 
 
 def test_make_targets_that_documents_name_exist() -> None:

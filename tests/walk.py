@@ -3,6 +3,7 @@
     bash     run as it stands.  A command that stays, such as `factorbus serve`, runs until the document ends, or until
              the document starts it again.  Of `make TARGET` it is only seen that there is such a target.
     python   run as a program.
+    console  each line after `$ ` is run as above; the lines below it are compared with what it prints.
     text     what the block before it printed: every line of it, with … for anything, and any number for a number.
 
 What is said to listen or answer at the usual addresses does so at free ports instead, and loads its kernels when it
@@ -20,7 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = Path(sys.executable).parent
 ENDPOINT, PAGE, METRICS = "tcp/127.0.0.1:7447", "http://127.0.0.1:8080", "127.0.0.1:9464"
-LANGUAGES = {"bash", "python", "text"}
+LANGUAGES = {"bash", "console", "python", "text"}
 # Commands that stay, with what lets them listen at any free port and begin at once.
 _STAYING = {"serve": ["--no-warm", "--listen", "tcp/127.0.0.1:0"], "work": ["--no-warm"], "gateway": ["--port", "0"]}
 _PATIENCE_S = 100.0
@@ -74,6 +75,8 @@ class _Walk:
         self._places = {METRICS: f"127.0.0.1:{_free_port()}"}
 
     def __call__(self, language: str, text: str) -> str:
+        if language == "console":
+            return self._session(text)
         for usual, real in self._places.items():
             text = text.replace(usual, real)
         if language == "python":
@@ -84,6 +87,13 @@ class _Walk:
         if words[0] == "factorbus" and words[1] in _STAYING:
             return self._start(words[1], text.strip())
         return self._run(["bash", "-euo", "pipefail", "-c", text])
+
+    def _session(self, text: str) -> str:
+        said = ""
+        for command, printed in re.findall(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", text, re.M):
+            said = self("bash", command)
+            agrees(printed, said)
+        return said
 
     def _environment(self) -> dict[str, str]:
         there = {"FACTORBUS_ENDPOINT": self._places[ENDPOINT]} if ENDPOINT in self._places else {}

@@ -194,6 +194,8 @@ def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPa
     found = checks.extras()
     assert (found.state, found.mend) == ("ok", "if wanted: pip install 'factorbus[watch]'")
     assert "without watch" in found.seen
+    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda _: None)
+    assert checks.extras().seen == "none installed; without service, viz, watch, record, gateway, ros2"
 
 
 @pytest.mark.parametrize(("answer", "state"), [(0, "ok"), (5, "warn"), (-1, "ok")])
@@ -216,7 +218,12 @@ def test_extras_are_those_of_the_project() -> None:
     from factorbus.cli.exits import EXTRAS
 
     project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
-    distributions = {"sksparse": "scikit-sparse", "rerun": "rerun-sdk", "foxglove": "foxglove-sdk"}
+    distributions = {
+        "prometheus_client": "prometheus-client",
+        "sksparse": "scikit-sparse",
+        "rerun": "rerun-sdk",
+        "foxglove": "foxglove-sdk",
+    }
     for extra, names in EXTRAS.items():
         brought = {re.split(r"[<>=\[]", each)[0] for each in project["optional-dependencies"][extra]}
         assert {distributions.get(name, name) for name in names} <= brought

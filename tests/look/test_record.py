@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from processes import Process
 
 from factorbus.cli.columns import merged
-from factorbus.cli.exits import FAILED, OK, REFUSED
+from factorbus.cli.exits import FAILED, OK
 from factorbus.cli.main import main
 from factorbus.client import connect
 from factorbus.proto.symbols import format_symbol, parse_symbol
@@ -97,12 +97,18 @@ def test_a_recording_has_every_estimate_and_every_factor(
     assert len(found["/map/poses"][-1].poses) == 120
 
 
-def test_a_recording_never_replaces_a_file_and_needs_a_map(endpoint: str, tmp_path: Path, capsys) -> None:
+def test_a_recording_never_replaces_a_file(endpoint: str, tmp_path: Path, capsys) -> None:
     there = tmp_path / "there.mcap"
     there.write_text("mine")
     assert main(["record", "nowhere", "--connect", endpoint, "--out", str(there)]) == FAILED
     assert "is there already" in capsys.readouterr().err
     assert there.read_text() == "mine"
-    assert main(["record", "nowhere", "--connect", endpoint, "--out", str(tmp_path / "new.mcap")]) == REFUSED
-    assert "[unknown_map]" in capsys.readouterr().err
-    assert not (tmp_path / "new.mcap").exists()
+
+
+def test_a_map_that_is_yet_to_come_is_waited_for(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
+    new = tmp_path / "new.mcap"
+    waiting = spawn("-m", "factorbus.cli", "record", "nowhere", "--connect", endpoint, "--out", str(new))
+    waiting.said("there is no map 'nowhere' here;")
+    waiting.signal(signal.SIGINT)
+    assert waiting.wait() == OK
+    assert not new.exists()

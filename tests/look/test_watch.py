@@ -1,6 +1,7 @@
 """`factorbus watch`: the recording holds what the map had, and the served page shows it in a real browser."""
 
 import signal
+import socket
 import time
 from collections import defaultdict
 from collections.abc import Callable
@@ -12,10 +13,10 @@ import pytest
 from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
 
-from factorbus.cli.exits import OK, REFUSED
-from factorbus.cli.main import main
+from factorbus.cli.exits import OK
 from factorbus.client import connect
 from factorbus.proto.messages import Variables
+from factorbus.proto.ports import PortTaken
 from factorbus.simulate import city_trees, manhattan
 from factorbus.viz import style
 from factorbus.viz.geometry import rays_of
@@ -98,6 +99,37 @@ def test_rays_point_where_the_features_angles_say_and_end_at_the_horizon() -> No
     np.testing.assert_allclose(rays[1, 1], [0, 0, 30])
 
 
-def test_a_map_that_is_not_there_is_refused(endpoint: str, tmp_path: Path, capsys) -> None:
-    assert main(["watch", "nowhere", "--connect", endpoint, "--save", str(tmp_path / "a.rrd")]) == REFUSED
-    assert "[unknown_map]" in capsys.readouterr().err
+def test_a_map_that_is_yet_to_come_is_waited_for(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    watcher = spawn("-m", "factorbus.cli", "watch", "later", "--connect", endpoint, "--save", str(path))
+    watcher.said("there is no map 'later' here;")
+    with connect(endpoint, client="robot") as bus, bus.map("later") as joined:
+        for step in manhattan(poses=5, seed=1):
+            joined.insert(step.batch)
+        assert watcher.ready() == [str(path)]
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+    waiting = spawn("-m", "factorbus.cli", "watch", "never", "--connect", endpoint, "--save", str(path))
+    waiting.said("there is no map 'never' here;")
+    waiting.signal(signal.SIGINT)
+    assert waiting.wait() == OK
+    assert "stopped before there was a map never" in waiting.errors()
+
+
+def test_the_viewer_listens_on_this_machine_alone_and_ends_with_whoever_started_it() -> None:
+    from factorbus.viz.viewer_process import Viewer
+
+    data, web = free_port(), free_port()
+    viewer = Viewer("127.0.0.1", data, web)
+    try:
+        with pytest.raises(PortTaken, match=f":{data} is taken"):
+            Viewer("127.0.0.1", data, web)
+        # Any other address of this machine, as one of 127/8 that is not 127.0.0.1, is not listened at.
+        for port in (data, web):
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(("127.0.0.2", port), timeout=5)
+            socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    finally:
+        viewer.stop()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", data), timeout=5)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import FAILED, OK, input_file
-from factorbus.cli.options import DEFAULT_ENDPOINT, file_argument, json_option, zenoh_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
 from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
 
@@ -33,7 +33,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=float, default=30.0, show_default=True, help="Seconds to wait."),
+        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):
@@ -43,7 +43,7 @@ def _asking(command: F) -> F:
 
 _probability = click.option(
     "--probability",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    type=Number(0, 1, min_open=True, max_open=True),
     default=0.95,
     show_default=True,
     help="With which a right measurement passes.",
@@ -158,19 +158,58 @@ def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_
 @command.command("why")
 @_asking
 @click.argument("what")
-def why_command(name: str, what: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+@click.option("--variable", "only", flag_value="variable", help="WHAT is a variable: of a key without a letter, 7.")
+@click.option("--factor", "only", flag_value="factor", help="WHAT is the id of a factor.")
+def why_command(
+    name: str, what: str, only: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
     """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
+
+    A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
+    both are told, unless --variable or --factor says which is meant.
 
     \b
     factorbus ask why warehouse x12
     factorbus ask why warehouse 17 --json
+    factorbus ask why warehouse 7 --variable
     """
+    if only == "factor" and not what.isdecimal():
+        raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
     with _map(name, connect, zenoh, timeout_s) as asked:
-        found = asked.doubt.why(factor=int(what)) if what.isdecimal() else asked.doubt.why(what)
+        told = _accounts(asked, what, only)
     if as_json:
-        content = {"revision": found.revision, "variable": found.variable, "factor": found.factor, "step": found.step}
+        content = {"revision": told[0].revision, "variable": {}, "factor": {}, "step": told[0].step}
+        for found in told:
+            content |= {kind: account for kind in ("variable", "factor") if (account := getattr(found, kind))}
         document(content)
         return OK
+    for found in told:
+        _tell(what, found)
+    return OK
+
+
+def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
+    """Of the variable, of the factor, or of both where WHAT may be either.  Raises Refused."""
+    from factorbus.client import Refused
+
+    if not what.isdecimal() or only == "variable":
+        return [asked.doubt.why(what)]
+    if only == "factor":
+        return [asked.doubt.why(factor=int(what))]
+    told, refused = [], None
+    for how in ({"key": what}, {"factor": int(what)}):
+        try:
+            told.append(asked.doubt.why(**how))
+        except Refused as problem:
+            if problem.code not in ("unknown_variable", "unknown_factor"):
+                raise
+            refused = problem
+    if refused is not None and not told:
+        raise refused
+    return told
+
+
+def _tell(what: str, found: Any) -> None:
     if found.variable:
         table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
         table([(_told(each), _factor_line(each)) for each in found.variable["factors"]], title="Its factors")
@@ -179,7 +218,6 @@ def why_command(name: str, what: str, connect: str, zenoh: str, timeout_s: float
     step = found.step
     if step:
         table([("the last step", f"{step['strategy']}, because {step['because']}")])
-    return OK
 
 
 @command.command("repair")
@@ -189,7 +227,7 @@ def why_command(name: str, what: str, connect: str, zenoh: str, timeout_s: float
 @click.option("--loss", "loss", metavar="LOSS", default="", help="With --apply: keep it, with this robust loss.")
 @click.option(
     "--probability",
-    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    type=Number(0, 1, min_open=True, max_open=True),
     default=0.99,
     show_default=True,
     help="With which a right measurement is kept.",
@@ -284,10 +322,10 @@ def _described(factors: tuple[Any, ...]) -> list[str]:
 @contextmanager
 def _map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> Iterator[Any]:
     """The map, joined only if it is there."""
-    from factorbus.client import connect
+    from factorbus.cli.bus import open_bus
 
     with (
-        connect(endpoint, client="ask", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        open_bus(endpoint, "ask", zenoh, timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):
         yield joined

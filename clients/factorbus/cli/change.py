@@ -8,7 +8,7 @@ import click
 
 from factorbus.cli.exits import OK
 from factorbus.cli.merging import merge_command
-from factorbus.cli.options import DEFAULT_ENDPOINT, json_option, zenoh_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, json_option, zenoh_option
 from factorbus.cli.screen import document, table
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -40,7 +40,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=float, default=30.0, show_default=True, help="Seconds to wait."),
+        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):
@@ -73,7 +73,7 @@ def remove_command(name: str, what: tuple[str, ...], alone: bool, **how: Any) ->
 @command.command("loss")
 @_changing
 @click.argument("loss")
-@click.argument("scale", type=float)
+@click.argument("scale", type=Number())
 @click.argument("factors", nargs=-1, required=True, type=int)
 def loss_command(name: str, loss: str, scale: float, factors: tuple[int, ...], **how: Any) -> int:
     """Give factors a robust LOSS of a SCALE in standard deviations, or take it away with `none`.
@@ -89,7 +89,7 @@ def loss_command(name: str, loss: str, scale: float, factors: tuple[int, ...], *
 
 @command.command("weigh")
 @_changing
-@click.argument("weight", type=float)
+@click.argument("weight", type=Number())
 @click.argument("factors", nargs=-1, required=True, type=int)
 def weigh_command(name: str, weight: float, factors: tuple[int, ...], **how: Any) -> int:
     """Multiply the information of factors by WEIGHT: below 1 they count for less.
@@ -143,9 +143,9 @@ def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float
     factorbus change remove what-if 17 --settle
     factorbus drop what-if
     """
-    from factorbus.client import connect as open_bus
+    from factorbus.cli.bus import open_bus
 
-    with open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus:
+    with open_bus(connect, "change", zenoh, timeout_s) as bus:
         row = bus.fork(name, new)
     if as_json:
         document(asdict(row))
@@ -160,10 +160,10 @@ command.command("merge")(_changing(merge_command))
 
 def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:
     """Send it, and say what came of it."""
-    from factorbus.client import connect as open_bus
+    from factorbus.cli.bus import open_bus
 
     with (
-        open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        open_bus(connect, "change", zenoh, timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):
         accepted = joined.change(changes, settle=settle)

@@ -188,9 +188,9 @@ def wall_clock() -> Finding:
 
 
 def extras() -> Finding:
-    """the extras for looking at maps"""
-    missing = [name for name in EXTRAS if name not in ("service", "viz") and lacking(name)]
-    have = [name for name in EXTRAS if name not in missing]
+    """the extras"""
+    have = [name for name in EXTRAS if not lacking(name)]
+    missing = [name for name in EXTRAS if name not in have]
     seen = f"{', '.join(have) or 'none'} installed" + (f"; without {', '.join(missing)}" if missing else "")
     mend = f"if wanted: pip install 'factorbus[{','.join(missing)}]'" if missing else ""
     return Finding("extras", "ok", seen, mend)

@@ -29,7 +29,8 @@ class Child:
         self._say = say  # gets what it prints on standard error until it is ready, once that takes long
         self._started = time.monotonic()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "factorbus.cli", *arguments],
+            # -P: a file of the folder we are in must not stand in for a library.
+            [sys.executable, "-P", "-m", "factorbus.cli", *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -9,7 +9,7 @@ import click
 
 from factorbus.cli import screen
 from factorbus.cli.exits import BAD_FILE, FAILED, OK, UNAVAILABLE, USAGE, Stopped
-from factorbus.cli.options import json_option
+from factorbus.cli.options import Number, json_option
 from factorbus.cli.stopping import interrupt_on_sigterm
 from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, check, fetch, find, locate, named
 from factorbus.datasets.download import GITHUB
@@ -74,7 +74,7 @@ def command(context: click.Context, as_json: bool) -> None:
 @click.option(
     "--timeout",
     "timeout_s",
-    type=click.FloatRange(0, min_open=True),
+    type=Number(0, min_open=True),
     default=30,
     show_default=True,
     metavar="S",

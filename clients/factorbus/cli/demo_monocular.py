@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import json_option, out_option
+from factorbus.cli.options import Number, json_option, out_option
 
 _RHO, _SIGMA_RHO = 0.28, 0.2  # 1/metre: anything from 1.5 metres to behind the horizon
 
@@ -23,8 +23,8 @@ _RHO, _SIGMA_RHO = 0.28, 0.2  # 1/metre: anything from 1.5 metres to behind the 
     metavar="N",
     help="In the filter at a time.",
 )
-@click.option("--noise", type=click.FloatRange(0.01, 20.0), default=1.0, show_default=True, metavar="PIXELS")
-@click.option("--outliers", type=click.FloatRange(0.0, 0.5), default=0.05, show_default=True, metavar="SHARE")
+@click.option("--noise", type=Number(0.01, 20.0), default=1.0, show_default=True, metavar="PIXELS")
+@click.option("--outliers", type=Number(0.0, 0.5), default=0.05, show_default=True, metavar="SHARE")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
 @click.option("--workers", type=click.IntRange(0, 64), default=2, show_default=True, metavar="N")
 @out_option("--plot", "plot", "The picture.  [default: out/monocular.png]", "FILE.png")

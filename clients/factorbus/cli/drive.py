@@ -137,6 +137,7 @@ def drive(
         driven.add(batch)
         driven.steps += target.send(batch)
         if every and driven.inserts % every == 0:
+            driven.steps += target.flush()  # what is held against the optimum is this step, not one before it
             target.compare()
         if show is not None and window.due():
             show(driven.poses, window.word(driven))

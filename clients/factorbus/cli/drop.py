@@ -2,7 +2,7 @@
 
 import click
 
-from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
+from factorbus.cli.options import SECONDS, connect_option, zenoh_option
 
 
 @click.command()
@@ -13,11 +13,9 @@ from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
     metavar="N",
     help="Only if the map is at this revision and nothing is under way: what `factorbus export` said.",
 )
-@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@connect_option
 @zenoh_option
-@click.option(
-    "--wait", "wait_s", type=click.FloatRange(0), default=30, show_default=True, metavar="S", help="For the answer."
-)
+@click.option("--wait", "wait_s", type=SECONDS, default=30, show_default=True, metavar="S", help="For the answer.")
 def command(name: str, revision: int | None, endpoint: str, zenoh: str, wait_s: float) -> None:
     """Drop MAP, with its journal. With --revision it stays when somebody inserted meanwhile: `moved_on`, exit code 5.
 
@@ -27,8 +25,8 @@ def command(name: str, revision: int | None, endpoint: str, zenoh: str, wait_s: 
     factorbus drop old-survey
     factorbus drop shard0-hall --revision 4711 --connect tls/router.local:7447 --zenoh ops.json5
     """
-    from factorbus.client import connect
+    from factorbus.cli.bus import open_bus
 
-    with connect(endpoint, client="drop", zenoh=zenoh, timeout_s=wait_s) as bus:
+    with open_bus(endpoint, "drop", zenoh, wait_s) as bus:
         bus.drop(name, revision=revision)
     click.echo(f"{name} is gone")

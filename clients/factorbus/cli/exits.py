@@ -24,7 +24,7 @@ EXIT_CODES = {
 
 # What the extras of pyproject.toml bring, by import name.
 EXTRAS = {
-    "service": ("numba", "scipy", "sksparse"),
+    "service": ("numba", "scipy", "sksparse", "prometheus_client"),
     "viz": ("matplotlib",),
     "watch": ("rerun",),
     "record": ("foxglove",),
@@ -33,7 +33,8 @@ EXTRAS = {
 }
 
 _USAGE_CODES = (
-    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting", "exposed",
+    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting",
+    "cannot_listen", "exposed", "port_taken",
 )  # fmt: skip
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down")
 
@@ -66,6 +67,8 @@ def input_file(path: Path) -> Iterator[None]:
     """Turns what goes wrong in reading `path` into the exit code for a bad file.  Raises Stopped."""
     try:
         yield
+    except UnicodeDecodeError as error:
+        raise Stopped("bad_file", f"{path} is not text: {error.reason}", BAD_FILE, path=str(path)) from error
     except OSError as error:
         raise Stopped("bad_file", f"{path} cannot be read: {error.strerror}", BAD_FILE, path=str(path)) from error
 

@@ -4,11 +4,11 @@ import click
 
 from factorbus.cli.children import READY
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
+from factorbus.cli.options import connect_option, zenoh_option
 
 
 @click.command()
-@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@connect_option
 @zenoh_option
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at; 0.0.0.0: all of them.")
 @click.option(
@@ -29,17 +29,17 @@ def command(endpoint: str, zenoh: str, host: str, port: int, names: tuple[str, .
     curl http://127.0.0.1:8080/api/maps/warehouse/variables/x12
     """
     require("gateway", "factorbus gateway")
-    from factorbus.cli.exits import Stopped
+    from factorbus.cli.bus import open_bus
     from factorbus.cli.stopping import stop_on_signals, wait_until
-    from factorbus.client import connect
     from factorbus.gateway import make_app
     from factorbus.gateway.server import serving
+    from factorbus.proto.ports import listening_problem
 
     hosts = ("127.0.0.1", "localhost", host, *names)
-    with stop_on_signals(until_eof) as stop, connect(endpoint, client="gateway", zenoh=zenoh) as bus:
+    with stop_on_signals(until_eof) as stop, open_bus(endpoint, "gateway", zenoh) as bus:
         try:
             with serving(make_app(bus, hosts), host, port) as bound:
                 click.echo(f"{READY}http://{'127.0.0.1' if host == '0.0.0.0' else host}:{bound}")
                 wait_until(stop)
         except OSError as error:
-            raise Stopped("port_taken", f"{host}:{port}: {error.strerror}; give another --port") from error
+            raise listening_problem(f"{host}:{port}", error) from error

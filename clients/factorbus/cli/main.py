@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import click
 
 from factorbus.cli.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
+from factorbus.proto.version import __version__
 
 # name -> (module, one line).  The lines stand here so that `factorbus --help` imports none of the commands.
 COMMANDS = {
@@ -19,11 +20,13 @@ COMMANDS = {
     "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
     "gateway": ("gateway", "Maps for browsers: a live page, HTTP and WebSocket."),
     "ros2": ("ros2", "Join a robot that speaks ROS 2 over Zenoh to a map."),
+    "maps": ("maps", "The maps of a service: names, sizes, revisions."),
     "top": ("top", "Maps, clients and workers of a service, in the terminal."),
     "record": ("record", "Record a map into an MCAP file, which Foxglove opens."),
     "ask": ("ask", "How certain a map is, what it thinks of a measurement, and why."),
     "change": ("change", "Take something out of a map, count it differently, hold it; fork, merge."),
     "plot": ("plot", "Pictures: a map, a drive, the sparsity of its system, where things may be."),
+    "save": ("save", "Write a map of a service into a g2o, TUM or KITTI file."),
     "convert": ("convert", "Turn one file format into another."),
     "datasets": ("datasets", "The public data sets: what there is, where it is, and fetching it."),
     "journal": ("journal", "What a service keeps on disk: show it, check it, run it again."),
@@ -80,6 +83,7 @@ class _Commands(click.Group):
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
     epilog=_EPILOG + "\n".join(f"  {code:<5}{meaning}" for code, meaning in EXIT_CODES.items()),
 )
+@click.version_option(__version__, prog_name="factorbus", message="%(prog)s %(version)s")
 @click.option("--debug", is_flag=True, help="On an error, show the traceback too (or FACTORBUS_DEBUG=1).")
 def cli(debug: bool) -> None:
     """A SLAM back end that robots talk to over a Zenoh message bus."""

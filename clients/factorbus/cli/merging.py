@@ -20,7 +20,11 @@ from factorbus.cli.screen import document, table
     help="Where the other map's pose (its new key) is, seen from one of NAME: x,y,theta or x,y,z,qx,qy,qz,qw.",
 )
 @click.option("--frame", metavar="T", help="Where the origin of OTHER is in NAME, if there is no anchor; as above.")
-@click.option("--sigmas", metavar="S", help="Standard deviations of anchors or frame: 0.1,0.1,0.05; in space six.")
+@click.option(
+    "--sigmas",
+    metavar="S",
+    help="Standard deviations of anchors or frame: 0.1,0.1,0.05; in space six, metres then radians.",
+)
 @click.option(
     "--absolute",
     type=click.Choice(["refuse", "leave-out", "keep"]),
@@ -43,7 +47,7 @@ def merge_command(
     factorbus change merge hall robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05 --settle
     factorbus change merge hall yard --from tcp/10.0.0.7:7447 --letter x=z --frame 12,-3,0.5 --sigmas 1,1,0.1
     """
-    from factorbus.client import connect as open_bus
+    from factorbus.cli.bus import open_bus
 
     how = {
         "letters": dict(_pair(each) for each in letters),
@@ -52,9 +56,9 @@ def merge_command(
         "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
         "absolute": absolute.replace("-", "_"),
     }
-    with open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus:
+    with open_bus(connect, "change", zenoh, timeout_s) as bus:
         with (
-            open_bus(source or connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as there,
+            open_bus(source or connect, "change", zenoh, timeout_s) as there,
             there.map(other, mirror=False, create=False) as theirs,
         ):
             graph = theirs.graph(timeout_s)

@@ -1,5 +1,6 @@
 """Options that several commands have."""
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,27 @@ class ModeChoice(click.Choice):
         return super().convert(str(value).replace(" ", "-"), param, ctx)
 
 
+class Number(click.FloatRange):
+    """A finite number in a range: click's own lets NaN through."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+# Seconds to wait for something: a day at most, which the operating system's clocks can count.
+SECONDS = Number(0, 86400)
+
+
+def connect_option(command: F) -> F:
+    """--connect, of a service that runs."""
+    return click.option(
+        "--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."
+    )(command)
+
+
 def zenoh_option(command: F) -> F:
     """--zenoh."""
     return click.option(
@@ -51,15 +73,18 @@ def file_argument(name: str) -> Callable[[F], F]:
 def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F]:
     """An option that names a file to write; its folder must exist, which is said before the work and not after."""
     return click.option(
-        flag, name, type=click.Path(path_type=Path), callback=_folder_exists, metavar=metavar, help=text
+        flag, name, type=click.Path(path_type=Path), callback=checked_output, metavar=metavar, help=text
     )
 
 
-def _folder_exists(_ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+def checked_output(_ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    """A file that can be written, as far as that is to be known beforehand."""
     if path is not None and not path.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {path.parent}; make it first", param=parameter)
     if path is not None and path.is_dir():
         raise click.BadParameter(f"{path} is a folder; wanted the name of a file", param=parameter)
+    if path is not None and not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
+        raise click.BadParameter(f"{path} cannot be written: permission denied", param=parameter)
     return path
 
 

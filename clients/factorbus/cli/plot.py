@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import ModeChoice, ellipses_option, out_option
+from factorbus.cli.options import ModeChoice, ellipses_option, out_option, zenoh_option
 from factorbus.cli.reading import reading_options
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -33,7 +33,7 @@ def command() -> None:
 
 def _source(command: F) -> F:
     return click.argument("source")(
-        click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(reading_options(command))
+        click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(zenoh_option(reading_options(command)))
     )
 
 
@@ -49,6 +49,7 @@ def _out(what: str) -> Callable[[F], F]:
 def map_command(
     source: str,
     connect: str | None,
+    zenoh: str,
     dialect: str | None,
     strict: bool,
     solve: bool,
@@ -63,13 +64,13 @@ def map_command(
     factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
     """
     from factorbus.cli.picture import draw
-    from factorbus.cli.plot_source import graph_of, solved, spread_in
+    from factorbus.cli.plot_source import graph_of, placed, solved, spread_in
     from factorbus.viz import Course
 
-    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
-    drawn = solved(drawn) if solve else drawn
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    drawn = solved(drawn) if solve else placed(drawn)
     path = drawn.file("map", out)
-    spread = spread_in(drawn, connect, ellipses) if ellipses else None
+    spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
     draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)
     click.echo(path)
 
@@ -122,7 +123,9 @@ def drive_command(
 @command.command("sparsity")
 @_source
 @_out("sparsity")
-def sparsity_command(source: str, connect: str | None, dialect: str | None, strict: bool, out: Path | None) -> None:
+def sparsity_command(
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+) -> None:
     """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
 
     \b
@@ -131,7 +134,7 @@ def sparsity_command(source: str, connect: str | None, dialect: str | None, stri
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot sparsity")
-    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
     from factorbus.cli.sparsity import pattern_of
     from factorbus.viz import save, sparsity_figure
 
@@ -143,7 +146,9 @@ def sparsity_command(source: str, connect: str | None, dialect: str | None, stri
 @command.command("tree")
 @_source
 @_out("tree")
-def tree_command(source: str, connect: str | None, dialect: str | None, strict: bool, out: Path | None) -> None:
+def tree_command(
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+) -> None:
     """The elimination tree of Λ, and what of it the last loop closure makes anew.
 
     \b
@@ -152,7 +157,7 @@ def tree_command(source: str, connect: str | None, dialect: str | None, strict: 
     from factorbus.cli.plot_source import graph_of
 
     require("service", "factorbus plot tree")
-    drawn = _ready(lambda: graph_of(source, connect, dialect, strict), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
     from factorbus.cli.sparsity import last_loop, pattern_of
     from factorbus.viz import save, tree_figure
 

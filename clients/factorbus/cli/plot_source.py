@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from factorbus.proto.messages import Batch, Variables
 
 if TYPE_CHECKING:
@@ -29,10 +31,12 @@ class Drawn:
         return out or Path(f"{self.name}-{what}.png")
 
 
-def graph_of(source: str, connect: str | None, dialect: str | None = None, strict: bool = False) -> Drawn:
+def graph_of(
+    source: str, connect: str | None, zenoh: str = "", dialect: str | None = None, strict: bool = False
+) -> Drawn:
     """The graph of a file, or, with an endpoint, of the map of that name.  Raises Stopped, FormatError, Problem."""
     if connect is not None:
-        return _from_bus(source, connect)
+        return _from_bus(source, connect, zenoh)
     file = file_of(source, dialect, strict)
     return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}")
 
@@ -43,6 +47,30 @@ def file_of(source: str, dialect: str | None = None, strict: bool = False) -> "G
     from factorbus.cli.replay_source import source_of
 
     return read_graph(source_of(Path(source)), dialect, strict)
+
+
+def placed(drawn: Drawn) -> Drawn:
+    """The same graph with a value for every pose: where the file has none, composed from odometry.  Raises Stopped."""
+    bare = [group for group in drawn.graph.variables if group.values is None and group.keys.size]
+    if not bare:
+        return drawn
+    from factorbus.cli.picture import reckoned
+    from factorbus.cli.screen import note
+
+    have = [group for group in drawn.graph.variables if group.values is not None]
+    missing = np.concatenate([group.keys for group in bare])
+    for group in reckoned(drawn.graph):
+        rows = np.isin(group.keys, missing)
+        if rows.any() and group.values is not None:
+            have.append(Variables(group.kind, group.keys[rows], group.values[rows]))
+    left = np.setdiff1d(missing, np.concatenate([np.empty(0, np.int64), *(group.keys for group in have)])).size
+    composed = missing.size - left
+    note(
+        f"{drawn.name}: {missing.size} variables have no value; {composed} poses are composed from odometry"
+        + (f", {left} are not drawn (--solve places them)" if left else "")
+    )
+    about = "values composed from odometry" if composed == sum(g.keys.size for g in have) else drawn.about
+    return Drawn(drawn.name, Batch(tuple(have), drawn.graph.factors), about)
 
 
 def solved(drawn: Drawn) -> Drawn:
@@ -58,7 +86,7 @@ def solved(drawn: Drawn) -> Drawn:
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
 
 
-def spread_in(drawn: Drawn, connect: str | None, most: int) -> "Spread":
+def spread_in(drawn: Drawn, connect: str | None, most: int, zenoh: str = "") -> "Spread":
     """Where about `most` poses, and points, may be: asked of the map on the bus, or computed at the values drawn.
 
     Raises Stopped, SolverError, Problem.
@@ -69,9 +97,9 @@ def spread_in(drawn: Drawn, connect: str | None, most: int) -> "Spread":
 
     keys = chosen(drawn.graph.variables, most)
     if connect is not None:
-        from factorbus.client import connect as connected
+        from factorbus.cli.bus import open_bus
 
-        with connected(connect, client="plot") as bus, bus.map(drawn.name, create=False, mirror=False) as joined:
+        with open_bus(connect, "plot", zenoh) as bus, bus.map(drawn.name, create=False, mirror=False) as joined:
             return spread_of(drawn.graph.variables, blocks_of(joined.doubt.covariance(keys.tolist())))
     require("service", "--ellipses of a file")
     from factorbus.cli.local import covariances_at
@@ -79,9 +107,9 @@ def spread_in(drawn: Drawn, connect: str | None, most: int) -> "Spread":
     return spread_of(drawn.graph.variables, covariances_at(drawn.graph, keys))
 
 
-def _from_bus(name: str, endpoint: str) -> Drawn:
-    from factorbus.client import connect
+def _from_bus(name: str, endpoint: str, zenoh: str) -> Drawn:
+    from factorbus.cli.bus import open_bus
 
-    with connect(endpoint, client="plot") as bus, bus.map(name, create=False, mirror=False) as joined:
+    with open_bus(endpoint, "plot", zenoh) as bus, bus.map(name, create=False, mirror=False) as joined:
         graph, chi2 = joined.graph(), joined.chi2()
     return Drawn(name, graph.batch, f"revision {graph.revision}, χ² {chi2.chi2:.6g}")

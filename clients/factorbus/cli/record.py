@@ -1,22 +1,28 @@
 """`factorbus record`: a map as an MCAP file, while it is made."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import DEFAULT_ENDPOINT, out_option, zenoh_option
+from factorbus.cli.options import Number, connect_option, out_option, zenoh_option
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from factorbus.client import Map
 
 
 @click.command()
 @click.argument("map_name", metavar="MAP")
-@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@connect_option
 @zenoh_option
 @out_option("--out", "out", "The recording.  [default: MAP.mcap here]", "FILE.mcap")
 @click.option(
     "--every",
     "every_s",
-    type=click.FloatRange(0.05, 60),
+    type=Number(0.05, 60),
     default=1.0,
     show_default=True,
     metavar="S",
@@ -30,30 +36,38 @@ def command(
     """Record MAP into an MCAP file until Ctrl-C: every step, every estimate, every factor, and a scene to look at.
 
     Foxglove opens it (3D panel: /map/scene and /tf; plots: /map/step.chi2), and any MCAP reader. What is in the map
-    already comes first.
+    already comes first. A map that is not there yet is waited for.
 
     \b
     factorbus record warehouse
     factorbus record warehouse --connect tcp/robot.local:7447 --out monday.mcap
     """
     require("record", "factorbus record")
+    from factorbus.cli.bus import joined_when_there, open_bus
     from factorbus.cli.exits import Stopped
     from factorbus.cli.screen import note
     from factorbus.cli.stopping import stop_on_signals
-    from factorbus.client import connect
-    from factorbus.viz.lookout import Lookout
-    from factorbus.viz.mcap import Recording
 
     path = out or Path(f"{map_name}.mcap")
     if path.exists():
         raise Stopped("file_exists", f"{path} is there already: give another --out, or remove it", path=str(path))
     with (
         stop_on_signals(until_eof) as stop,
-        connect(endpoint, client="recorder", zenoh=zenoh) as bus,
-        bus.map(map_name, create=False) as joined,
-        Lookout(joined) as lookout,
-        Recording(path) as recording,
+        open_bus(endpoint, "recorder", zenoh) as bus,
+        joined_when_there(bus, map_name, stop.wait) as joined,
     ):
+        if joined is None:
+            note(f"stopped before there was a map {map_name}; nothing is recorded")
+            return
+        _record(joined, path, every_s, until, stop)
+
+
+def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event") -> None:
+    from factorbus.cli.screen import note
+    from factorbus.viz.lookout import Lookout
+    from factorbus.viz.mcap import Recording
+
+    with Lookout(joined) as lookout, Recording(path) as recording:
         recording.begin(lookout.last_look(joined.timeout_s))
         click.echo(f"ready {path}")
         while not stop.wait(every_s) and (until is None or joined.estimate.revision < until):

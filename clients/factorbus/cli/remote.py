@@ -59,8 +59,13 @@ class RemoteMap:
         return self._map.ask.chi2(batch=False, timeout_s=_ANSWER_S).result(_ANSWER_S).chi2
 
     def compare(self) -> None:
-        """Ask for the batch optimum of the present revision; a worker finds it while the drive goes on."""
+        """Ask for the batch optimum of the present revision; a worker finds it while the drive goes on.
+
+        The map may go on when what the worker needs has been copied: questions are answered in the order in which they
+        come, so it has when a later one is answered.
+        """
         self._comparisons.append(self._map.ask.chi2(batch=True, timeout_s=_ANSWER_S))
+        self.chi2()
 
     def compared(self) -> list[Compared]:
         """All comparisons, by revision."""

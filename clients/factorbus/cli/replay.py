@@ -10,8 +10,10 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import ModeChoice, file_argument, json_option, out_option, zenoh_option
+from factorbus.cli.options import SECONDS, ModeChoice, Number, file_argument, json_option, out_option, zenoh_option
 from factorbus.cli.reading import read_graph, reading_options
+
+_ANSWER_S, _LISTENING_S = 10.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +23,7 @@ class Request:
     file: Path
     in_process: bool
     connect: str | None
-    wait_s: float
+    wait_s: float | None
     map_name: str
     mode: str
     every: int
@@ -59,11 +61,9 @@ class Request:
 @click.option(
     "--wait",
     "wait_s",
-    type=click.FloatRange(0),
-    default=10,
-    show_default=True,
+    type=SECONDS,
     metavar="S",
-    help="For ENDPOINT to answer.",
+    help="Wait so long for a service to be there.  [default: 1 where nobody listens, else 10]",
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
 @click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
@@ -72,7 +72,7 @@ class Request:
     type=click.IntRange(0),
     default=0,
     metavar="N",
-    help="Hold χ² against the batch optimum at every Nth step.",
+    help="Hold χ² against the batch optimum at every Nth step; 0: never.",
 )
 @click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
@@ -81,7 +81,7 @@ class Request:
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
 )
-@click.option("--pace", type=click.FloatRange(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
+@click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
 @out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
@@ -201,7 +201,13 @@ def _target(request: Request) -> Iterator[Any]:
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
         bus = stack.enter_context(
-            connect(endpoint, client=request.client, zenoh=request.zenoh, timeout_s=request.wait_s)
+            connect(
+                endpoint,
+                client=request.client,
+                zenoh=request.zenoh,
+                timeout_s=_ANSWER_S if request.wait_s is None else request.wait_s,
+                listening_s=_LISTENING_S if request.wait_s is None else None,
+            )
         )
         if solver is not None:
             solver.when_ended(bus.close)

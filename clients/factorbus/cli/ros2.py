@@ -8,7 +8,7 @@ import click
 from factorbus.cli.children import READY
 from factorbus.cli.exits import require
 from factorbus.cli.logs import begin, log_option
-from factorbus.cli.options import DEFAULT_ENDPOINT, zenoh_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, Number, zenoh_option
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical")
 # The interpreter's default, 5 ms, is what a transform would wait for while a path is being drawn.
@@ -48,7 +48,7 @@ _SWITCH_S = 0.0005
     help="Where the map begins: where odometry does, or with the first pose that is told.",
 )  # fmt: skip
 @click.option(
-    "--keyframe", nargs=2, type=click.FloatRange(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
+    "--keyframe", nargs=2, type=Number(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
     metavar="METRES RADIANS", help="A pose of the map for so much way or turn.",
 )  # fmt: skip
 @click.option(
@@ -59,7 +59,7 @@ _SWITCH_S = 0.0005
     help="Where a sensor's frame is on the robot.",
 )
 @click.option(
-    "--drift", nargs=2, type=click.FloatRange(min=0, min_open=True), default=(0.02, 0.02), show_default=True,
+    "--drift", nargs=2, type=Number(min=0, min_open=True), default=(0.02, 0.02), show_default=True,
     metavar="PER_METRE PER_RADIAN", help="Odometry is not believed to be better than this.",
 )  # fmt: skip
 @click.option("--tolerance", default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead.")

@@ -12,10 +12,10 @@ _WAIT_S = 5.0
 
 def services(endpoint: str, zenoh: str) -> list[Finding]:
     """How the services at `endpoint` are; a failure where none answers."""
-    from factorbus.client import connect
+    from factorbus.cli.bus import open_bus
 
     try:
-        with connect(endpoint, client="doctor", zenoh=zenoh, timeout_s=_WAIT_S) as bus:
+        with open_bus(endpoint, "doctor", zenoh, _WAIT_S) as bus:
             return [finding(account) for account in bus.stats()]
     except Problem as problem:
         mend = "is it running (systemctl status factorbus)? with access control, only an operator may ask: give --zenoh"

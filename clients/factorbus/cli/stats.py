@@ -6,15 +6,13 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import FAILED, OK
-from factorbus.cli.options import DEFAULT_ENDPOINT, json_option, zenoh_option
+from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
 
 
 @click.command()
-@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
+@connect_option
 @zenoh_option
-@click.option(
-    "--wait", "wait_s", type=click.FloatRange(0), default=5, show_default=True, metavar="S", help="For answers."
-)
+@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For answers.")
 @json_option
 def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
     """Show how services are, what their maps hold, and how long steps and inserts take.
@@ -27,9 +25,9 @@ def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
     factorbus stats --connect tls/solver.local:7447 --zenoh ops.json5 --json
     """
     from factorbus.cli import screen
-    from factorbus.client import connect
+    from factorbus.cli.bus import open_bus
 
-    with connect(endpoint, client="stats", zenoh=zenoh, timeout_s=wait_s) as bus:
+    with open_bus(endpoint, "stats", zenoh, wait_s) as bus:
         services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
     if as_json:
         screen.document({"services": services})

@@ -5,27 +5,27 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from factorbus.cli.options import DEFAULT_ENDPOINT, json_option
+from factorbus.cli.options import Number, connect_option, json_option, zenoh_option
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
 @click.command()
-@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT")
-@click.option(
-    "--every", "every_s", type=click.FloatRange(0.1, 60), default=1.0, show_default=True, metavar="S", help="Seconds."
-)
+@connect_option
+@zenoh_option
+@click.option("--every", "every_s", type=Number(0.1, 60), default=1.0, show_default=True, metavar="S", help="Seconds.")
 @click.option("--once", is_flag=True, help="Look twice, `--every` apart, print it, and end.")
 @click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
 @json_option
-def command(endpoint: str, every_s: float, once: bool, until_eof: bool, as_json: bool) -> None:
+def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bool, as_json: bool) -> None:
     """Show maps, clients and workers of the service at ENDPOINT: rates, times, queues. Until Ctrl-C.
 
     \b
     factorbus top
     factorbus top --connect tcp/robot.local:7447 --every 2
     factorbus top --once --json
+    factorbus top --connect tls/solver.local:7447 --zenoh ops.json5
 
     \b
     In the tables:
@@ -35,11 +35,11 @@ def command(endpoint: str, every_s: float, once: bool, until_eof: bool, as_json:
       answer ms  from asking for these numbers to having them, over the bus
     """
     from factorbus.cli import screen
+    from factorbus.cli.bus import open_bus
     from factorbus.cli.gauges import Gauges
     from factorbus.cli.stopping import stop_on_signals
-    from factorbus.client import connect
 
-    with stop_on_signals(until_eof) as stop, connect(endpoint, client="top") as bus:
+    with stop_on_signals(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
         gauges = Gauges(bus)
         seen = gauges.read()
         if once or as_json:

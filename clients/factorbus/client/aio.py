@@ -9,6 +9,8 @@ Answers come from the bus's threads straight into futures of the loop; only conn
 are rare, and putting large covariances together borrow a thread of the loop's executor.
 """
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -20,9 +22,10 @@ from numpy.typing import ArrayLike
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Doubt
 from factorbus.client.changes import Changes
-from factorbus.client.draft import Draft, Key
+from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
 from factorbus.client.grown import Factored, Grown
+from factorbus.client.key_numbers import Key
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
 from factorbus.client.merging import Merged, fit_into
@@ -43,7 +46,7 @@ async def connect(
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
     zenoh: str | PathLike[str] = "",
-) -> AsyncIterator["Bus"]:
+) -> AsyncIterator[Bus]:
     """As `factorbus.client.connect`, in `async with`."""
     bus = await asyncio.to_thread(
         sync.connect, endpoint, client=client, timeout_s=timeout_s, settings=settings, zenoh=zenoh
@@ -63,7 +66,7 @@ class Bus:
     @asynccontextmanager
     async def map(
         self, name: str, mode: str = "auto", *, window: int = 32, mirror: bool = True, create: bool = True
-    ) -> AsyncIterator["Map"]:
+    ) -> AsyncIterator[Map]:
         """As `factorbus.client.Bus.map`, in `async with`; leaving it waits for what was sent."""
         joined = await asyncio.to_thread(self._bus.map, name, mode, window=window, mirror=mirror, create=create)
         try:
@@ -74,7 +77,7 @@ class Bus:
             await asyncio.to_thread(joined.close)
 
     @asynccontextmanager
-    async def features(self, camera: Camera, **prior: Any) -> AsyncIterator["Features"]:
+    async def features(self, camera: Camera, **prior: Any) -> AsyncIterator[Features]:
         """As `factorbus.client.Bus.features`, in `async with`."""
         front = self._bus.features(camera, **prior)
         try:
@@ -98,9 +101,9 @@ class Bus:
         """A new map that begins as `name` is now.  Raises as `factorbus.client.Bus.fork`."""
         return await asyncio.to_thread(self._bus.fork, name, target)
 
-    async def drop(self, name: str) -> None:
-        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName."""
-        await asyncio.to_thread(self._bus.drop, name)
+    async def drop(self, name: str, *, missing_ok: bool = False) -> None:
+        """Drop map `name` and everything in it; as `Bus.drop`.  Raises Refused, Unavailable, BadName, UnknownMap."""
+        await asyncio.to_thread(self._bus.drop, name, missing_ok=missing_ok)
 
 
 class Features:
@@ -166,7 +169,7 @@ class Map:
 
     async def merge(
         self,
-        other: "Graph | Map",
+        other: Graph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -218,7 +221,7 @@ class Map:
         """Join the map as it is now and return its epoch; numbering starts again."""
         return await asyncio.to_thread(self._map.rejoin)
 
-    async def ask_estimate(self, of: list[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+    async def ask_estimate(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Estimate:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.estimate(of, timeout_s))
 
@@ -227,7 +230,7 @@ class Map:
         return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s))
 
     async def repair(
-        self, factors: Sequence[int] | None = None, *, probability: float = 0.99, timeout_s: float | None = None
+        self, factors: Sequence[int] | int | None = None, *, probability: float = 0.99, timeout_s: float | None = None
     ) -> Repaired:
         """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))

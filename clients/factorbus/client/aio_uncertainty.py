@@ -1,12 +1,15 @@
 """What a map can be asked about its uncertainty, for asyncio; see `factorbus.client.uncertainty`."""
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from factorbus.client.draft import Draft, Key
-from factorbus.client.uncertainty import DoubtQuestions, asked_why, factors_of, matrix_of, sightings
+from factorbus.client.draft import Draft
+from factorbus.client.key_numbers import Key
+from factorbus.client.uncertainty import DoubtQuestions, asked_why, factors_of, matrix_of, paired, sightings
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
 from factorbus.proto.messages import Batch, Factors
@@ -18,7 +21,7 @@ class Doubt:
     def __init__(self, ask: DoubtQuestions) -> None:
         self._ask = ask
 
-    async def covariance(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Covariances:
+    async def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:
         """The covariance of each of some variables, or of all of them."""
         return await asyncio.wrap_future(self._ask.covariance("diagonal", of, None, timeout_s))
 
@@ -26,18 +29,21 @@ class Doubt:
         """The covariance of the pose that was inserted last."""
         return await asyncio.wrap_future(self._ask.covariance("last", None, None, timeout_s))
 
-    async def joint(self, of: Sequence[Key], timeout_s: float | None = None) -> F64:
+    async def joint(self, of: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
         """The joint covariance (d, d) of some variables."""
         return matrix_of(await asyncio.wrap_future(self._ask.covariance("joint", of, None, timeout_s)))
 
-    async def cross(self, rows: Sequence[Key], columns: Sequence[Key], timeout_s: float | None = None) -> F64:
+    async def cross(
+        self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, timeout_s: float | None = None
+    ) -> F64:
         """The covariance (d, e) between some variables and others."""
         return matrix_of(await asyncio.wrap_future(self._ask.covariance("cross", rows, columns, timeout_s)))
 
-    async def relative(self, pairs: Sequence[tuple[Key, Key]], timeout_s: float | None = None) -> Covariances:
+    async def relative(
+        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], timeout_s: float | None = None
+    ) -> Covariances:
         """Of each pair, the second as seen from the first."""
-        of = [key for pair in pairs for key in pair]
-        return await asyncio.wrap_future(self._ask.covariance("relative", of, None, timeout_s))
+        return await asyncio.wrap_future(self._ask.covariance("relative", paired(pairs), None, timeout_s))
 
     async def gate(
         self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
@@ -56,7 +62,7 @@ class Doubt:
         measured: ArrayLike,
         *,
         information: ArrayLike,
-        landmarks: Sequence[Key] | None = None,
+        landmarks: Sequence[Key] | Key | None = None,
         probability: float = 0.95,
         timeout_s: float | None = None,
     ) -> Associated:

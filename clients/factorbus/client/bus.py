@@ -14,7 +14,9 @@ from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.problems import Refused, UnknownMap
+from factorbus.proto.problems import Problem, Refused, UnknownMap
+
+_LIST_S = 2.0  # to ask for the names of maps, where one was asked for that is not there
 
 
 def connect(
@@ -24,17 +26,19 @@ def connect(
     timeout_s: float = 10.0,
     settings: Mapping[str, Any] | None = None,
     zenoh: str | PathLike[str] = "",
+    listening_s: float | None = None,
 ) -> "Bus":
     """Connect to a service or router, trying again until `timeout_s` has passed.
 
     endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
+    listening_s: give up after so long, and not `timeout_s`, where nobody listens at all; None: wait for whoever comes.
     Raises Unavailable, BadEndpoint, BadName, BadSetting.
     """
     keys.checked_name("client", f"{client}-00000000")
     endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
-    return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh)), client, timeout_s)
+    return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh), listening_s), client, timeout_s)
 
 
 class Bus:
@@ -127,15 +131,24 @@ class Bus:
         try:
             return self._admin("fork", asked | {"request": secrets.randbits(62) | 1}, _row, timeout_s)
         except Refused as refused:
-            raise (UnknownMap(name) if refused.code == UnknownMap.code else refused) from None
+            raise self._named(name, refused) from None
 
-    def drop(self, name: str, timeout_s: float | None = None, *, revision: int | None = None) -> None:
-        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName.
+    def drop(
+        self, name: str, timeout_s: float | None = None, *, revision: int | None = None, missing_ok: bool = False
+    ) -> None:
+        """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName, UnknownMap.
+
+        missing_ok: it is no error if there is no such map.
 
         revision: only if it is at this one and nothing is under way; else it stays, and Refused says `moved_on`.
         """
         asked = {"map": keys.checked_name("map", name)}
-        self._admin("drop", asked | ({} if revision is None else {"revision": revision}), codec.decode_map, timeout_s)
+        try:
+            asked |= {} if revision is None else {"revision": revision}
+            self._admin("drop", asked, codec.decode_map, timeout_s)
+        except Refused as refused:
+            if not (missing_ok and refused.code == UnknownMap.code):
+                raise self._named(name, refused) from None
 
     def close(self) -> None:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
@@ -151,7 +164,16 @@ class Bus:
         try:
             return self._courier.carry(asked).future.result()
         except Refused as refused:
-            raise (UnknownMap(name) if refused.code == UnknownMap.code else refused) from None
+            raise self._named(name, refused) from None
+
+    def _named(self, name: str, refused: Refused) -> Problem:
+        """`refused`; of a map that is not there with the names of those that are, if this client may know them."""
+        if refused.code != UnknownMap.code:
+            return refused
+        try:
+            return UnknownMap(name, [row.name for row in self.maps(min(self.timeout_s, _LIST_S))])
+        except Problem:
+            return UnknownMap(name)
 
     def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
         timeout_s = self.timeout_s if timeout_s is None else timeout_s

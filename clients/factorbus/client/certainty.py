@@ -1,47 +1,81 @@
 """How certain a measurement is, as a front end says it: checked, and brought into the form of the wire."""
 
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
 from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.proto.arrays import F64
-from factorbus.proto.kinds import LOSSES
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES
+from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import BadInformation, BadLoss, BadShape
 
 # How far an information matrix may be from symmetric, relative to its largest entry: rounding, not meaning.
 _ASYMMETRY = 1e-9
 
+# Of these the last three rows of the residual are the vector part of a quaternion: half an angle.
+_HALF_ANGLES = ("prior_se3", "between_se3")
+
+# Scales of losses given by name alone, standard deviations.  Those of huber, cauchy and tukey keep 95 % of the
+# efficiency of least squares where one number is measured and its noise is Gaussian.
+DEFAULT_SCALES = types.MappingProxyType(
+    {"huber": 1.345, "cauchy": 2.3849, "geman-mcclure": 1.0, "tukey": 4.6851, "dcs": 1.0}
+)
+
+# What others call it, and what is near it here.
+_ELSEWHERE = types.MappingProxyType(
+    {
+        "covariance": "information",
+        "cov": "information",
+        "noise": "sigmas",
+        "std": "sigmas",
+        "stddev": "sigmas",
+        "robust": "loss",
+        "kernel": "loss",
+        "huber": "loss",
+        "cauchy": "loss",
+        "tukey": "loss",
+        "dcs": "loss",
+    }
+)
+
 
 class Certainty(TypedDict, total=False):
-    """How certain a measurement is: one of the two.
+    """How certain a measurement is: sigmas or information, and a loss if wanted.
 
-    sigmas (r,): standard deviations in the units and order of the residual.
-    information: the inverse covariance, a symmetric (r, r) matrix or its upper triangle (r(r+1)/2,) row by row.
-    The rotation part of an se3 residual is the vector part of a quaternion, so half an angle: for a standard
-    deviation of s radians say s/2.
-    loss: what it counts where it is far off, ("huber", 1.345) say: one of `factorbus.proto.kinds.LOSSES` and its scale,
-    standard deviations.
+    sigmas (r,): standard deviations, one for each number of the residual: metres, and radians also for rotations in
+    space (they are converted to g2o's half angles).  One number will do where the residual has one.
+    information: the inverse covariance of the residual as the wire has it, a symmetric (r, r) matrix or its upper
+    triangle (r(r+1)/2,) row by row; the rotation rows of `prior_se3` and `between_se3` are half angles, so an
+    information of 1/s² of an angle in radians is 4/s² there.
+    loss: what it counts where it is far off: ("huber", 1.345), a name of `factorbus.proto.kinds.LOSSES` and its scale
+    in standard deviations; the name alone has the scale of DEFAULT_SCALES.
     """
 
     sigmas: ArrayLike
     information: ArrayLike
-    loss: tuple[str, float] | None
+    loss: tuple[str, float] | str | None
 
 
-def triangle_of(where: str, dim: int, certainty: Certainty) -> F64:
-    """The upper triangle of Ω, dim × dim.  Raises BadShape, BadInformation."""
+def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F64:
+    """The upper triangle of Ω, dim × dim, of a factor of `kind`.  Raises BadShape, BadInformation."""
+    _check_names(where, certainty)
     sigmas, information = certainty.get("sigmas"), certainty.get("information")
-    if (sigmas is None) == (information is None):
-        raise BadInformation(where, "both or neither of sigmas and information", "one of the two")
-    if information is None:
-        return _from_sigmas(where, dim, np.array(sigmas, np.float64))
-    return _from_matrix(where, dim, np.array(information, np.float64))
+    if sigmas is not None and information is None:
+        return _from_sigmas(where, dim, np.atleast_1d(_numbers(f"{where}: sigmas", sigmas)), kind)
+    if information is not None and sigmas is None:
+        return _from_matrix(where, dim, _numbers(f"{where}: information", information))
+    seen = "neither sigmas nor information" if sigmas is None else "both sigmas and information"
+    raise BadInformation(where, seen, "one of the two: how certain it is")
 
 
-def carried(where: str, dim: int, certainty: Certainty, A: F64) -> Certainty:
-    """The certainty of r' where this is that of r = A r'."""
-    W = full(triangle_of(where, dim, certainty), dim)
+def carried(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
+    """The certainty of r' where this is that of r = A r', both of a factor of `kind`."""
+    W = full(triangle_of(where, dim, certainty, kind), dim)
     return {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}
 
 
@@ -52,24 +86,61 @@ def full(triangle: F64, dim: int) -> F64:
     return W + np.triu(W, 1).T
 
 
-def loss_of(where: str, loss: tuple[str, float] | None) -> tuple[str, float]:
-    """(name, scale); ("", 0) for none."""
+def loss_of(where: str, loss: tuple[str, float] | str | None) -> tuple[str, float]:
+    """(name, scale); ("", 0) for none.  Raises BadLoss."""
     if loss is None:
         return "", 0.0
-    name, scale = loss
+    name, scale = _parts(where, loss)
     if name not in LOSSES:
-        raise BadLoss(where, repr(name), f"one of {', '.join(LOSSES)}")
+        raise BadLoss(where, repr(name), f"one of {', '.join(LOSSES)}{nearest(name, LOSSES)}")
+    scale = DEFAULT_SCALES[name] if scale is None else scale
+    if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)):
+        raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
     if not (np.isfinite(scale) and scale > 0.0):
         raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
-    return name, float(scale)
+    return str(name), float(scale)
 
 
-def _from_sigmas(where: str, dim: int, sigmas: F64) -> F64:
+def _parts(where: str, loss: object) -> tuple[object, object]:
+    if isinstance(loss, str):
+        return loss, None
+    if not isinstance(loss, (tuple, list)) or len(loss) != 2:
+        raise BadLoss(where, repr(loss), 'a name and a scale, such as ("huber", 1.345), or a name alone')
+    return loss[0], loss[1]
+
+
+def _check_names(where: str, certainty: Mapping[str, object]) -> None:
+    """A misspelt keyword must not be a loss or a weight ignored."""
+    wanted = tuple(Certainty.__annotations__)
+    for name in certainty:
+        if name not in wanted:
+            meant = f"; did you mean {_ELSEWHERE[name]!r}?" if name in _ELSEWHERE else nearest(name, wanted)
+            if name.startswith("cov"):
+                meant += " It is the inverse of the covariance of the residual; or give sigmas"
+            raise BadInformation(where, f"there is no keyword {name!r}", f"{', '.join(wanted)}{meant}")
+
+
+def _numbers(where: str, given: ArrayLike) -> F64:
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError):
+        raise BadShape(where, repr(given)[:80], "numbers") from None
+
+
+def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
     if sigmas.shape != (dim,):
-        raise BadShape(f"{where}: sigmas", f"shape {sigmas.shape}", f"({dim},)")
+        seen = "one number" if sigmas.shape == (1,) else f"shape {sigmas.shape}"
+        rows = f": {FACTOR_KINDS[kind].measured}" if kind in FACTOR_KINDS and dim > 1 else ""
+        raise BadShape(f"{where}: sigmas", seen, f"({dim},), one for each number of the residual{rows}")
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
-    return np.diag(1.0 / sigmas**2)[np.triu_indices(dim)]
+    if kind in _HALF_ANGLES:
+        sigmas = sigmas * (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
+    with np.errstate(over="ignore", divide="ignore", under="ignore"):
+        information = 1.0 / sigmas**2
+    if not (np.isfinite(information).all() and (information > 0).all()):
+        raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "numbers whose squares a double has, 1e-150 to 1e150")
+    return np.diag(information)[np.triu_indices(dim)]
 
 
 def _from_matrix(where: str, dim: int, matrix: F64) -> F64:

@@ -6,18 +6,20 @@ A factor is called by its id: `first_factor` of the answer to the insert that br
 of the batch; `Map.graph` tells the ids of all.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.draft import Draft, Key
+from factorbus.client.certainty import loss_of
+from factorbus.client.draft import Draft
+from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import Repaired
-from factorbus.proto.kinds import LOSSES
 from factorbus.proto.messages import Accepted, Batch, Change, Variables
 from factorbus.proto.problems import BadLoss, BadShape
-from factorbus.proto.symbols import parse_symbol
 
 
 class Changes:
@@ -29,15 +31,15 @@ class Changes:
     def __init__(self) -> None:
         self._changes: list[Change] = []
 
-    def remove_factors(self, factors: Iterable[int]) -> "Changes":
+    def remove_factors(self, factors: Iterable[int] | int) -> Changes:
         """These factors go."""
-        return self._add(Change("remove_factors", _ids(factors)))
+        return self._add(Change("remove_factors", id_numbers("changes", factors)))
 
-    def remove_variables(self, *keys: Key, alone: bool = False) -> "Changes":
+    def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> Changes:
         """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
         return self._add(Change("remove_variables", keys=_keys(keys), alone=alone))
 
-    def undo(self, batch: Batch | Draft, accepted: Accepted) -> "Changes":
+    def undo(self, batch: Batch | Draft, accepted: Accepted) -> Changes:
         """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
         batch = batch.batch() if isinstance(batch, Draft) else batch
         brought = [group.keys for group in batch.variables]
@@ -45,27 +47,34 @@ class Changes:
         self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
         return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
 
-    def loss(self, factors: Iterable[int], name: str, scale: ArrayLike = 1.0) -> "Changes":
-        """These factors have this loss from now on ("": none); scale: one, or one for each, standard deviations."""
-        ids = _ids(factors)
-        if name and name not in LOSSES:
-            raise BadLoss("changes", repr(name), f"one of {', '.join(LOSSES)}, or an empty string")
-        return self._add(Change("loss", ids, loss=name, scale=_each("scale", scale, ids) if name else None))
+    def loss(self, factors: Iterable[int] | int, name: str, scale: ArrayLike | None = None) -> Changes:
+        """These factors have this loss from now on ("": none).
 
-    def weigh(self, factors: Iterable[int], weight: ArrayLike) -> "Changes":
+        scale: one, or one for each, standard deviations; None: that of `certainty.DEFAULT_SCALES`.
+        """
+        ids = id_numbers("changes", factors)
+        if not name:
+            return self._add(Change("loss", ids, loss=""))
+        name, usual = loss_of("changes", name)
+        scales = _each("scale", usual if scale is None else scale, ids)
+        if not (np.isfinite(scales).all() and (scales > 0.0).all()):
+            raise BadLoss("changes", f"the scale {scale!r}", "finite numbers above 0, standard deviations")
+        return self._add(Change("loss", ids, loss=name, scale=scales))
+
+    def weigh(self, factors: Iterable[int] | int, weight: ArrayLike) -> Changes:
         """The information matrices of these factors are multiplied by this (one, or one for each)."""
-        ids = _ids(factors)
+        ids = id_numbers("changes", factors)
         return self._add(Change("weigh", ids, weight=_each("weight", weight, ids)))
 
-    def fix(self, *keys: Key) -> "Changes":
+    def fix(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are held where they are."""
         return self._add(Change("fix", keys=_keys(keys)))
 
-    def free(self, *keys: Key) -> "Changes":
+    def free(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are estimated again."""
         return self._add(Change("free", keys=_keys(keys)))
 
-    def marginalise(self, *keys: Key) -> "Changes":
+    def marginalise(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables go; what their factors say of the others is kept, as linear factors.
 
         Refused (too_connected) where what hangs together shares factors with more than 128 variables that stay.  Before
@@ -74,39 +83,39 @@ class Changes:
         """
         return self._add(Change("marginalise", keys=_keys(keys)))
 
-    def place(self, groups: Iterable[Variables]) -> "Changes":
+    def place(self, groups: Iterable[Variables]) -> Changes:
         """Variables go to the values in `groups`, as in an estimate; the map goes on from there."""
         for group in groups:
             self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values))
         return self
 
-    def repair(self, repaired: Repaired, loss: tuple[str, float] | None = None) -> "Changes":
+    def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
         """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
         if loss is None:
             self.remove_factors(repaired.factors.tolist())
         else:
-            self.loss(repaired.factors.tolist(), *loss)
+            self.loss(repaired.factors.tolist(), *loss_of("repair", loss))
         return self.place(repaired.variables)
 
     def listed(self) -> tuple[Change, ...]:
         """What has been put together so far."""
         return tuple(self._changes)
 
-    def _add(self, change: Change) -> "Changes":
+    def _add(self, change: Change) -> Changes:
         self._changes.append(change)
         return self
 
 
-def _ids(factors: Iterable[int]) -> I64:
-    return np.array(list(factors), np.int64)
-
-
-def _keys(keys: Sequence[Key]) -> I64:
-    return np.array([parse_symbol(key) if isinstance(key, str) else key for key in keys], np.int64)
+def _keys(keys: Sequence[Key | Sequence[Key]]) -> I64:
+    """Keys one by one, or in lists."""
+    return np.concatenate([np.empty(0, np.int64), *map(key_numbers, keys)])
 
 
 def _each(name: str, numbers: ArrayLike, ids: I64) -> F64:
-    given = np.array(numbers, np.float64)
+    try:
+        given = np.array(numbers, np.float64)
+    except (TypeError, ValueError):
+        raise BadShape(f"changes: {name}", repr(numbers)[:80], "numbers") from None
     if given.shape not in ((), ids.shape):
         raise BadShape(f"changes: {name}", f"shape {given.shape}", f"one number, or {ids.size}")
     return np.broadcast_to(given, ids.shape)

@@ -3,6 +3,8 @@
 Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.02))
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias, TypeVar, Unpack
 
@@ -10,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
+from factorbus.client.key_numbers import Key, key_number, key_numbers
 from factorbus.client.linear import linear_pieces
 from factorbus.client.mounted import moved_se2, moved_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadShape, UnknownKind
-from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.proto.symbols import format_symbol
 
-Key: TypeAlias = str | int
 _Kind = TypeVar("_Kind")
 _Row: TypeAlias = NDArray[np.float64]
 
@@ -28,8 +30,9 @@ class Draft:
 
     A key is "x12" or an int64.  A variable without a value gets one from the first factor of the same insert that
     reaches it.  fixed: the variable is held where it is (a map's first pose, say).
-    Every factor needs a certainty: sigmas= or information=.  Raises BadSymbol, BadShape, BadInformation, BadLoss,
-    UnknownKind.
+    Every factor needs a certainty: sigmas=, standard deviations in metres and radians (also of rotations in space), or
+    information=, and may have a loss= (`factorbus.client.certainty.Certainty`).
+    Raises BadSymbol, BadShape, BadInformation, BadLoss, UnknownKind.
     """
 
     def __init__(self) -> None:
@@ -37,39 +40,43 @@ class Draft:
         self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
         self._linear: list[Factors] = []
 
-    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
         return self.variable("se2", key, value, fixed=fixed)
 
-    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A pose in space: x y z (metres), unit quaternion qx qy qz qw."""
         return self.variable("se3", key, value, fixed=fixed)
 
-    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A point in the plane: x y (metres)."""
         return self.variable("point2", key, value, fixed=fixed)
 
-    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A point in space: x y z (metres)."""
         return self.variable("point3", key, value, fixed=fixed)
 
-    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
         return self.variable("idp", key, value, fixed=fixed)
 
-    def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
         return self.factor("prior_se2", (key,), measured, **certainty)
 
-    def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
-        """Where a pose in space is in the map: x y z (metres), qx qy qz qw."""
+    def prior_se3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
+        """Where a pose in space is in the map: x y z (metres), qx qy qz qw.
+
+        Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
+        g2o: 4/s² for s radians.
+        """
         return self.factor("prior_se3", (key,), measured, **certainty)
 
-    def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_point2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point in the plane is in the map: x y (metres)."""
         return self.factor("prior_point2", (key,), measured, **certainty)
 
-    def prior_point3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def prior_point3(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point in space is in the map: x y z (metres)."""
         return self.factor("prior_point3", (key,), measured, **certainty)
 
@@ -81,7 +88,7 @@ class Draft:
         *,
         mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """The second pose in the first one's frame: x y (metres), theta (radians).  Odometry, loop closures.
 
         mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
@@ -91,7 +98,7 @@ class Draft:
         if mount is not None:
             where = self._between(first, second, "between_se2")
             measured, A = moved_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = carried(where, 3, certainty, A)
+            certainty = carried(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -102,15 +109,18 @@ class Draft:
         *,
         mount: ArrayLike | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
-        """The second pose in the first one's frame: x y z (metres), qx qy qz qw; residual x y z, then half-angles.
+    ) -> Draft:
+        """The second pose in the first one's frame: x y z (metres), qx qy qz qw.
+
+        Six sigmas: x y z in metres, the rotation about x y z in radians; information= is of half angles, as in
+        g2o: 4/s² for s radians.
 
         mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
         """
         if mount is not None:
             where = self._between(first, second, "between_se3")
             measured, A = moved_se3(where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7))
-            certainty = carried(where, 6, certainty, A)
+            certainty = carried(where, 6, certainty, A, "between_se3")
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -119,7 +129,7 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point2 in the pose's frame: x y (metres)."""
         return self.factor("landmark_se2", (pose, point), measured, **certainty)
 
@@ -129,7 +139,7 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point3 in the pose's frame: x y z (metres)."""
         return self.factor("landmark_se3", (pose, point), measured, **certainty)
 
@@ -139,13 +149,13 @@ class Draft:
         point: Key,
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A point2 seen from the pose: bearing (radians, from the x axis to the left), range (metres)."""
         return self.factor("bearing_range_se2", (pose, point), measured, **certainty)
 
     def position_se2(
         self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """Where an antenna is in the map: x y (metres); lever: where it is on the robot."""
         return self.factor(
             "position_se2", (key,), [*_row("measured", measured, 2), *_row("lever", lever, 2)], **certainty
@@ -153,36 +163,36 @@ class Draft:
 
     def position_se3(
         self, key: Key, measured: ArrayLike, *, lever: ArrayLike = (0.0, 0.0, 0.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """Where an antenna is in the map: x y z (metres); lever: where it is on the robot."""
         return self.factor(
             "position_se3", (key,), [*_row("measured", measured, 3), *_row("lever", lever, 3)], **certainty
         )
 
-    def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def heading_se2(self, key: Key, theta: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane looks, in the map: theta (radians)."""
         return self.factor("heading_se2", (key,), [theta], **certainty)
 
     def attitude_se3(
         self, key: Key, seen: ArrayLike, *, direction: ArrayLike = (0.0, 0.0, -1.0), **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """A direction of the map (down, unless said otherwise) as the robot sees it: vectors of any length."""
         both = [*_row("seen", seen, 3), *_row("direction", direction, 3)]
         return self.factor("attitude_se3", (key,), both, **certainty)
 
-    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def range_se2(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
         """How far a point2 is from the pose (metres)."""
         return self.factor("range_se2", (pose, point), [distance], **certainty)
 
-    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def range_se3(self, pose: Key, point: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
         """How far a point3 is from the pose (metres)."""
         return self.factor("range_se3", (pose, point), [distance], **certainty)
 
-    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> "Draft":
+    def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
         return self.factor("bearing_se2", (pose, point), [bearing], **certainty)
 
-    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> "Draft":
+    def bearing_se3(self, pose: Key, point: Key, direction: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point3 is to be seen from the pose: a vector of any length in its frame; sigmas: nearly radians."""
         return self.factor("bearing_se3", (pose, point), _row("direction", direction, 3), **certainty)
 
@@ -195,7 +205,7 @@ class Draft:
         *,
         kinds: Sequence[str] | None = None,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """What you have linearised yourself, of up to 128 variables: r = sum H (x - y) + b.
 
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
@@ -205,7 +215,7 @@ class Draft:
         What is of more than two variables, or has more rows than the smaller has scalars, is sent as several factors,
         which sum to it: they stay or go together, and have no loss.
         """
-        numbers = [_number(key) for key in keys]
+        numbers = key_numbers(keys).tolist()
         for pieces in linear_pieces(numbers, values, jacobians, residual, kinds, certainty):
             self._linear.append(pieces)
         return self
@@ -221,8 +231,8 @@ class Draft:
         sigma_rho: float,
         sigma_pixel: float = 1.0,
         sigma_anchor: float = 1e-4,
-        loss: tuple[str, float] | None = None,
-    ) -> "Draft":
+        loss: tuple[str, float] | str | None = None,
+    ) -> Draft:
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
         sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
@@ -233,20 +243,20 @@ class Draft:
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
         return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
 
     def point_seen(
         self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
-    ) -> "Draft":
+    ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
         return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
 
-    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> "Draft":
+    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
-        number = _number(key)
+        number = key_number(key)
         row = None if value is None else _row(f"{kind} {format_symbol(number)}", value, size)
         keys, rows = self._variables.setdefault((kind, row is not None, fixed), ([], []))
         keys.append(number)
@@ -260,16 +270,16 @@ class Draft:
         keys: Sequence[Key],
         measured: ArrayLike,
         **certainty: Unpack[Certainty],
-    ) -> "Draft":
+    ) -> Draft:
         """A factor of any kind of `factorbus.proto.kinds`."""
         of = _known(FACTOR_KINDS, kind)
-        numbers = [_number(key) for key in keys]
+        numbers = key_numbers(keys).tolist()
         where = " ".join([kind, *map(format_symbol, numbers)])
         if len(numbers) != len(of.connects):
             raise BadShape(f"{where}: keys", len(numbers), f"{len(of.connects)} ({', '.join(of.connects)})")
         row = _row(f"{where}: measured", measured, of.size)
         name, scale = loss_of(where, certainty.get("loss"))
-        triangle = triangle_of(where, of.dim, certainty)
+        triangle = triangle_of(where, of.dim, certainty, kind)
         all_keys, all_measured, all_triangles, scales = self._factors.setdefault((kind, name), ([], [], [], []))
         scales.append(scale)
         all_keys.append(numbers)
@@ -279,7 +289,7 @@ class Draft:
 
     def _between(self, first: Key, second: Key, kind: str) -> str:
         """What an error says it is about."""
-        return " ".join([kind, *(format_symbol(_number(key)) for key in (first, second))])
+        return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
 
     def batch(self) -> Batch:
         """What has been drafted so far, as columns."""
@@ -311,12 +321,11 @@ def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
     return kinds[kind]
 
 
-def _number(key: Key) -> int:
-    return parse_symbol(key) if isinstance(key, str) else int(key)
-
-
 def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
-    row = np.array(numbers, np.float64)
+    try:
+        row = np.array(numbers, np.float64)
+    except (TypeError, ValueError):
+        raise BadShape(where, repr(numbers)[:80], f"({size},) numbers") from None
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")
     return row

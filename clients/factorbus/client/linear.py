@@ -1,5 +1,7 @@
 """What a front end has linearised itself, as factors that a map takes in: one where it can be, else in pieces."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

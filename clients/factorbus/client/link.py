@@ -14,10 +14,11 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
+from factorbus.client.listening import heard
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet
 from factorbus.proto.kept_state import keep_state
-from factorbus.proto.problems import BadEndpoint, BadSetting, Unavailable
+from factorbus.proto.problems import BadEndpoint, BadSetting, NobodyListens, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
@@ -136,19 +137,30 @@ class Link:
         self._session.close()
 
 
-def open_link(endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any], file: str = "") -> Link:
+def open_link(
+    endpoints: Sequence[str],
+    timeout_s: float,
+    settings: Mapping[str, Any],
+    file: str = "",
+    listening_s: float | None = None,
+) -> Link:
     """A link to the first of `endpoints` that takes us; as `open_session`."""
-    return Link(open_session(endpoints, timeout_s, settings, file))
+    return Link(open_session(endpoints, timeout_s, settings, file, listening_s))
 
 
 def open_session(
-    endpoints: Sequence[str], timeout_s: float, settings: Mapping[str, Any], file: str = ""
+    endpoints: Sequence[str],
+    timeout_s: float,
+    settings: Mapping[str, Any],
+    file: str = "",
+    listening_s: float | None = None,
 ) -> zenoh.Session:
     """A session with the first of `endpoints` that takes us, trying until `timeout_s` has passed.
 
     settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.  file: path of a
-    zenoh configuration file that comes before all this.
-    Raises BadEndpoint and BadSetting at once, Unavailable when time is up.
+    zenoh configuration file that comes before all this.  listening_s: give up after so long, not `timeout_s`, where no
+    endpoint has anybody who listens.
+    Raises BadEndpoint and BadSetting at once, Unavailable (NobodyListens) when time is up.
     """
     config = _config(endpoints, settings, file)
     start, pause = time.monotonic(), _FIRST_PAUSE_S
@@ -156,7 +168,10 @@ def open_session(
         try:
             return zenoh.open(config)
         except zenoh.ZError:
-            if time.monotonic() - start + pause > timeout_s:
+            waited_s = time.monotonic() - start
+            if listening_s is not None and waited_s >= min(listening_s, timeout_s) and not heard(endpoints):
+                raise NobodyListens(discreet.endpoint(" and ".join(endpoints))) from None
+            if waited_s + pause > timeout_s:
                 raise Unavailable(
                     discreet.endpoint(" and ".join(endpoints)),
                     timeout_s,

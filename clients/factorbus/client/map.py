@@ -1,5 +1,7 @@
 """One map, as a client works with it."""
 
+from __future__ import annotations
+
 import os
 import threading
 import time
@@ -12,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.changes import Changes
 from factorbus.client.courier import Courier, Errand
-from factorbus.client.draft import Draft, Key
+from factorbus.client.draft import Draft
+from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
@@ -70,7 +73,7 @@ class Map:
         self.ask = Questions(courier, self.name, timeout_s)
         self.doubt = Doubt(DoubtQuestions(courier, self.name, timeout_s))
 
-    def __enter__(self) -> "Map":
+    def __enter__(self) -> Map:
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
@@ -125,7 +128,7 @@ class Map:
 
     def merge(
         self,
-        other: "Graph | Map",
+        other: Graph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -209,7 +212,7 @@ class Map:
             self._enter(self._join())
         return self.epoch
 
-    def ask_estimate(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Estimate:
+    def ask_estimate(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Estimate:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
         return self.ask.estimate(of, timeout_s).result()
 
@@ -218,7 +221,7 @@ class Map:
         return self.ask.chi2(batch, timeout_s).result()
 
     def repair(
-        self, factors: Sequence[int] | None = None, *, probability: float = 0.99, timeout_s: float | None = None
+        self, factors: Sequence[int] | int | None = None, *, probability: float = 0.99, timeout_s: float | None = None
     ) -> Repaired:
         """Which factors (ids; None: of all that close loops) are false; nothing is changed yet.
 

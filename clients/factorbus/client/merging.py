@@ -7,6 +7,8 @@ factors among others.  So what b knows of its own frame is worth nothing in a, a
 map has to begin with: one fixed pose, or one prior of a pose.  More says something of the world, which is wrong in a.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from factorbus.client.following import Following, tables_of
+from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
 from factorbus.client.replies import Answer, Reply, TimedOut, pause
 from factorbus.proto import fields, keys
@@ -19,7 +20,7 @@ from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
 from factorbus.proto.problems import BadSymbol, Unavailable
-from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
 
@@ -70,7 +71,7 @@ class Mirror:
     def __getitem__(self, key: str | int) -> F64:
         """The value of a variable, "x12" or its number: a copy.  Raises KeyError."""
         try:
-            number = parse_symbol(key) if isinstance(key, str) else int(key)
+            number = key_number(key)
         except BadSymbol as bad:
             raise KeyError(bad.message) from None
         with self._lock:

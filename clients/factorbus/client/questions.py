@@ -5,16 +5,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-import numpy as np
-
 from factorbus.client.courier import Courier, Errand
-from factorbus.client.draft import Key
+from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.messages import Chi2, Estimate, Graph
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
-from factorbus.proto.symbols import parse_symbol
 
 T = TypeVar("T")
 log = logging.getLogger("factorbus.client")
@@ -33,9 +30,9 @@ class Questions:
     def __init__(self, courier: Courier, map_name: str, timeout_s: float) -> None:
         self._courier, self._map, self._timeout_s = courier, map_name, timeout_s
 
-    def estimate(self, of: Sequence[Key] | None, timeout_s: float | None) -> Future[Estimate]:
+    def estimate(self, of: Sequence[Key] | Key | None, timeout_s: float | None) -> Future[Estimate]:
         """Values at one revision: all, or of some variables."""
-        numbers = None if of is None else np.array([parse_symbol(k) if isinstance(k, str) else k for k in of], np.int64)
+        numbers = None if of is None else key_numbers(of)
         return self._ask("estimate", codec.encode_keys_asked(numbers), codec.decode_estimate, timeout_s)
 
     def chi2(self, batch: bool, timeout_s: float | None) -> Future[Chi2]:
@@ -64,9 +61,11 @@ class Questions:
         question = {"format": format, "strict": strict, "ids": ids} | ({} if robot is None else {"robot": robot})
         return self._ask("export", codec.encode_map(question), _exported, timeout_s)
 
-    def repair(self, factors: Sequence[int] | None, probability: float, timeout_s: float | None) -> Future[Repaired]:
+    def repair(
+        self, factors: Sequence[int] | int | None, probability: float, timeout_s: float | None
+    ) -> Future[Repaired]:
         """Which factors are false, and the estimate without them."""
-        chosen = None if factors is None else np.array(factors, np.int64)
+        chosen = None if factors is None else id_numbers("repair", factors)
         question = encode_ask_repair(AskRepair(chosen, probability, values=True))
         return self._ask("repair", question, decode_repaired, timeout_s)
 

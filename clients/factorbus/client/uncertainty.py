@@ -8,7 +8,9 @@ Covariances are in tangent spaces: of local increments, translation first, metre
 is needed here.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
@@ -16,9 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.client.courier import Courier, Errand
-from factorbus.client.draft import Draft, Key
+from factorbus.client.draft import Draft
+from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.proto import asking_codec, keys
-from factorbus.proto.arrays import F64, I64
+from factorbus.proto.arrays import F64
 from factorbus.proto.asking import (
     AskAssociate,
     AskCovariance,
@@ -34,7 +37,6 @@ from factorbus.proto.asking import (
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors
 from factorbus.proto.problems import BadShape, Unavailable
-from factorbus.proto.symbols import parse_symbol
 
 T = TypeVar("T")
 
@@ -46,10 +48,12 @@ class DoubtQuestions:
         self._courier, self._map, self._timeout_s = courier, map_name, timeout_s
 
     def covariance(
-        self, blocks: str, of: Sequence[Key] | None, others: Sequence[Key] | None, timeout_s: float | None
+        self, blocks: str, of: Sequence[Key] | Key | None, others: Sequence[Key] | Key | None, timeout_s: float | None
     ) -> Future[Covariances]:
         """Blocks of the covariance, as in `AskCovariance`."""
-        ask = AskCovariance(blocks, None if of is None else numbers(of), None if others is None else numbers(others))
+        ask = AskCovariance(
+            blocks, None if of is None else key_numbers(of), None if others is None else key_numbers(others)
+        )
         return self._ask(
             "covariance", asking_codec.encode_ask_covariance(ask), asking_codec.decode_covariances, timeout_s
         )
@@ -86,7 +90,7 @@ class Doubt:
     def __init__(self, ask: DoubtQuestions) -> None:
         self.ask = ask
 
-    def covariance(self, of: Sequence[Key] | None = None, timeout_s: float | None = None) -> Covariances:
+    def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:
         """The covariance of each of some variables, or of all of them: `answer[symbol("x", 3)]` is one block."""
         return self.ask.covariance("diagonal", of, None, timeout_s).result()
 
@@ -94,17 +98,19 @@ class Doubt:
         """The covariance of the pose that was inserted last: microseconds of the solver's time."""
         return self.ask.covariance("last", None, None, timeout_s).result()
 
-    def joint(self, of: Sequence[Key], timeout_s: float | None = None) -> F64:
+    def joint(self, of: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
         """The joint covariance (d, d) of some variables, their tangent spaces one after the other."""
         return matrix_of(self.ask.covariance("joint", of, None, timeout_s).result())
 
-    def cross(self, rows: Sequence[Key], columns: Sequence[Key], timeout_s: float | None = None) -> F64:
+    def cross(self, rows: Sequence[Key] | Key, columns: Sequence[Key] | Key, timeout_s: float | None = None) -> F64:
         """The covariance (d, e) between some variables and others."""
         return matrix_of(self.ask.covariance("cross", rows, columns, timeout_s).result())
 
-    def relative(self, pairs: Sequence[tuple[Key, Key]], timeout_s: float | None = None) -> Covariances:
+    def relative(
+        self, pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key], timeout_s: float | None = None
+    ) -> Covariances:
         """Of each pair, the second as seen from the first: its value and its covariance there."""
-        return self.ask.covariance("relative", [key for pair in pairs for key in pair], None, timeout_s).result()
+        return self.ask.covariance("relative", paired(pairs), None, timeout_s).result()
 
     def gate(
         self, candidates: Batch | Draft | Sequence[Factors], probability: float = 0.95, timeout_s: float | None = None
@@ -123,7 +129,7 @@ class Doubt:
         measured: ArrayLike,
         *,
         information: ArrayLike,
-        landmarks: Sequence[Key] | None = None,
+        landmarks: Sequence[Key] | Key | None = None,
         probability: float = 0.95,
         timeout_s: float | None = None,
     ) -> Associated:
@@ -141,9 +147,13 @@ class Doubt:
         return self.ask.why(asked_why(key, factor), timeout_s).result()
 
 
-def numbers(of: Iterable[Key]) -> I64:
-    """Keys as int64."""
-    return np.array([parse_symbol(key) if isinstance(key, str) else key for key in of], np.int64)
+def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
+    """Pairs one after the other; one pair will do.  Raises BadShape."""
+    alone = len(pairs) == 2 and not any(isinstance(key, (tuple, list, np.ndarray)) for key in pairs)
+    each: list[Any] = [pairs] if alone else list(pairs)
+    if any(isinstance(pair, (str, int)) or len(pair) != 2 for pair in each):
+        raise BadShape("pairs", repr(pairs)[:80], 'pairs of keys, such as [("x1", "x2")]')
+    return [key for pair in each for key in pair]
 
 
 def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, ...]:
@@ -168,7 +178,9 @@ def asked_why(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")
-    return AskWhy(None if key is None else int(numbers([key])[0]), factor)
+    return AskWhy(
+        None if key is None else key_number(key), None if factor is None else int(id_numbers("why", factor)[0])
+    )
 
 
 def sightings(
@@ -176,7 +188,7 @@ def sightings(
     kind: str,
     measured: ArrayLike,
     information: ArrayLike,
-    landmarks: Sequence[Key] | None,
+    landmarks: Sequence[Key] | Key | None,
     probability: float,
 ) -> AskAssociate:
     """The question, with the information of every sighting.  Raises BadShape."""
@@ -192,5 +204,5 @@ def sightings(
     if weights.shape not in ((known.information_size,), (len(rows), known.information_size)):
         raise BadShape("information", " × ".join(map(str, weights.shape)), f"{known.dim} × {known.dim}")
     weights = np.broadcast_to(weights, (len(rows), known.information_size))
-    chosen = None if landmarks is None else numbers(landmarks)
-    return AskAssociate(int(numbers([pose])[0]), kind, rows, weights, chosen, probability)
+    chosen = None if landmarks is None else key_numbers(landmarks)
+    return AskAssociate(key_number(pose), kind, rows, weights, chosen, probability)

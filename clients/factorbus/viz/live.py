@@ -20,6 +20,7 @@ from factorbus.viz.closures import closures_of, colours_of
 from factorbus.viz.ellipses import outlines
 from factorbus.viz.geometry import Track, points_of, rays_of, segments_of, track_of, view_of
 from factorbus.viz.lookout import Look
+from factorbus.viz.viewer_process import Viewer
 
 _LETTER_BITS = 56
 _POSITIONS_PER_S = 100_000  # what the whole map may add to a recording
@@ -39,23 +40,29 @@ class LiveView:
         self._map = map_name
         self._to = rr.RecordingStream("factorbus", recording_id=f"{map_name}-{os.urandom(4).hex()}")
         self._drawn_at, self._framed_m = -1e9, 0.0
+        self._viewer: Viewer | None = None  # for browsers; a window of this display stays when we go
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything from now on into an .rrd file."""
         self._to.save(os.fspath(path), default_blueprint=_blueprint(self._map))
         self._name_plots()
 
-    def spawn(self) -> None:
-        """Start the viewer on this machine's display, or use the one that runs.  Raises RuntimeError."""
-        self._to.spawn(default_blueprint=_blueprint(self._map))
-        self._name_plots()
+    def spawn(self, data_port: int) -> None:
+        """Start the viewer on this machine's display, or use the one that runs.  Raises RuntimeError, PortTaken."""
+        self._connect(Viewer("127.0.0.1", data_port))
 
-    def serve(self, web_port: int, data_port: int) -> str:
-        """Serve to browsers; gives the address of the page.  Raises RuntimeError, such as for a port that is taken."""
-        data = self._to.serve_grpc(grpc_port=data_port, default_blueprint=_blueprint(self._map))
-        rr.serve_web_viewer(web_port=web_port, open_browser=False, connect_to=data)
+    def serve(self, host: str, web_port: int, data_port: int) -> str:
+        """Serve to browsers at the address `host`; returns the page's address.
+
+        Raises RuntimeError, PortTaken, CannotListen.
+        """
+        self._viewer = Viewer(host, data_port, web_port)
+        self._connect(self._viewer)
+        return self._viewer.page
+
+    def _connect(self, viewer: Viewer) -> None:
+        self._to.connect_grpc(viewer.data, default_blueprint=_blueprint(self._map))
         self._name_plots()
-        return f"http://127.0.0.1:{web_port}/?url={data.replace(':', '%3A').replace('/', '%2F').replace('+', '%2B')}"
 
     def show(self, look: Look) -> None:
         """Log every step, and the map as it is now, unless it is large and was drawn just before."""
@@ -74,6 +81,8 @@ class LiveView:
         """Hand over what is still here."""
         self._to.flush(timeout_sec=10.0)
         self._to.disconnect()
+        if self._viewer is not None:
+            self._viewer.stop()
 
     def _frame(self, track: Track) -> None:
         """Step back when the map has outgrown the picture, each time by so much that it is seldom."""

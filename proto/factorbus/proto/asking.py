@@ -10,6 +10,7 @@ from typing import Any
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Factors, Variables
 from factorbus.proto.symbols import parse_symbol
+from factorbus.proto.why_text import why_symbols, why_text
 
 BLOCKS = ("diagonal", "joint", "cross", "relative", "last")
 
@@ -151,13 +152,29 @@ class AskWhy:
 
 @dataclass(frozen=True, slots=True)
 class Why:
-    """variable or factor: an account of it, the other is empty; step: the report of the map's last step.  Open maps."""
+    """variable or factor: an account of it, the other is empty; step: the report of the map's last step.  Open maps.
+
+    `str` of it is the same in words, with keys as they print (x12).
+    """
 
     epoch: int
     revision: int
     variable: Mapping[str, Any]
     factor: Mapping[str, Any]
     step: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The account in words: what it is, how certain, and its factors, those that fit worst first."""
+        return why_text(self.revision, self.variable, self.factor, self.step)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """The variables that are named, as they print: the variable first, then the others of its factors."""
+        return why_symbols(self.variable, self.factor)
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
+    │   └── NobodyListens    unavailable          there is nothing at that address
     ├── Refused              (the code it carries) a problem that came over the bus, as the client sees it
     └── Internal             internal             a fault of the service itself, with a reference into its log
 
@@ -25,8 +26,12 @@ The solver's own errors (unknown_variable, not_positive_definite, underconstrain
 (`factorbus.solver.errors`) and travel in the same form.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from factorbus.proto.nearest import nearest
+
+_NAMED = 12  # maps named where one is asked for that is not there
 
 
 class Problem(Exception):
@@ -141,8 +146,16 @@ class WrongEpoch(Problem):
 class UnknownMap(Problem):
     code = "unknown_map"
 
-    def __init__(self, name: str) -> None:
-        super().__init__(f"there is no map {name!r} here; create it, or ask admin/maps for those there are", map=name)
+    def __init__(self, name: str, known: Sequence[str] | None = None) -> None:
+        """known: the maps that there are, where that is known."""
+        if known is None:
+            super().__init__(
+                f"there is no map {name!r} here; create it, or ask admin/maps for those there are", map=name
+            )
+            return
+        shown = ", ".join(sorted(known)[:_NAMED]) + (f" and {len(known) - _NAMED} more" if len(known) > _NAMED else "")
+        there = f"there are {shown}{nearest(name, known)}" if known else "there is none yet"
+        super().__init__(f"there is no map {name!r} here; {there}", map=name, known=sorted(known))
 
 
 class UnknownQuestion(Problem):
@@ -188,6 +201,15 @@ class Unavailable(Problem):
 
     def __init__(self, what: str, waited_s: float, hint: str) -> None:
         super().__init__(f"{what} did not answer within {waited_s:g} s; {hint}", waited_s=waited_s)
+
+
+class NobodyListens(Unavailable):
+    """The address is that of a machine where nothing listens: no service, and no router."""
+
+    def __init__(self, endpoint: str) -> None:
+        Problem.__init__(
+            self, f"nothing listens at {endpoint}; start a service there with `factorbus serve`, or check the address"
+        )
 
 
 class Internal(Problem):

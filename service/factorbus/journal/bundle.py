@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from factorbus.journal.folders import IMPORTING, make_beside, sync_folder
-from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
+from factorbus.journal.problems import JournalDamaged, JournalFailed, MapThere, NoJournal
 from factorbus.journal.snapshots import file_of
 from factorbus.journal.store import NAME, open_store, what_reading_failed_with
 from factorbus.ownership import private_file
@@ -49,12 +49,12 @@ def export_map(folder: Path, file: Path) -> int:
 def import_map(file: Path, folder: Path) -> None:
     """The map in `file` into `folder`, which must not be there yet; all of it or nothing.
 
-    Raises NoJournal, JournalDamaged, JournalVersion, JournalFailed.
+    Raises NoJournal, MapThere, JournalDamaged, JournalVersion, JournalFailed.
     """
     if not file.is_file():
         raise NoJournal(file)
     if folder.exists():
-        raise JournalFailed(folder, "there is a map of that name; drop it, or give another name")
+        raise MapThere(folder)
     beside = folder.with_name(f"{IMPORTING}{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:

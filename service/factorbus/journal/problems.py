@@ -93,6 +93,32 @@ class JournalDiffers(Problem):
         )
 
 
+class JournalOption(Problem):
+    """The solver was set up with an option that this version does not have, or not with such a value."""
+
+    code = "journal_option"
+
+    def __init__(self, name: str, what: str) -> None:
+        super().__init__(
+            f"the journal's map was solved with the option {name!r}: {what}. Other settings would make other steps, so "
+            "it is not opened; open it with the version of factorbus that wrote it",
+            name=name,
+        )
+
+
+class MapThere(Problem):
+    """A map of that name is in the folder already."""
+
+    code = "map_exists"
+
+    def __init__(self, where: Path) -> None:
+        super().__init__(
+            f"there is a map {where.name!r} in {where.parent} already, and it stays as it is: give the new one another "
+            "name (--as), or drop that one first",
+            map=where.name,
+        )
+
+
 class NoJournal(Problem):
     """There is no journal where one was looked for."""
 

@@ -17,6 +17,7 @@ from zenoh.handlers import Callback
 from factorbus.proto import codec, discreet, keys
 from factorbus.proto.kept_state import keep_state
 from factorbus.proto.messages import Job
+from factorbus.proto.ports import check_endpoints
 from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.events import Asker
@@ -35,7 +36,7 @@ _PRIORITY = {
 
 
 def open_bus(config: Config) -> "Bus":
-    """The bus as `config` describes it.  Raises BadConfig; Exposed is one."""
+    """The bus as `config` describes it.  Raises BadConfig; Exposed is one.  Raises PortTaken, CannotListen."""
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
@@ -50,9 +51,11 @@ def open_bus(config: Config) -> "Bus":
     try:
         return Bus(zenoh.open(settings))
     except zenoh.ZError as error:
+        if config.mode != "client":
+            check_endpoints(config.listen)
         where = discreet.endpoint(", ".join(config.listen if config.mode != "client" else config.connect))
         raise BadConfig(
-            f"cannot open {where}: {discreet.reason(error)}; is the address right and free, and its certificate there?"
+            f"cannot open {where}: {discreet.reason(error)}; is the address right, and its certificate there?"
         ) from None
 
 

@@ -12,10 +12,11 @@ from typing import Any
 from factorbus.journal.folders import GONE, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
-from factorbus.journal.problems import JournalFailed
+from factorbus.journal.problems import JournalFailed, JournalOption
 from factorbus.journal.records import Epoch, Header
 from factorbus.journal.snapshots import remove_strangers
 from factorbus.journal.store import NAME, Last, Store, create, open_store
+from factorbus.proto.nearest import nearest
 from factorbus.service.config import Config, Limits
 from factorbus.service.core import MapCore, Restored
 from factorbus.service.fold import Folder
@@ -26,12 +27,18 @@ log = logging.getLogger(__name__)
 
 
 def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> Folder:
-    """A new folder with a solver in `mode`, and the other settings as `options` has them."""
+    """A new folder with a solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
     from factorbus.solver import Options, Solver
+    from factorbus.solver.errors import BadOption
 
-    known = {field.name for field in fields(Options)}
-    chosen = {name: value for name, value in options.items() if name in known}
-    settings = Options(**{**chosen, "mode": mode, "clock": time.perf_counter})
+    known = tuple(field.name for field in fields(Options) if field.name != "clock")
+    for name in options:
+        if name not in known:
+            raise JournalOption(name, "there is no such option here" + nearest(name, known))
+    try:
+        settings = Options(**{**options, "mode": mode, "clock": time.perf_counter})
+    except BadOption as bad:
+        raise JournalOption(str(bad.detail["name"]), bad.message) from None
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, NamedTuple
 
+from factorbus.proto.ports import listening_problem
 from factorbus.service.config import BadConfig
 from factorbus.service.vitals import Vitals
 
@@ -42,7 +43,10 @@ class Metrics:
 
 
 def open_metrics(where: str, vitals: Vitals) -> Metrics:
-    """Serve what `vitals` know at `where` (HOST:PORT); nowhere if that is empty.  Raises BadConfig."""
+    """Serve what `vitals` know at `where` (HOST:PORT); nowhere if that is empty.
+
+    Raises BadConfig, PortTaken, CannotListen.
+    """
     if not where:
         return Metrics()
     try:
@@ -53,7 +57,9 @@ def open_metrics(where: str, vitals: Vitals) -> Metrics:
     try:
         server = _Server((host.strip("[]"), int(port)), _handler(vitals))
     except OSError as error:
-        raise BadConfig(f"cannot serve metrics at {where}: {error.strerror}; is the address right, and free?") from None
+        raise listening_problem(f"{where}, for metrics,", error) from None
+    except OverflowError:
+        raise BadConfig(f"metrics is {where!r}; wanted a port from 0 to 65535") from None
     opened = Metrics(server)
     log.info("metrics at http://%s:%d/metrics", host, opened.port, extra={"port": opened.port})
     return opened

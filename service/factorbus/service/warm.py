@@ -63,7 +63,7 @@ def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
         with os.fdopen(tell, "w") as end:
             for _ in range(processes):
                 process = subprocess.Popen(
-                    [sys.executable, "-m", "factorbus.service.warm", claims],
+                    [sys.executable, "-P", "-m", "factorbus.service.warm", claims],
                     stdin=subprocess.DEVNULL,
                     stdout=end,
                     env=os.environ | _PLAIN_MESSAGES,

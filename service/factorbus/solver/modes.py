@@ -37,7 +37,7 @@ MODES = ("auto", *MODE_OF_NAME)
 
 def mode_named(name: str) -> Mode:
     """The mode of this name; "inc-l b10", as in the paper, is "inc-l-b10".  Raises UnknownMode."""
-    wanted = AUTO if name == "auto" else name.replace(" ", "-")
+    wanted = AUTO if name == "auto" else str(name).replace(" ", "-")
     if wanted not in MODE_OF_NAME:
         raise UnknownMode(name, MODES)
     return MODE_OF_NAME[wanted]

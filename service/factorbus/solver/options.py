@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from factorbus.solver.errors import BadOption
 from factorbus.solver.modes import MODES, mode_named
+from factorbus.solver.option_ranges import check_numbers
 
 __all__ = ["MODES", "Options"]
 
@@ -105,16 +106,11 @@ class Options:
         mode_named(self.mode)
         if self.backend not in ("blocks", "cholmod"):
             raise BadOption("backend", repr(self.backend), '"blocks" or "cholmod"')
-        if not 0 <= self.small_loop <= self.big_loop:
+        if self.clock is not None and not callable(self.clock):
+            raise BadOption("clock", repr(self.clock), "None, or a function that returns seconds")
+        check_numbers(self)
+        if not self.small_loop <= self.big_loop:
             raise BadOption("small_loop, big_loop", f"{self.small_loop}, {self.big_loop}", "0 ≤ small_loop ≤ big_loop")
-        if not self.rings > 1.0:
-            raise BadOption("rings", str(self.rings), "more than 1")
-        if self.recent_poses < 1:
-            raise BadOption("recent_poses", str(self.recent_poses), "1 or more")
-        if self.max_iterations < 0 or self.settle_iterations < 0:
-            raise BadOption(
-                "max_iterations, settle_iterations", f"{self.max_iterations}, {self.settle_iterations}", "0 or more"
-            )
 
     def as_dict(self) -> dict[str, Any]:
         """All settings but the clock, as plain types: what a solver reports of itself."""

@@ -210,7 +210,7 @@ class TreeSteps:
         return _new(StepReport, (
             "tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
-            because or (f"{relinearised} variables relinearized" if relinearised else _NOTHING_TO_RELINEARIZE),
+            because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
             chi2,
             chi2_before if chi2_before > 0.0 else 0.0,
@@ -228,3 +228,10 @@ class TreeSteps:
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip
+
+
+def _relinearized(count: int, rounds: int) -> str:
+    """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
+    if rounds > 1:
+        return f"{count} relinearizations in {rounds} rounds"
+    return f"{count} variable{'s' if count > 1 else ''} relinearized"

@@ -6,6 +6,7 @@ const AXES = { z: [0, 1], y: [0, 2], x: [1, 2] };
 // Where the entries of a covariance are in xx xy xz yy yz zz.
 const ENTRY = [[0, 1, 2], [1, 3, 4], [2, 4, 5]];
 const REACH_PX = 14;
+const FEW_TOUCHED = 60; // so many variables of the last step are shown in full
 
 export class View {
   constructor(canvas, plane) {
@@ -61,8 +62,7 @@ export class View {
     this.canvas.height = h * ratio;
     const pen = this.canvas.getContext("2d");
     pen.scale(ratio, ratio);
-    // Below everything else, so that it hides nothing.
-    for (const key of map.touched) this.dot(pen, map.placeOf(key), 4, colour("touched"));
+    this.drawTouched(pen, map);
     this.drawEllipses(pen, map, ellipses);
     this.drawClosures(pen, map, closures);
     for (const keys of map.tracks().values()) this.drawTrack(pen, map, keys);
@@ -70,6 +70,24 @@ export class View {
       if (kind.startsWith("point")) this.dot(pen, map.placeOf(key), 3.5, colour("landmark"));
     }
     if (this.chosen) this.ring(pen, map.placeOf(this.chosen));
+  }
+
+  // Below everything else, and paler and smaller the more there are, so that a step that moved all hides nothing.
+  drawTouched(pen, map) {
+    const few = Math.min(1, FEW_TOUCHED / Math.max(map.touched.size, 1));
+    const radius = 2 + 2 * few;
+    pen.fillStyle = colour("touched");
+    pen.globalAlpha = 0.3 + 0.7 * few;
+    pen.beginPath(); // one for all: where dots lie upon each other they are no darker
+    for (const key of map.touched) {
+      const place = map.placeOf(key);
+      if (!place) continue;
+      const [x, y] = this.pixelOf(place);
+      pen.moveTo(x + radius, y);
+      pen.arc(x, y, radius, 0, 2 * Math.PI);
+    }
+    pen.fill();
+    pen.globalAlpha = 1;
   }
 
   drawTrack(pen, map, keys) {

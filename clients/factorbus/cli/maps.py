@@ -1,0 +1,40 @@
+"""`factorbus maps`: the maps that there are."""
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
+
+if TYPE_CHECKING:
+    from factorbus.client.map import MapRow
+
+
+@click.command()
+@connect_option
+@zenoh_option
+@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For the answer.")
+@json_option
+def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
+    """List the maps of the service at ENDPOINT; at a router, those of all services.
+
+    \b
+    factorbus maps
+    factorbus maps --connect tls/solver.local:7447 --zenoh ops.json5 --json
+    """
+    from factorbus.cli import screen
+    from factorbus.cli.bus import open_bus
+
+    with open_bus(endpoint, "maps", zenoh, wait_s) as bus:
+        rows = sorted(bus.maps(), key=lambda row: row.name)
+    if as_json:
+        screen.document({"maps": [asdict(row) for row in rows]})
+    elif rows:
+        screen.table([(row.name, _told(row)) for row in rows])
+    else:
+        screen.note(f"there is no map at {endpoint} yet")
+
+
+def _told(row: "MapRow") -> str:
+    return f"{row.variables:,} variables, {row.factors:,} factors, revision {row.revision:,}, {row.mode}"

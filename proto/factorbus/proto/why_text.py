@@ -1,0 +1,46 @@
+"""An answer of `ask/why` in words, for a person.  Of open accounts, what is not there is not said."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from factorbus.proto.symbols import format_symbol
+
+_SHOWN = 8
+
+
+def why_text(revision: int, variable: Mapping[str, Any], factor: Mapping[str, Any], step: Mapping[str, Any]) -> str:
+    """Lines about a variable and its factors, those that fit worst first, or about one factor; then the last step."""
+    lines = [*_of_variable(revision, variable)] if variable else [f"{_of_factor(factor)}, at revision {revision}"]
+    if "because" in step:
+        lines.append(f"last step: {step.get('strategy', '')}, because {step['because']}")
+    return "\n".join(lines)
+
+
+def why_symbols(variable: Mapping[str, Any], factor: Mapping[str, Any]) -> tuple[str, ...]:
+    """The variables that are named, as they print, each once."""
+    factors = variable.get("factors", ()) if variable else (factor,)
+    keys = [variable["key"]] if "key" in variable else []
+    keys += [key for each in factors for key in each.get("keys", ())]
+    return tuple(dict.fromkeys(format_symbol(int(key)) for key in keys))
+
+
+def _of_variable(revision: int, variable: Mapping[str, Any]) -> Iterator[str]:
+    name, fixed = format_symbol(int(variable["key"])), ", fixed" if variable.get("fixed") else ""
+    yield f"{name}, {variable.get('kind', 'a variable')}{fixed}, at revision {revision}"
+    for what in ("value", "sigmas"):
+        if what in variable:
+            yield f"{what}: {'  '.join(f'{number:.4g}' for number in variable[what])}"
+    factors = sorted(variable.get("factors", ()), key=lambda each: -float(each.get("chi2") or 0.0))
+    yield from map(_of_factor, factors[:_SHOWN])
+    if len(factors) > _SHOWN:
+        yield f"and {len(factors) - _SHOWN} factors more"
+
+
+def _of_factor(factor: Mapping[str, Any]) -> str:
+    ends = ", ".join(format_symbol(int(key)) for key in factor.get("keys", ()))
+    told = f"factor {factor.get('factor', '?')}, {factor.get('kind', '')} ({ends})"
+    if factor.get("chi2") is not None:
+        told += f": χ² {factor['chi2']:.3g}"
+    if factor.get("without") is not None:
+        told += f", without it χ² falls by {factor['without']:.3g}"
+    return told

@@ -1,0 +1,229 @@
+"""What a newcomer types: wrong things are told apart and said at once, in whatever folder."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import processes
+
+from factorbus.cli.bus import open_bus
+from factorbus.cli.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABLE, USAGE
+from factorbus.cli.main import main
+from factorbus.client import Draft, connect
+from factorbus.proto.problems import NobodyListens
+from factorbus.proto.version import __version__
+
+FACTORBUS = str(Path(sys.executable).parent / "factorbus")
+SIGMAS = (0.1, 0.1, 0.02)
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A service with the map `yard` of two robots, of keys without letters, and none else."""
+    with processes(tmp_path_factory.mktemp("newcomer")) as start:
+        (found,) = start("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--no-warm").ready()
+        with connect(found, client="robot", timeout_s=60) as bus, bus.map("yard") as yard:
+            for letter in ("a", "b", ""):
+                draft = Draft().se2(f"{letter}0", (len(letter), ord(letter or "z"), 0), fixed=True)
+                for i in range(1, 4):
+                    ends = f"{letter}{i - 1}", f"{letter}{i}"
+                    draft.se2(ends[1]).between_se2(*ends, (1, 0, 0), sigmas=SIGMAS)
+                yard.insert(draft)
+        yield found
+
+
+def typed(*arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([FACTORBUS, *arguments], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_version() -> None:
+    assert typed("--version").stdout == f"factorbus {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["ask", "why", "yard", "x1"], ["stats"], ["maps"], ["top", "--once"], ["drop", "yard"],
+        ["save", "yard", "a.g2o"],
+        ["watch", "yard", "--save", "a.rrd"], ["record", "yard", "--out", "a.mcap"], ["gateway", "--port", "0"],
+        ["change", "fix", "yard", "x1"], ["plot", "map", "yard"], ["replay", "one.g2o"],
+    ],
+)  # fmt: skip
+def test_where_nothing_listens_it_is_said_within_about_a_second(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.g2o").write_text("VERTEX_SE2 0 0 0 0\n")
+    with socket.socket() as taken:  # bound, and nobody listens
+        taken.bind(("127.0.0.1", 0))
+        nowhere = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        code = main([*arguments, "--connect", nowhere])
+        with pytest.raises(NobodyListens):  # and not after the day that its answers may take
+            open_bus(nowhere, "test", timeout_s=86400)
+    said = capsys.readouterr().err
+    assert code == UNAVAILABLE, said
+    assert f"nothing listens at {nowhere}; start a service there" in said
+
+
+@pytest.mark.parametrize("arguments", [["ask", "why", "yrad", "x1"], ["drop", "yrad"], ["save", "yrad", "a.g2o"]])
+def test_an_unknown_map_names_those_there_are(
+    endpoint: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([*arguments, "--connect", endpoint]) == REFUSED
+    assert "there is no map 'yrad' here; there are yard; did you mean 'yard'? [unknown_map]" in capsys.readouterr().err
+
+
+def test_maps_are_listed(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["maps", "--connect", endpoint, "--json"]) == OK
+    (row,) = json.loads(capsys.readouterr().out)["maps"]
+    assert (row["name"], row["variables"], row["factors"], row["revision"]) == ("yard", 12, 9, 3)
+
+
+def test_a_map_is_saved_whole_or_the_way_of_each_robot(
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def save(*arguments: str) -> list[str]:
+        assert main(["save", "yard", *arguments, "--connect", endpoint]) == OK
+        return capsys.readouterr().out.split()
+
+    whole, way = tmp_path / "yard.g2o", tmp_path / "way.tum"
+    assert save(str(whole)) == [str(whole)]
+    assert whole.read_text().count("EDGE_SE2") == 9
+    assert save(str(way), "--robot", "a") == [str(way)]
+    assert [float(line.split()[2]) for line in way.read_text().splitlines()] == [97.0] * 4
+    each = save(str(tmp_path / "all.kitti"))
+    assert each == [str(tmp_path / f"all-{name}.kitti") for name in ("none", "a", "b")]
+    assert all(len(Path(path).read_text().splitlines()) == 4 for path in each)
+    assert main(["save", "yard", str(way), "--robot", "q", "--connect", endpoint]) == REFUSED
+    assert "there is keys without a letter, a, b" in capsys.readouterr().err
+    assert main(["save", "yard", str(tmp_path / "a.xyz"), "--connect", endpoint]) == USAGE
+    assert main(["save", "yard", str(whole), "--robot", "a", "--connect", endpoint]) == USAGE
+
+
+def test_why_of_a_number_is_of_the_factor_and_of_the_variable_without_a_letter(
+    endpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def why(*arguments: str) -> dict:
+        assert main(["ask", "why", "yard", *arguments, "--json", "--connect", endpoint]) == OK
+        return json.loads(capsys.readouterr().out)
+
+    both = why("3")
+    assert (both["variable"]["key"], both["factor"]["factor"]) == (3, 3)
+    assert why("3", "--variable")["factor"] == {}
+    assert why("3", "--factor")["variable"] == {}
+    assert why("8")["variable"] == {}
+    assert main(["ask", "why", "yard", "99", "--connect", endpoint]) == REFUSED
+    assert main(["ask", "why", "yard", "x3", "--factor", "--connect", endpoint]) == USAGE
+    assert main(["ask", "why", "yard", "9" * 30, "--connect", endpoint]) == USAGE
+
+
+def test_why_in_python_has_words_and_symbols_and_one_key_will_do(endpoint: str) -> None:
+    with connect(endpoint, client="reader") as bus, bus.map("yard", mirror=False, create=False) as yard:
+        why = yard.doubt.why("a2")
+        assert why.symbols == ("a2", "a1", "a3")
+        assert str(why) == why.text
+        assert why.text.splitlines()[0] == "a2, se2, at revision 3"
+        assert "between_se2 (a1, a2): χ²" in why.text
+        assert yard.doubt.why(factor=0).text.startswith("factor 0, between_se2 (a0, a1)")
+        assert yard.doubt.covariance("a2")["a2"].shape == (3, 3)
+        assert yard.doubt.relative(("a1", "a2")).groups[0].covariance.shape == (1, 3, 3)
+        assert [group.keys.size for group in yard.ask_estimate("a2").variables] == [1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ask", "covariance", "yard", "--timeout", "nan"], "not a finite number"),
+        (["ask", "covariance", "yard", "--timeout", "-1"], "range"),
+        (["change", "weigh", "yard", "nan", "1"], "not a finite number"),
+        (["stats", "--wait", "1e300"], "range"),
+        (["replay", "a.g2o", "--pace", "inf"], "not a finite number"),
+        (["top", "--every", "nan"], "not a finite number"),
+        (["record", "yard", "--out", "nowhere/a.mcap"], "there is no folder nowhere"),
+        (["save", "yard", "nowhere/a.g2o"], "there is no folder nowhere"),
+    ],
+)
+def test_numbers_and_places_that_cannot_be_are_refused(
+    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == USAGE
+    assert said in capsys.readouterr().err
+
+
+def test_a_taken_port_has_its_code_and_is_named(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        ran = typed("serve", "--no-warm", "--listen", f"tcp/127.0.0.1:{port}", folder=tmp_path)
+        assert (ran.returncode, ran.stdout) == (USAGE, "")
+        assert f"tcp/127.0.0.1:{port} is taken: another process listens there" in ran.stderr
+        assert "[port_taken]" in ran.stderr
+    ran = typed("serve", "--no-warm", "--listen", "tcp/192.0.2.1:7447", "--insecure", folder=tmp_path)
+    assert ran.returncode == USAGE
+    assert "[cannot_listen]" in ran.stderr
+
+
+def test_an_import_over_a_map_that_is_there_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "journal" / "hall").mkdir(parents=True)
+    (tmp_path / "hall.fbmap").write_text("")
+    code = main(["import", str(tmp_path / "hall.fbmap"), "--journal", str(tmp_path / "journal")])
+    said = capsys.readouterr().err
+    assert code == REFUSED, said
+    assert "[map_exists]" in said
+
+
+def test_files_of_the_folder_one_is_in_are_neither_run_nor_in_the_way(tmp_path: Path) -> None:
+    for name in (
+        "click",
+        "numpy",
+        "json",
+        "zenoh",
+        "rich",
+        "msgpack",
+        "factorbus",
+        "numba",
+        "logging",
+        "typing",
+        "queue",
+    ):
+        (tmp_path / f"{name}.py").write_text("import sys\nsys.exit('poisoned')\n")
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    for arguments in (
+        ["simulate", "manhattan", "--poses", "12", "--out", "town.g2o"],
+        ["replay", "town.g2o", "--every", "4", "--json"],  # a solver and a worker of its own
+        ["doctor"],
+        ["version"],
+    ):
+        ran = subprocess.run(
+            [FACTORBUS, *arguments],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=280,
+            check=False,
+        )
+        assert ran.returncode in (OK, FAILED if arguments == ["doctor"] else OK), ran.stderr
+        assert "poisoned" not in ran.stdout + ran.stderr
+        if arguments[0] == "replay":
+            assert [each["revision"] for each in json.loads(ran.stdout)["against_batch"]] == [4, 8, 12]
+
+
+def test_a_map_of_a_file_without_vertices_is_drawn_from_odometry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    edges = [f"EDGE_SE2 {i} {i + 1} 1 0 0.3 100 0 0 100 0 400\n" for i in range(6)]
+    (tmp_path / "bare.g2o").write_text("".join(edges))
+    assert main(["plot", "map", "bare.g2o"]) == OK
+    shown = capsys.readouterr()
+    assert "poses are composed from odometry" in shown.err
+    assert (tmp_path / "bare-map.png").stat().st_size > 5000
+    assert main(["plot", "map", "nothing.g2o"]) == BAD_FILE

@@ -1,0 +1,72 @@
+"""Every option that is not what it should be is refused by name; every one that is, is taken."""
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from factorbus.solver import Options
+from factorbus.solver.errors import BadOption, SolverError
+from factorbus.solver.option_ranges import RANGES, SWITCHES
+
+TEXTS = ("mode", "backend")
+FIELDS = tuple(field.name for field in dataclasses.fields(Options))
+JUNK = st.one_of(
+    st.none(), st.text(max_size=4), st.complex_numbers(), st.binary(max_size=2), st.lists(st.integers(), max_size=2)
+)
+
+
+def test_every_option_has_a_range_or_is_a_switch_or_a_text() -> None:
+    assert set(FIELDS) == {*RANGES, *SWITCHES, *TEXTS, "clock"}
+    for field in dataclasses.fields(Options):
+        if field.name in RANGES:
+            assert RANGES[field.name].takes(field.default)
+            assert RANGES[field.name].whole == (field.type in (int, "int"))
+
+
+@pytest.mark.parametrize("name", sorted(RANGES))
+def test_a_number_out_of_its_range_is_refused_by_name(name: str) -> None:
+    allowed = RANGES[name]
+    for wrong in (
+        math.nan,
+        -1,
+        -math.inf,
+        "x",
+        "0.5",
+        None,
+        True,
+        [1],
+        1j,
+        allowed.least - 1,
+        2.5 if allowed.whole else "1",
+    ):
+        with pytest.raises(BadOption, match=f"option {name}: seen") as refused:
+            Options(**{name: wrong})
+        assert refused.value.detail["name"] == name
+        assert refused.value.detail["wanted"] == str(allowed)
+
+
+@pytest.mark.parametrize("name", [*SWITCHES, "clock", "mode", "backend"])
+def test_what_is_no_switch_no_clock_and_no_name_is_refused(name: str) -> None:
+    for wrong in (1, 0.0, "yes", math.nan, []):
+        with pytest.raises(SolverError, match=r"seen|no mode"):
+            Options(**{name: wrong})
+
+
+@settings(max_examples=300, deadline=None)
+@given(name=st.sampled_from(sorted(RANGES)), value=st.floats() | st.integers() | st.booleans() | JUNK)
+def test_any_value_is_taken_as_it_is_or_refused(name: str, value: Any) -> None:
+    allowed = RANGES[name]
+    number = not isinstance(value, bool) and isinstance(value, int if allowed.whole else (int, float))
+    right = number and not math.isnan(value) and allowed.least <= value <= allowed.most
+    right = right and not (allowed.above and value == allowed.least)
+    if name in ("small_loop", "big_loop") and right:
+        right = value <= Options().big_loop if name == "small_loop" else value >= Options().small_loop
+    if right:
+        assert getattr(Options(**{name: value}), name) == value
+    else:
+        with pytest.raises(BadOption):
+            Options(**{name: value})
