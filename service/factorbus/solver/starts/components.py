@@ -10,7 +10,7 @@ from factorbus.solver.starts.rotation_matrices import nearest_rotations
 from factorbus.solver.starts.translations import placed
 
 # What the rotations that are there count for beside what is measured: where that leaves a direction open.
-_PRESENT = 1e-9
+_PRESENT = 1e-12
 
 
 def components_of(relations: Relations, held: np.ndarray) -> I64:
