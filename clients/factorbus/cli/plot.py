@@ -55,7 +55,7 @@ def map_command(source: str, connect: str | None, solve: bool, ellipses: int, ou
     from factorbus.viz import Course
 
     drawn = _ready(lambda: graph_of(source, connect), out)
-    drawn = solved(drawn) if solve else drawn
+    drawn = solved(drawn, on_file=connect is None) if solve else drawn
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses) if ellipses else None
     draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)

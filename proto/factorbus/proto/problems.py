@@ -18,6 +18,7 @@
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
+    ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── Refused              (the code it carries) a problem that came over the bus, as the client sees it
     └── Internal             internal             a fault of the service itself, with a reference into its log
 
@@ -27,6 +28,8 @@ The solver's own errors (unknown_variable, not_positive_definite, underconstrain
 
 from collections.abc import Mapping
 from typing import Any
+
+_FROM = {"values": "the map's own values", "odometry": "composed odometry", "rotations": "averaged rotations"}
 
 
 class Problem(Exception):
@@ -174,6 +177,29 @@ class Unavailable(Problem):
 
     def __init__(self, what: str, waited_s: float, hint: str) -> None:
         super().__init__(f"{what} did not answer within {waited_s:g} s; {hint}", waited_s=waited_s)
+
+
+class BetterOptimum(Problem):
+    """A notice, not a refusal: it comes in the answer to ask/chi2."""
+
+    code = "better_optimum"
+    # How far χ² of the map may be above the batch optimum's before it is said.
+    SHARE, FLOOR = 0.01, 1e-6
+
+    def __init__(self, chi2: float, batch: float, start: str) -> None:
+        by = _FROM.get(start, "another start")
+        super().__init__(
+            f"the map is in a worse minimum: its χ² is {chi2:.6g}, and {batch:.6g} at an optimum found from {by}; "
+            "`factorbus change adopt MAP` puts the map there",
+            chi2=chi2,
+            batch=batch,
+            start=start,
+        )
+
+    @classmethod
+    def or_none(cls, chi2: float, batch: float, start: str) -> "BetterOptimum | None":
+        """The notice, if `batch` is below `chi2` by more than 1 %."""
+        return cls(chi2, batch, start) if chi2 > (1.0 + cls.SHARE) * batch + cls.FLOOR else None
 
 
 class Internal(Problem):

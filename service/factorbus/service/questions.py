@@ -29,13 +29,16 @@ _FORMATS = ("g2o", "tum", "kitti")
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format: of export.
+    """One question, checked.  keys: of an estimate, None for all.  batch, values, timeout_s: of chi2.
+    format: of export.
+
     ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
     """
 
     name: str
     keys: I64 | None = None
     batch: bool = False
+    values: bool = False
     timeout_s: float = 60.0
     format: str = "g2o"
     ask: Any = None
@@ -86,7 +89,8 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, ask=decode_ask_repair(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
-        return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
+        batch, values = _flag(content, "batch"), _flag(content, "values")
+        return Question(name, batch=batch, values=values, timeout_s=_seconds(content, "timeout_s", 60.0))
     if name == "export" and content.get("format", "g2o") not in _FORMATS:
         raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {content['format']!r:.40}")
     return Question(name, format=content.get("format", "g2o"))

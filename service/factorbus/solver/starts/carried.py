@@ -8,6 +8,7 @@ from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.starts.relations import Relations, Space
+from factorbus.solver.starts.rotation_matrices import turned_rays
 
 # What such a tie counts for beside rays to the same point.
 _WEAK = 1e-4
@@ -56,15 +57,11 @@ def carry(graph: Graph, space: Space, before: tuple[F64, F64], after: tuple[F64,
         return
     start = graph.var[features - 1, at.V_AT]
     at_now = graph.values[start[:, None] + np.arange(3)]
-    theta, phi = graph.values[start + 3], graph.values[start + 4]
-    m = np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=1)
     (R, t), (to_R, to_t) = before, after
     turn = to_R[poses] @ R[poses].transpose(0, 2, 1)
-    there = to_t[poses] + (turn @ (at_now - t[poses])[:, :, None])[:, :, 0]
-    m = (turn @ m[:, :, None])[:, :, 0]
-    values[start[:, None] + np.arange(3)] = there
-    values[start + 3] = np.arctan2(m[:, 0], m[:, 2])
-    values[start + 4] = np.arcsin(np.clip(-m[:, 1], -1.0, 1.0))
+    values[start[:, None] + np.arange(3)] = to_t[poses] + (turn @ (at_now - t[poses])[:, :, None])[:, :, 0]
+    angles = graph.values[start[:, None] + 3 + np.arange(2)]
+    values[start[:, None] + 3 + np.arange(2)] = turned_rays(angles, turn)
 
 
 def _first_seen(graph: Graph, wanted: np.ndarray, pose: np.ndarray) -> tuple[I64, I64, I64]:

@@ -59,3 +59,11 @@ def angles_of(R: F64) -> F64:
     if R.shape[1] == 2:
         return np.abs(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
     return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+
+
+def turned_rays(angles: F64, turn: F64) -> F64:
+    """Azimuth and elevation (n, 2) of rays turned by rotations (n, 3, 3)."""
+    theta, phi = angles.T
+    m = np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=1)
+    m = (turn @ m[:, :, None])[:, :, 0]
+    return np.stack([np.arctan2(m[:, 0], m[:, 2]), np.arcsin(np.clip(-m[:, 1], -1.0, 1.0))], axis=1)
