@@ -61,7 +61,7 @@ class Descents:
 
     def __init__(self, graph: Graph) -> None:
         options = Options(mode="all-batch")
-        self._rule = options.settle_tolerance, 1e-8 * options.negligible
+        self._rule, self._nothing = (options.settle_tolerance, 1e-8 * options.negligible), options.negligible
         self.graph, none = graph, (0,) * at.COUNTS
         self._system = System(graph, Incremental(Elimination(options), options))
         self._suspects = find_unheld(graph, none)
@@ -102,7 +102,7 @@ class Descents:
         if failed is not None and not descents:
             raise failed
         lowest = min(each.chi2 for each in descents)
-        equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + self._rule[1]]
+        equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + self._nothing]
         return min(equal, key=lambda each: (not each.converged, STARTS.index(each.start)))
 
     def _go_on(self, descent: Descent) -> None:
