@@ -1,6 +1,7 @@
 """`factorbus replay`: the same file in this process and over the bus, and what is said and written about it."""
 
 import json
+import math
 import os
 import re
 import select
@@ -201,3 +202,41 @@ def announced(lines: IO[str]) -> tuple[int, str]:
         if found := re.search(r"solver process (\d+) on (\S+)", line):
             return int(found[1]), found[2]
     pytest.fail("the replay did not say where its solver process is")
+
+
+@pytest.fixture(scope="module")
+def wound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ring of 16 exact relative poses, its values wound once too often: a minimum of its own."""
+    turn, lines = 2 * math.pi / 16, []
+    for i in range(16):
+        angle = math.remainder(2 * turn * i, 2 * math.pi)
+        lines.append(f"VERTEX_SE2 {i} 0 0 {angle:.17g}")
+    step = (math.cos(turn / 2) * 2 * math.sin(turn / 2), 2 * math.sin(turn / 2) ** 2, turn)
+    for i in range(16):
+        z = " ".join(f"{number:.17g}" for number in step)
+        lines.append(f"EDGE_SE2 {i} {(i + 1) % 16} {z} 100 0 0 100 0 2500")
+    path = tmp_path_factory.mktemp("worlds") / "wound.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_values_of_a_file_in_a_worse_minimum_are_told_and_left(wound: Path) -> None:
+    kept = replayed(wound, "--in-process", "--use-values", "--no-adopt", "--every", "16")
+    last = kept["against_batch"][-1]
+    if not last["better_optimum"]:
+        pytest.fail(f"the ring is meant to stay wound: {last}")
+    assert last["start"] in ("odometry", "rotations")
+    assert kept["adopted"] is None
+    assert kept["chi2"] > 1.0
+    found = replayed(wound, "--in-process", "--use-values")
+    assert found["adopted"]["code"] == "better_optimum"
+    assert found["adopted"]["chi2"] == pytest.approx(kept["chi2"], rel=1e-6)
+    assert found["chi2"] < 1e-9
+
+
+def test_what_the_batch_optimum_was_found_from_is_said(wound: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(wound), "--in-process", "--every", "16", "--use-values"]) == OK
+    said = capsys.readouterr()
+    assert "better_optimum" in said.out + said.err
+    assert main(["replay", str(wound), "--in-process", "--every", "16"]) == OK
+    assert "optimum from the map's own values" in capsys.readouterr().out
