@@ -13,7 +13,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64
 from factorbus.solver.kernels.reach import reach
 from factorbus.solver.starts.averaged import averaged
-from factorbus.solver.starts.descent import ODOMETRY, ROTATIONS, STARTS, VALUES, Descent, Descents, are_close
+from factorbus.solver.starts.descent import NOTHING, ODOMETRY, ROTATIONS, STARTS, VALUES, Descent, Descents, are_close
 
 __all__ = ["STARTS", "BatchResult", "solve_batch"]
 
@@ -61,7 +61,7 @@ def _begun(descents: Descents, given: bool) -> list[Descent]:
             failed = failed or problem
     if failed is not None and not begun:
         raise failed
-    begun.sort(key=lambda each: each.chi2)
+    begun.sort(key=lambda each: (each.chi2 if each.chi2 > NOTHING else 0.0, STARTS.index(each.start)))
     return [each for n, each in enumerate(begun) if not any(_is_beside(each, lower) for lower in begun[:n])]
 
 

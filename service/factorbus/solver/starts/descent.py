@@ -35,6 +35,7 @@ _SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
 _PATIENCE, _FAR = 2, 2.0
 # Ends whose χ² differ by less than this share are one: of those, the start that comes first in the list counts.
 _EQUAL = 1e-9
+NOTHING = Options().negligible
 
 
 @dataclass(slots=True)
@@ -61,7 +62,7 @@ class Descents:
 
     def __init__(self, graph: Graph) -> None:
         options = Options(mode="all-batch")
-        self._rule, self._nothing = (options.settle_tolerance, 1e-8 * options.negligible), options.negligible
+        self._rule = options.settle_tolerance, 1e-8 * options.negligible
         self.graph, none = graph, (0,) * at.COUNTS
         self._system = System(graph, Incremental(Elimination(options), options))
         self._suspects = find_unheld(graph, none)
@@ -102,7 +103,7 @@ class Descents:
         if failed is not None and not descents:
             raise failed
         lowest = min(each.chi2 for each in descents)
-        equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + self._nothing]
+        equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + NOTHING]
         return min(equal, key=lambda each: (not each.converged, STARTS.index(each.start)))
 
     def _go_on(self, descent: Descent) -> None:
