@@ -11,6 +11,7 @@ The bytes are part of wire version 1: they never change; new optional fields get
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from factorbus.proto.messages import (
     Optimum,
     Variables,
 )
-from factorbus.proto.problems import Busy
+from factorbus.proto.problems import BetterOptimum, Busy
 from factorbus.proto.symbols import symbol
 
 _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
@@ -83,6 +84,16 @@ def vectors() -> dict[str, bytes]:
         "graph_ids": codec.encode_graph(Graph(7, 3, Batch(pair, (_odometry(0)._replace(ids=np.array([4])),)))),
         "chi2": codec.encode_chi2(Chi2(7, 2, 0.25)),
         "chi2_batch": codec.encode_chi2(Chi2(7, 2, 0.25, 0.125, "w1", 0.5)),
+        "chi2_better": codec.encode_chi2(
+            Chi2(7, 2, 0.25, 0.125, "w1", 0.5, "rotations", BetterOptimum(0.25, 0.125, "rotations"), optimum.variables)
+        ),
+        "ask_chi2_values": codec.encode_map({"batch": True, "timeout_s": 10.0, "values": True}),
+        "insert_adopt": codec.encode_insert(
+            Insert(10, Batch(), settle=True, epoch=7, changes=(_adopted(optimum.variables[0]),))
+        ),
+        "job_done_start": codec.encode_job_done(
+            JobDone("j1", "batch", codec.encode_optimum(replace(optimum, start="rotations")), 0.5)
+        ),
         "job": codec.encode_job(Job("j1", "batch", codec.encode_graph(graph))),
         "job_done": codec.encode_job_done(JobDone("j1", "batch", codec.encode_optimum(optimum), 0.5)),
         "problem": codec.encode_problem(Busy(256, 0.05)),
@@ -146,6 +157,10 @@ def _about_uncertainty() -> dict[str, bytes]:
             )
         ),
     }  # fmt: skip
+
+
+def _adopted(group: Variables) -> Change:
+    return Change("place", keys=group.keys, kind=group.kind, values=group.values, carry=True)
 
 
 def _changes() -> tuple[Change, ...]:

@@ -1,6 +1,7 @@
 """`factorbus replay`: the same file in this process and over the bus, and what is said and written about it."""
 
 import json
+import math
 import os
 import re
 import select
@@ -15,6 +16,7 @@ import pytest
 
 from factorbus.cli.children import service
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
+from factorbus.cli.local import LocalMap
 from factorbus.cli.main import main
 from factorbus.client import connect
 from factorbus.datasets import CATALOGUE, named
@@ -201,3 +203,42 @@ def announced(lines: IO[str]) -> tuple[int, str]:
         if found := re.search(r"solver process (\d+) on (\S+)", line):
             return int(found[1]), found[2]
     pytest.fail("the replay did not say where its solver process is")
+
+
+@pytest.fixture(scope="module")
+def wound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ring of 16 exact relative poses, its values wound once too often: a minimum of its own."""
+    turn, lines = 2 * math.pi / 16, []
+    for i in range(16):
+        angle = math.remainder(2 * turn * i, 2 * math.pi)
+        lines.append(f"VERTEX_SE2 {i} 0 0 {angle:.17g}")
+    step = (math.cos(turn / 2) * 2 * math.sin(turn / 2), 2 * math.sin(turn / 2) ** 2, turn)
+    for i in range(16):
+        z = " ".join(f"{number:.17g}" for number in step)
+        lines.append(f"EDGE_SE2 {i} {(i + 1) % 16} {z} 100 0 0 100 0 2500")
+    path = tmp_path_factory.mktemp("worlds") / "wound.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_map_in_a_worse_minimum_adopts_the_better_one(wound: Path) -> None:
+    """All at once, so that it stays wound; driven pose by pose it does not."""
+    target = LocalMap("auto")
+    (step,) = target.send(read(wound).whole())
+    settled = target.settle()
+    assert settled.report["chi2"] > 1.0
+    found = target.optimum()
+    assert found.notice is not None
+    assert found.as_dict()["better_optimum"]
+    assert found.start in ("odometry", "rotations")
+    adopted = target.adopt(found)
+    assert adopted.revision == step.revision + 2
+    assert adopted.report["chi2"] < 1e-9
+    assert target.optimum().notice is None
+
+
+def test_what_the_batch_optimum_was_found_from_is_said(wound: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(wound), "--in-process", "--every", "16", "--use-values"]) == OK
+    assert "from the file's values" in " ".join(capsys.readouterr().out.split())
+    assert main(["replay", str(wound), "--in-process", "--every", "16"]) == OK
+    assert "from the map's own values" in " ".join(capsys.readouterr().out.split())

@@ -72,4 +72,4 @@ def test_what_is_wrong_is_named(name: str | None, wrong: dict[str, Any], where: 
 def test_a_client_that_sends_no_changes_sends_the_bytes_that_it_always_sent() -> None:
     assert b"changes" not in codec.encode_insert(Insert(1, Batch()))
     assert codec.decode_insert(codec.encode_insert(Insert(1, Batch()))).changes == ()
-    assert Change("fix") == ("fix", None, None, "", None, None, False, "", None)
+    assert Change("fix") == ("fix", None, None, "", None, None, False, "", None, False)

@@ -11,6 +11,7 @@ from factorbus.cli.exits import FAILED, OK, input_file
 from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
 from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
+from factorbus.cli.starts import optimum_from
 
 _SHOWN = 20  # more false factors than these are told with --json only
 
@@ -25,6 +26,7 @@ def command() -> None:
     factorbus ask covariance warehouse x12 x300
     factorbus ask gate warehouse candidates.g2o
     factorbus ask why warehouse x12
+    factorbus ask chi2 warehouse --batch
     """
 
 
@@ -218,6 +220,39 @@ def _tell(what: str, found: Any) -> None:
     step = found.step
     if step:
         table([("the last step", f"{step['strategy']}, because {step['because']}")])
+
+
+@command.command("chi2")
+@_asking
+@click.option("--batch", is_flag=True, help="Also of the optimum found from scratch, which takes a while.")
+def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """How well the estimate fits: χ² = Σ rᵀΩr, with --batch over that of the optimum found from scratch.
+
+    That is the lowest of three: from the map's own values, from composed odometry, from averaged rotations. Where the
+    map is above it by more than 1 % this says so, and `factorbus change adopt` puts the map there.
+
+    \b
+    factorbus ask chi2 warehouse
+    factorbus ask chi2 warehouse --batch
+    """
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.chi2(batch, timeout_s)
+    if as_json:
+        content = {"revision": found.revision, "chi2": found.chi2}
+        if found.batch is not None:
+            content |= {"batch": found.batch, "start": found.start, "worker": found.worker, "seconds": found.seconds}
+            content["better_optimum"] = None if found.notice is None else found.notice.message
+        document(content)
+        return OK
+    rows = [("χ²", f"{found.chi2:.9g}")]
+    if found.batch is not None:
+        by = f"{optimum_from(found.start)}; {found.worker}, {found.seconds:.2f} s"
+        rows.append(("batch", f"{found.batch:.9g}  ({by})"))
+        rows.append(("χ² / batch", f"{found.chi2 / found.batch:.9f}" if found.batch else "-"))
+    if found.notice is not None:
+        rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {name}")))
+    table(rows, title=f"At revision {found.revision}")
+    return OK
 
 
 @command.command("repair")

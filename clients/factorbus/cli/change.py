@@ -10,6 +10,7 @@ from factorbus.cli.exits import OK
 from factorbus.cli.merging import merge_command
 from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, json_option, zenoh_option
 from factorbus.cli.screen import document, table
+from factorbus.cli.starts import optimum_from
 
 F = TypeVar("F", bound=Callable[..., Any])
 _COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
@@ -27,6 +28,7 @@ def command() -> None:
     factorbus change fix warehouse x0
     factorbus change fork warehouse what-if
     factorbus change merge warehouse robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05
+    factorbus change adopt warehouse
     """
 
 
@@ -128,6 +130,44 @@ def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
     from factorbus.client import Changes
 
     return _make(name, Changes().free(*keys), **how)
+
+
+@command.command("adopt")
+@_asking
+def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """Put the map into the optimum found from scratch, if that is below its χ² by more than 1 %; and settle it.
+
+    One step, as any change kept in the journal. Variables that came since the optimum was asked for go along with
+    what they hang on. To be able to go back, fork the map first.
+
+    \b
+    factorbus ask chi2 warehouse --batch
+    factorbus change fork warehouse as-it-was
+    factorbus change adopt warehouse
+    """
+    from factorbus.client import Changes
+    from factorbus.client import connect as open_bus
+
+    with (
+        open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        bus.map(name, mirror=False, create=False) as joined,
+    ):
+        found = joined.chi2(batch=True, values=True, timeout_s=timeout_s)
+        better = found.notice is not None
+        accepted = joined.change(Changes().adopt(found), settle=True, timeout_s=timeout_s) if better else None
+    revision = found.revision if accepted is None else accepted.revision
+    chi2 = found.chi2 if accepted is None else accepted.report.get("chi2")
+    if as_json:
+        told = {"revision": revision, "adopted": better, "chi2_before": found.chi2, "chi2": chi2}
+        document(told | {"batch": found.batch, "start": found.start})
+        return OK
+    rows = [("χ²", f"{found.chi2:.6g}"), ("batch", f"{found.batch:.6g}  ({optimum_from(found.start)})")]
+    if accepted is None:
+        rows.append(("adopted", "nothing: the map is where the optimum is, to 1 %"))
+    else:
+        rows.append(("adopted", f"χ² is {chi2:.6g} now"))
+    table(rows, title=f"At revision {revision}")
+    return OK
 
 
 @command.command("fork")

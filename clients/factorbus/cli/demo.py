@@ -11,6 +11,7 @@ import click
 
 from factorbus.cli.exits import require
 from factorbus.cli.options import WORLDS, json_option, out_option
+from factorbus.cli.starts import optimum_from
 
 _COMPARISONS = 10
 
@@ -172,7 +173,7 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ratios = [each["ratio"] for each in result["against_batch"]]
     got = result["estimates_received"]
     last = result["against_batch"][-1]
-    by = f"{last['worker']}, {last['seconds'] * 1e3:.0f} ms"
+    by = f"{optimum_from(last['start'])}; {last['worker']}, {last['seconds'] * 1e3:.0f} ms"
     rows = [
         ("poses", f"{result['poses']:,}" + (f", and {result['landmarks']} landmarks" if result["landmarks"] else "")),
         ("factors", f"{result['factors']:,}, {result['loop_closures']:,} of them loop closures"),
@@ -189,6 +190,8 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
             f"{_metres(result['error_m'])}; by odometry alone {_metres(result['error_odometry_m'])}",
         ),
     ]
+    if worse := sum(each["better_optimum"] for each in result["against_batch"]):
+        rows.append(("better_optimum", f"{worse} times the map was above it by more than 1 %"))
     if result["error_landmarks_m"]:
         rows.append(("landmarks' error", _metres(result["error_landmarks_m"])))
     every = "every one" if result["every_estimate_received"] else "NOT every one"

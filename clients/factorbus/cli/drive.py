@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from factorbus.proto.messages import Batch, Variables
+from factorbus.proto.problems import BetterOptimum
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,13 +26,18 @@ class Stepped:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """χ² at `revision` beside the optimum of the same graph found from scratch, by `worker` in `seconds`."""
+    """χ² at `revision` beside the optimum of the same graph found from scratch, by `worker` in `seconds`.
+
+    start: what led to that optimum; variables: the optimum, if it was asked for.
+    """
 
     revision: int
     chi2: float
     batch: float
     worker: str
     seconds: float
+    start: str = ""
+    variables: tuple[Variables, ...] = ()
 
     @property
     def ratio(self) -> float:
@@ -40,7 +46,13 @@ class Compared:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {name: getattr(self, name) for name in ("revision", "chi2", "batch", "ratio", "worker", "seconds")}
+        told = ("revision", "chi2", "batch", "ratio", "worker", "seconds", "start")
+        return {name: getattr(self, name) for name in told} | {"better_optimum": self.notice is not None}
+
+    @property
+    def notice(self) -> BetterOptimum | None:
+        """What is to be said where the map is well above that optimum."""
+        return BetterOptimum.or_none(self.chi2, self.batch, self.start)
 
 
 class Target(Protocol):
@@ -64,6 +76,14 @@ class Target(Protocol):
 
     def compare(self) -> None:
         """Have the present χ² held against the batch optimum; the result is in `compared` sooner or later."""
+        ...
+
+    def optimum(self) -> Compared:
+        """The same with the optimum itself, waited for."""
+        ...
+
+    def adopt(self, found: Compared) -> Stepped:
+        """Go to an optimum, and settle there."""
         ...
 
     def compared(self) -> list[Compared]:

@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from factorbus.cli.drive import Compared, Stepped
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
 from factorbus.solver.covariance.blocks import Blocks
 
@@ -42,10 +43,24 @@ class LocalMap:
 
     def compare(self) -> None:
         """Solve the same graph from scratch, here and now: the drive waits."""
+        self._compared.append(replace(self.optimum(), variables=()))
+
+    def optimum(self) -> Compared:
+        """The same, and the optimum itself."""
         start = time.perf_counter()
         batch = solve_batch(*self._solver.graph())
-        seconds = time.perf_counter() - start
-        self._compared.append(Compared(self._revision, self._solver.chi2(), batch.chi2, "in-process", seconds))
+        seconds, chi2 = time.perf_counter() - start, self._solver.chi2()
+        values = _variables(batch.values)
+        return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values)
+
+    def adopt(self, found: Compared) -> Stepped:
+        """Go to an optimum, and settle there."""
+        start = time.thread_time()
+        changes = [Change("place", keys=g.keys, kind=g.kind, values=g.values, carry=True) for g in found.variables]
+        self._solver, _, report, counted = self._solver.with_changes(changes, settle=True)
+        self._cpu_s += time.thread_time() - start
+        self._revision += 1
+        return Stepped(self._revision, report.as_dict() | counted, None)
 
     def compared(self) -> list[Compared]:
         """All comparisons."""

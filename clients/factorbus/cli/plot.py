@@ -68,7 +68,7 @@ def map_command(
     from factorbus.viz import Course
 
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
-    drawn = solved(drawn) if solve else placed(drawn)
+    drawn = solved(drawn, on_file=connect is None) if solve else placed(drawn)
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
     draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)

@@ -73,16 +73,20 @@ def placed(drawn: Drawn) -> Drawn:
     return Drawn(drawn.name, Batch(tuple(have), drawn.graph.factors), about)
 
 
-def solved(drawn: Drawn) -> Drawn:
-    """The same graph at its optimum, found from scratch in this process.  Raises Stopped, SolverError."""
+def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
+    """The same graph at its optimum, found from scratch in this process.  Raises Stopped, SolverError.
+
+    on_file: its values are those of a file.
+    """
     from factorbus.cli.exits import require
+    from factorbus.cli.starts import optimum_from
 
     require("service", "--solve")
     from factorbus.solver import solve_batch
 
     result = solve_batch(drawn.graph.variables, drawn.graph.factors)
     groups = tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in result.values)
-    about = f"χ² {result.chi2:.6g} after {result.iterations} iterations"
+    about = f"χ² {result.chi2:.6g}, {optimum_from(result.start, on_file)}, after {result.iterations} iterations"
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
 
 

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from factorbus.cli.drive import Compared, Stepped
-from factorbus.client import Map, Ticket
+from factorbus.client import Changes, Map, Ticket
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
 
 # A step of a large map may take long; a service that is gone is noticed otherwise.
@@ -66,6 +66,18 @@ class RemoteMap:
         """
         self._comparisons.append(self._map.ask.chi2(batch=True, timeout_s=_ANSWER_S))
         self.chi2()
+
+    def optimum(self) -> Compared:
+        """The batch optimum of the present revision, waited for."""
+        return _compared(self._map.ask.chi2(True, _ANSWER_S, values=True).result(_ANSWER_S))
+
+    def adopt(self, found: Compared) -> Stepped:
+        """Go to an optimum, and settle there."""
+        start = time.perf_counter()
+        changes = Changes().place(found.variables, carry=True)
+        accepted = self._map.change(changes, settle=True, timeout_s=_ANSWER_S)
+        self.wait_for(accepted.revision)
+        return _stepped(accepted, time.perf_counter() - start)
 
     def compared(self) -> list[Compared]:
         """All comparisons, by revision."""
@@ -138,4 +150,4 @@ def _stepped(accepted: Accepted, seconds: float) -> Stepped:
 
 def _compared(answer: Chi2) -> Compared:
     batch = float("nan") if answer.batch is None else answer.batch
-    return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds)
+    return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds, answer.start, answer.variables)

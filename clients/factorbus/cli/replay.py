@@ -12,6 +12,7 @@ import click
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
 from factorbus.cli.options import SECONDS, ModeChoice, Number, file_argument, json_option, out_option, zenoh_option
 from factorbus.cli.reading import read_graph, reading_options
+from factorbus.cli.starts import optimum_from
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
 
@@ -30,6 +31,7 @@ class Request:
     window: int
     use_values: bool
     settle: bool
+    adopt: bool
     tum: Path | None
     kitti: Path | None
     out: Path | None
@@ -77,6 +79,12 @@ class Request:
 @click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
 @click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
 @click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
+@click.option(
+    "--adopt/--no-adopt",
+    default=True,
+    show_default=True,
+    help="With --settle: go to the optimum found from scratch where that is better by more than 1 %.",
+)
 @click.option("--live", is_flag=True, help="Show the map in a browser as it grows; afterwards stay until Ctrl-C.")
 @click.option(
     "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
@@ -107,6 +115,9 @@ def command(as_json: bool, **asked: Any) -> None:
       bus_ms       from sending the insert to having its answer and its delta here, beyond the solver's own time
                    (staging and step); with --window above 1, from sending to the answer, queueing included
       chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
+      against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
+                   (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest
+      adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
     request = Request(**asked)
     if request.in_process and request.connect:
@@ -143,15 +154,31 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
             driven = drive(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
+        adopted = None
+        if request.settle and request.adopt:
+            last, adopted = _adopt(request, target, last)
         written = _write(request, target, graph.numbering)
         if request.plot:
             _draw(request.plot, request.file.name, driven, target, steps)
         result = _document(request, driven, target, steps, last, unsettled, before)
-        result |= {"read": graph.account(), "written": [str(file) for file in written]}
+        result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
         told(result)
         if request.live:
             _stay()
     return result
+
+
+def _adopt(request: Request, target: Any, last: Any) -> tuple[Any, dict[str, Any] | None]:
+    """The optimum found from scratch, if it is better than where the map has settled; says so."""
+    from factorbus.cli.screen import note
+
+    found = target.optimum()
+    if found.notice is None:
+        return last, None
+    last = target.adopt(found)
+    told = f"better_optimum: χ² {found.chi2:.6g} where the map had settled; it is now at the"
+    note(f"{told} {optimum_from(found.start, request.use_values)}, χ² {last.report['chi2']:.6g}")
+    return last, {"code": found.notice.code, **found.as_dict(), "chi2_adopted": last.report["chi2"]}
 
 
 def _document(
@@ -172,6 +199,7 @@ def _document(
         "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
         "kernels_compiled_s": after["kernels_compiled_s"],
         "deltas": after["deltas"],
+        "use_values": request.use_values,
         "against_batch": [each.as_dict() for each in target.compared()],
     }
 
@@ -297,10 +325,13 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
     initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
     rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
-    rows += [
-        (f"χ² / batch at {each['revision']}", f"{each['ratio']:.9f}  ({each['worker']}, {each['seconds']:.2f} s)")
-        for each in result["against_batch"]
-    ]
+    for each in result["against_batch"]:
+        by = f"{optimum_from(each['start'], result['use_values'])}; {each['worker']}, {each['seconds']:.2f} s"
+        worse = "  better_optimum" if each["better_optimum"] else ""
+        rows.append((f"χ² / batch at {each['revision']}", f"{each['ratio']:.9f}  ({by}){worse}"))
+    if result["adopted"]:
+        was = f"{result['adopted']['chi2']:.8g}, {optimum_from(result['adopted']['start'], result['use_values'])}"
+        rows.append(("better_optimum", f"adopted: χ² was {was}"))
     rows.append(("strategies", ", ".join(f"{name} {count}" for name, count in result["strategies"].items())))
     if result["kernels_compiled_s"] > 0.1:
         rows.append(("compiling", f"{result['kernels_compiled_s']:.1f} s, once on this machine"))

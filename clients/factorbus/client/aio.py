@@ -225,9 +225,9 @@ class Map:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.estimate(of, timeout_s))
 
-    async def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
-        """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
-        return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s))
+    async def chi2(self, batch: bool = False, timeout_s: float | None = None, *, values: bool = False) -> Chi2:
+        """Σ rᵀΩr of the estimate, and of the optimum from scratch, as `factorbus.client.Map.chi2`."""
+        return await asyncio.wrap_future(self._map.ask.chi2(batch, timeout_s, values))
 
     async def repair(
         self, factors: Sequence[int] | int | None = None, *, probability: float = 0.99, timeout_s: float | None = None

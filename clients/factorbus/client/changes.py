@@ -18,7 +18,7 @@ from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import Repaired
-from factorbus.proto.messages import Accepted, Batch, Change, Variables
+from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Variables
 from factorbus.proto.problems import BadLoss, BadShape
 
 
@@ -83,11 +83,25 @@ class Changes:
         """
         return self._add(Change("marginalise", keys=_keys(keys)))
 
-    def place(self, groups: Iterable[Variables]) -> Changes:
-        """Variables go to the values in `groups`, as in an estimate; the map goes on from there."""
+    def place(self, groups: Iterable[Variables], carry: bool = False) -> Changes:
+        """Variables go to the values in `groups`, as in an estimate; the map goes on from there.
+
+        carry: what is not in `groups`, and not fixed, goes along with what it hangs on.
+        """
         for group in groups:
-            self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values))
+            self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values, carry=carry))
         return self
+
+    def adopt(self, found: Chi2) -> Changes:
+        """The map goes to the optimum that was found from scratch: `found` is `Map.chi2(batch=True, values=True)`.
+
+        Variables that came since go along with what they hang on.  Refused (unknown_variable, kind_mismatch) where a
+        variable of the optimum is gone, or a feature has become a point: ask again.  `settle` it.  To undo it place
+        what `Map.ask_estimate` said before.  Raises BadShape if the answer came without values.
+        """
+        if not found.variables:
+            raise BadShape("changes: adopt", "an answer without variables", "chi2(batch=True, values=True)")
+        return self.place(found.variables, carry=True)
 
     def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
         """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""

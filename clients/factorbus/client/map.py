@@ -216,9 +216,13 @@ class Map:
         """Values from the service at one revision: all, or of some variables.  Raises Refused, Unavailable."""
         return self.ask.estimate(of, timeout_s).result()
 
-    def chi2(self, batch: bool = False, timeout_s: float | None = None) -> Chi2:
-        """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch.  Raises Refused, Unavailable."""
-        return self.ask.chi2(batch, timeout_s).result()
+    def chi2(self, batch: bool = False, timeout_s: float | None = None, *, values: bool = False) -> Chi2:
+        """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch, with `values` that itself.
+
+        Where the map is above it by more than 1 % the answer's `notice` says so (`better_optimum`), and
+        `change(Changes().adopt(answer), settle=True)` puts the map there.  Raises Refused, Unavailable.
+        """
+        return self.ask.chi2(batch, timeout_s, values).result()
 
     def repair(
         self, factors: Sequence[int] | int | None = None, *, probability: float = 0.99, timeout_s: float | None = None

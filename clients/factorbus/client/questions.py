@@ -35,11 +35,11 @@ class Questions:
         numbers = None if of is None else key_numbers(of)
         return self._ask("estimate", codec.encode_keys_asked(numbers), codec.decode_estimate, timeout_s)
 
-    def chi2(self, batch: bool, timeout_s: float | None) -> Future[Chi2]:
-        """Σ rᵀΩr; with `batch` also of the optimum from scratch, for which a worker gets `timeout_s`."""
+    def chi2(self, batch: bool, timeout_s: float | None, values: bool = False) -> Future[Chi2]:
+        """Σ rᵀΩr; with `batch` also of the optimum from scratch, for which a worker gets `timeout_s`; or all of it."""
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        question = codec.encode_map({"batch": batch, "timeout_s": timeout_s})
-        return self._ask("chi2", question, codec.decode_chi2, timeout_s)
+        question = {"batch": batch, "timeout_s": timeout_s} | ({"values": True} if values else {})
+        return self._ask("chi2", codec.encode_map(question), codec.decode_chi2, timeout_s)
 
     def graph(self, timeout_s: float | None) -> Future[Graph]:
         """Variables with present values, and factors."""

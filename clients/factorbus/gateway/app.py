@@ -6,6 +6,7 @@
 | /api/maps | the maps of the service |
 | /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
+| /api/maps/NAME/optimum | χ² beside that of the optimum found from scratch, and a notice where that is better |
 | /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
 """
@@ -43,6 +44,7 @@ _STATUS = {
     "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400, "bad_name": 400, "bad_symbol": 400,
     "unavailable": 503, "shutting_down": 503,
 }  # fmt: skip
+_OPTIMUM_S = 60.0
 # Codes of a WebSocket that is closed, from the range that is the application's.
 _FOREIGN, _PROBLEM = 4403, 4404
 _MOST_REASON = 120  # bytes of it, of 123 that a WebSocket has room for
@@ -59,6 +61,7 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
         f"{one}/closures": _closures,
         f"{one}/ellipses": _ellipses,
         f"{one}/stats": _stats,
+        f"{one}/optimum": _optimum,
         f"{one}/export": _export,
         f"{one}/variables/{{key}}": _variable,
     }
@@ -124,6 +127,14 @@ async def _stats(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         stats = await asyncio.wrap_future(joined.map.ask.stats(None))
     return Document(stats | {"epoch": str(stats["epoch"])})
+
+
+async def _optimum(maps: Maps, request: Request) -> Response:
+    async with maps.using(request.path_params["name"]) as joined:
+        found = await asyncio.wrap_future(joined.map.ask.chi2(True, _OPTIMUM_S))
+    told = {name: getattr(found, name) for name in ("revision", "chi2", "batch", "start", "worker", "seconds")}
+    notice = None if found.notice is None else {"code": found.notice.code, "message": found.notice.message}
+    return JSONResponse(told | {"notice": notice})
 
 
 async def _export(maps: Maps, request: Request) -> Response:

@@ -38,6 +38,8 @@ def _map(change: Change) -> dict[str, Any]:
         content |= {"kind": change.kind, "values": _bytes(change.values, F8)}
     if change.alone:
         content["alone"] = True
+    if change.carry:
+        content["carry"] = True
     return content
 
 
@@ -55,7 +57,7 @@ def _read(index: int, content: Map) -> Change:
         if kind not in VARIABLE_KINDS:
             raise UnknownKind(f"{place()}.kind", kind, tuple(VARIABLE_KINDS))
         rows = fields.rows(place, content, "values", named.size, VARIABLE_KINDS[kind].size)
-        return Change(name, keys=named, kind=kind, values=rows)
+        return Change(name, keys=named, kind=kind, values=rows, carry=fields.flag(place(), content, "carry"))
     if of.names == "keys":
         return Change(name, keys=named, alone=name == "remove_variables" and fields.flag(place(), content, "alone"))
     if of.numbers == "weight":

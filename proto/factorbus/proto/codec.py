@@ -159,7 +159,13 @@ def encode_chi2(message: Chi2) -> bytes:
     content: dict[str, Any] = {"epoch": message.epoch, "revision": message.revision, "chi2": message.chi2}
     if message.batch is not None:
         content |= {"batch": message.batch, "worker": message.worker, "seconds": message.seconds}
-    return _pack(content)
+    if message.start:
+        content["start"] = message.start
+    if message.notice is not None:
+        content["notice"] = _problem_map(message.notice)
+    if message.variables:
+        content["variables"] = variables_to_maps(message.variables)
+    return _pack(content, default=_plain)
 
 
 def decode_chi2(data: bytes, limits: Limits = ANSWER_LIMITS) -> Chi2:
@@ -173,6 +179,9 @@ def decode_chi2(data: bytes, limits: Limits = ANSWER_LIMITS) -> Chi2:
         batch=fields.number("", content, "batch") if asked else None,
         worker=fields.text("", content, "worker", default=""),
         seconds=fields.number("", content, "seconds") if "seconds" in content else 0.0,
+        start=fields.text("", content, "start", default=""),
+        notice=_read_problem("notice", fields.mapping("", content, "notice")) if content.get("notice") else None,
+        variables=read_values(content) if content.get("variables") else (),
     )
 
 
@@ -215,6 +224,7 @@ def encode_optimum(message: Optimum) -> bytes:
             "iterations": message.iterations,
             "variables": variables_to_maps(message.variables),
         }
+        | ({"start": message.start} if message.start else {})
     )
 
 
@@ -225,23 +235,18 @@ def decode_optimum(data: bytes, limits: Limits = ANSWER_LIMITS) -> Optimum:
         chi2=fields.number("", content, "chi2"),
         iterations=fields.integer("", content, "iterations"),
         variables=read_values(content),
+        start=fields.text("", content, "start", default=""),
     )
 
 
 def encode_problem(problem: Any) -> bytes:
     """The bytes of anything with `code`, `message` and `detail`: a Problem or an error of the solver."""
-    detail = {str(name): value for name, value in dict(problem.detail).items()}
-    return _pack({"code": problem.code, "message": problem.message, "detail": detail}, default=_plain)
+    return _pack(_problem_map(problem), default=_plain)
 
 
 def decode_problem(data: bytes, limits: Limits = ANSWER_LIMITS) -> Refused:
     """The problem that `data` is, ready to be raised.  Raises BadMessage, TooLarge."""
-    content = fields.read_map("problem", data, limits)
-    return Refused(
-        fields.text("", content, "code"),
-        fields.text("", content, "message"),
-        fields.mapping("", content, "detail"),
-    )
+    return _read_problem("", fields.read_map("problem", data, limits))
 
 
 def encode_keys_asked(keys: I64 | None) -> bytes:
@@ -263,6 +268,16 @@ def encode_map(content: Mapping[str, Any]) -> bytes:
 def decode_map(data: bytes, limits: Limits = ANSWER_LIMITS, what: str = "map") -> dict[str, Any]:
     """The plain map that `data` is; no bytes at all are an empty map.  Raises BadMessage, TooLarge."""
     return dict(fields.read_map(what, data, limits)) if data else {}
+
+
+def _problem_map(problem: Any) -> dict[str, Any]:
+    detail = {str(name): value for name, value in dict(problem.detail).items()}
+    return {"code": problem.code, "message": problem.message, "detail": detail}
+
+
+def _read_problem(where: str, content: Mapping[str, Any]) -> Refused:
+    code, message = fields.text(where, content, "code"), fields.text(where, content, "message")
+    return Refused(code, message, fields.mapping(where, content, "detail"))
 
 
 def _plain(value: Any) -> Any:

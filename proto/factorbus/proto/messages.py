@@ -11,6 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.problems import Problem
+
+# What a batch optimum may be found from: the values that the graph has, composed odometry, averaged rotations.
+STARTS = ("values", "odometry", "rotations")
 
 
 class Variables(NamedTuple):
@@ -54,7 +58,8 @@ class Change(NamedTuple):
     weigh             factors, weight (n,)       their information is multiplied by it
     fix, free         keys                       held where they are; estimated again
     marginalise       keys                       they go; what their factors say of others is kept
-    place             kind, keys, values         variables of one kind go to these values (n, size)
+    place             kind, keys, values, carry  variables of one kind go to these values (n, size); carry: what is not
+                                                 placed by this insert goes along with what it hangs on
     """
 
     change: str
@@ -66,6 +71,7 @@ class Change(NamedTuple):
     alone: bool = False
     kind: str = ""
     values: F64 | None = None
+    carry: bool = False
 
 
 class Batch(NamedTuple):
@@ -154,6 +160,8 @@ class Chi2:
     """The answer to ask/chi2: Σ rᵀ Ω r at `revision`; `batch` is the optimum found from scratch, if asked for.
 
     worker: who computed the batch optimum ("in-place": the service itself); seconds: how long it took there.
+    start: what led to it, one of `STARTS` ("": not told).  notice: a BetterOptimum where the map is well above it.
+    variables: the optimum itself, if it was asked for.
     """
 
     epoch: int
@@ -162,6 +170,9 @@ class Chi2:
     batch: float | None = None
     worker: str = ""
     seconds: float = 0.0
+    start: str = ""
+    notice: Problem | None = None
+    variables: tuple[Variables, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +196,12 @@ class JobDone:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """The payload that answers a job of kind `batch`: the graph optimised from scratch, its χ² and its values."""
+    """The payload that answers a job of kind `batch`: the graph optimised from scratch, its χ² and its values.
+
+    start: what led there, one of `STARTS`; "": not told.
+    """
 
     chi2: float
     iterations: int
     variables: tuple[Variables, ...]
+    start: str = ""

@@ -19,6 +19,7 @@
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
     │   └── NobodyListens    unavailable          there is nothing at that address
+    ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── Refused              (the code it carries) a problem that came over the bus, as the client sees it
     └── Internal             internal             a fault of the service itself, with a reference into its log
 
@@ -32,6 +33,7 @@ from typing import Any
 from factorbus.proto.nearest import nearest
 
 _NAMED = 12  # maps named where one is asked for that is not there
+_FROM = {"values": "the map's own values", "odometry": "composed odometry", "rotations": "averaged rotations"}
 
 
 class Problem(Exception):
@@ -210,6 +212,28 @@ class NobodyListens(Unavailable):
         Problem.__init__(
             self, f"nothing listens at {endpoint}; start a service there with `factorbus serve`, or check the address"
         )
+
+class BetterOptimum(Problem):
+    """A notice, not a refusal: it comes in the answer to ask/chi2."""
+
+    code = "better_optimum"
+    # How far χ² of the map may be above the batch optimum's before it is said.
+    SHARE, FLOOR = 0.01, 1e-6
+
+    def __init__(self, chi2: float, batch: float, start: str) -> None:
+        by = _FROM.get(start, "another start")
+        super().__init__(
+            f"the map is in a worse minimum: its χ² is {chi2:.6g}, and {batch:.6g} at an optimum found from {by}; "
+            "`factorbus change adopt MAP` puts the map there",
+            chi2=chi2,
+            batch=batch,
+            start=start,
+        )
+
+    @classmethod
+    def or_none(cls, chi2: float, batch: float, start: str) -> "BetterOptimum | None":
+        """The notice, if `batch` is below `chi2` by more than 1 %."""
+        return cls(chi2, batch, start) if chi2 > (1.0 + cls.SHARE) * batch + cls.FLOOR else None
 
 
 class Internal(Problem):

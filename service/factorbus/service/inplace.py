@@ -21,7 +21,7 @@ def _batch(payload: bytes) -> bytes:
 
     graph = codec.decode_graph(payload)
     result = solve_batch(graph.batch.variables, graph.batch.factors)
-    return codec.encode_optimum(Optimum(result.chi2, result.iterations, as_variables(result.values)))
+    return codec.encode_optimum(Optimum(result.chi2, result.iterations, as_variables(result.values), result.start))
 
 
 def _idp(payload: bytes) -> bytes:

@@ -6,7 +6,7 @@ from typing import Any
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Chi2, JobDone
-from factorbus.proto.problems import Busy, Problem
+from factorbus.proto.problems import BetterOptimum, Busy, Problem
 from factorbus.service.dispatch import Ended
 from factorbus.service.events import Asker
 from factorbus.service.jobs import Jobs
@@ -33,11 +33,11 @@ class Optima:
 
         def ended(job: Ended) -> None:
             self.open -= 1
-            self._answer(asker, taken, job)
+            self._answer(asker, question, taken, job)
 
         self.jobs.submit("batch", codec.encode_graph(taken.graph), ended, self.deadline_s, question.timeout_s)
 
-    def _answer(self, asker: Asker, taken: Snapshot, job: Ended) -> None:
+    def _answer(self, asker: Asker, question: Question, taken: Snapshot, job: Ended) -> None:
         result = job.result
         if not isinstance(result, JobDone):
             self.refuse(asker, result)
@@ -47,5 +47,15 @@ class Optima:
         except Problem as problem:
             self.refuse(asker, problem)
             return
-        chi2 = Chi2(taken.epoch, taken.revision, taken.chi2, optimum.chi2, job.worker, result.seconds)
+        chi2 = Chi2(
+            taken.epoch,
+            taken.revision,
+            taken.chi2,
+            optimum.chi2,
+            job.worker,
+            result.seconds,
+            optimum.start,
+            BetterOptimum.or_none(taken.chi2, optimum.chi2, optimum.start),
+            optimum.variables if question.values else (),
+        )
         self.reply(asker, codec.encode_chi2(chi2))

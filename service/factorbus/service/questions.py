@@ -30,13 +30,15 @@ _IDS = ("auto", "ids", "keys", "counted")
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question, checked.  keys: of an estimate, None for all.  batch, timeout_s: of chi2.  format, robot, strict,
-    ids: of export.  ask: of one about uncertainty, and of a copy (which only the service itself asks for), all of it.
+    """One question, checked.  keys: of an estimate, None for all.  batch, values, timeout_s: of chi2.  format, robot,
+    strict, ids: of export.  ask: of one about uncertainty, and of a copy (which only the service itself asks for), all
+    of it.
     """
 
     name: str
     keys: I64 | None = None
     batch: bool = False
+    values: bool = False
     timeout_s: float = 60.0
     format: str = "g2o"
     robot: str | None = None
@@ -90,7 +92,8 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, ask=decode_ask_repair(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
-        return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
+        batch, values = _flag(content, "batch"), _flag(content, "values")
+        return Question(name, batch=batch, values=values, timeout_s=_seconds(content, "timeout_s", 60.0))
     return _export(content) if name == "export" else Question(name)
 
 

@@ -6,9 +6,9 @@
     loss               factors (n,), loss, scale (n,)   these factors have this loss from now on; "": none
     weigh              factors (n,), weight (n,)        Ω becomes w Ω
     fix, free          keys (n,)                        variables are held where they are; or estimated again
-    place              kind, keys (n,), values          variables of one kind, also fixed ones, go to these values; the
-                                                        estimate goes on from there
-
+    place              kind, keys (n,), values, carry   variables of one kind, also fixed ones, go to these values; the
+                                                        estimate goes on from there; with `carry` all that no change
+                                                        places goes along with what it hangs on (`carrying`)
     marginalise        keys (n,)                        these variables go; what their factors say of others is kept as
                                                         linear factors (`marginal`)
 
@@ -23,6 +23,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.admission import out_of_bounds
+from factorbus.solver.carrying import carry_along
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph import Graph
 from factorbus.solver.groups import FactorGroup
@@ -59,6 +60,8 @@ class ChangeLike(Protocol):
     def kind(self) -> str: ...
     @property
     def values(self) -> F64 | None: ...
+    @property
+    def carry(self) -> bool: ...
 
 
 @dataclass(slots=True)
@@ -67,8 +70,8 @@ class Edits:
 
     stays, kept: whether it is there afterwards   free: whether a variable is estimated
     loss, scale: code of the loss and its scale   weight: what Ω is multiplied by   values: as in the graph
-    placed: how many variables were given a value   added: factors that take the place of some
-    counted: what is to be told of it
+    placed (n,): whether a variable was given a value; carry: whether others go along with such
+    added: factors that take the place of some   counted: what is to be told of it
     """
 
     stays: np.ndarray
@@ -78,7 +81,8 @@ class Edits:
     scale: F64
     weight: F64
     values: F64
-    placed: int = 0
+    placed: np.ndarray
+    carry: bool = False
     added: list[FactorGroup] = field(default_factory=list)
     counted: dict[str, int] = field(default_factory=dict)
 
@@ -97,6 +101,8 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         if make is None:
             raise errors.UnknownKind("change", change.change, CHANGES)
         make(graph, edits, change, touched)
+    if edits.carry:
+        edits.values = carry_along(graph, edits.values, edits.placed, edits.stays, edits.kept)
     check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
@@ -104,7 +110,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         "edited_factors": int(np.count_nonzero(touched & edits.kept)),
         "fixed_variables": int(np.count_nonzero(edits.stays & before & ~edits.free)),
         "freed_variables": int(np.count_nonzero(edits.stays & ~before & edits.free)),
-        "placed_variables": edits.placed,
+        "placed_variables": int(np.count_nonzero(edits.placed)),
         "added_factors": sum(len(group.keys) for group in edits.added),
     }
     return edits
@@ -128,6 +134,7 @@ def unchanged(graph: Graph) -> Edits:
         scale,
         np.ones(factors),
         graph.values[: graph.counts[at.VALUES]],
+        np.zeros(variables, bool),
     )
 
 
@@ -206,7 +213,8 @@ def _place(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> Non
     if values is None or values.shape != (picked.size, kind.size):
         seen = "none" if values is None else " × ".join(map(str, values.shape))
         raise errors.BadShape("change place values", seen, f"{picked.size} × {kind.size}")
-    edits.values, edits.placed = edits.values.copy(), edits.placed + picked.size
+    edits.values, edits.carry = edits.values.copy(), edits.carry or change.carry
+    edits.placed[picked] = True
     edits.values[graph.var[picked, at.V_AT, None] + np.arange(kind.size)] = _checked(kind.name, picked, values, graph)
 
 
@@ -229,7 +237,7 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
 def _marginalise(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
     gone = np.unique(_variables(graph, edits, change))
     held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
-    if edits.added or edits.placed or touched.any() or held:
+    if edits.added or edits.placed.any() or touched.any() or held:
         raise errors.BadOrder("marginalise", "before any loss, weigh, fix, free, place or marginalise")
     check_kept(graph, edits.kept, all_or_none=True)
     made, replaced = marginals(graph, gone, edits.kept)

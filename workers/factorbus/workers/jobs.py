@@ -27,7 +27,7 @@ def batch(payload: bytes) -> bytes:
     graph = codec.decode_graph(payload).batch
     result = solve_batch(graph.variables, graph.factors)
     values = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in result.values)
-    return codec.encode_optimum(Optimum(result.chi2, result.iterations, values))
+    return codec.encode_optimum(Optimum(result.chi2, result.iterations, values, result.start))
 
 
 def idp(payload: bytes) -> bytes:

@@ -96,6 +96,24 @@ async function explain(key) {
   }
 }
 
+const STARTS = { values: "the map's own values", odometry: "composed odometry", rotations: "averaged rotations" };
+
+async function compare() {
+  const panel = of("panel"), name = map.name;
+  panel.replaceChildren(element("h2", "The optimum"), element("p", "is being found from scratch"));
+  try {
+    const found = await ask(`/api/maps/${name}/optimum`);
+    const ratio = found.batch > 0 ? `, ${(found.chi2 / found.batch).toFixed(6)} of it` : "";
+    panel.replaceChildren(
+      element("h2", found.notice ? found.notice.code : "The optimum"),
+      element("p", `χ² ${found.chi2.toPrecision(7)} at revision ${found.revision}; optimum from ${STARTS[found.start] ?? "a start"}: ${found.batch.toPrecision(7)}${ratio}`),
+      element("p", found.notice ? found.notice.message.replace("adopt MAP", `adopt ${name}`) : "The map is where the optimum is."),
+    );
+  } catch (error) {
+    panel.replaceChildren(element("h2", "The optimum"), element("p", error.message));
+  }
+}
+
 function hands(canvas) {
   let from = null, moved = 0;
   canvas.onpointerdown = (e) => { from = [e.clientX, e.clientY]; moved = 0; canvas.setPointerCapture(e.pointerId); };
@@ -144,6 +162,7 @@ async function list() {
 of("maps").onchange = (e) => show(e.target.value);
 of("plane").onchange = (e) => { view.plane = e.target.value; view.follow = true; if (map) view.draw(map, asked); };
 of("fit").onclick = () => { view.follow = true; if (map) view.draw(map, asked); };
+of("compare").onclick = () => map && compare();
 window.onresize = () => map && view.draw(map, asked);
 hands(of("map"));
 list();

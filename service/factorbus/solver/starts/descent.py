@@ -1,0 +1,147 @@
+"""One graph, minimised from several starts in turn: the pattern of Λ and the order of R are the same for all.
+
+A start that is on its way to where another one is already, or hopelessly above it, is not finished.  MATH §12.6.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.anchors import find_unanchored, find_unheld
+from factorbus.solver.elimination import Elimination
+from factorbus.solver.gauss_newton import Rule, minimise
+from factorbus.solver.graph import Graph
+from factorbus.solver.incremental import Incremental
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64
+from factorbus.solver.kernels.chi2 import sum_chi2
+from factorbus.solver.options import Options
+from factorbus.solver.report import Stopwatch
+from factorbus.solver.system import System
+
+VALUES, ODOMETRY, ROTATIONS = "values", "odometry", "rotations"
+# What is there is preferred, then what no order of the factors decides.
+STARTS = (VALUES, ROTATIONS, ODOMETRY)
+
+_POLISH = 100
+# Tries at a time; of a start at most, and of one that is not the best when another has converged.
+_CHUNK, _MOST, _MOST_OF_OTHERS = 4, 500, 60
+# Two starts are on the way to the same optimum when no value differs by more than this share of how far they reach, or
+# χ² by less than _SAME_CHI2 of it while it falls by less than _SLOW in a chunk.
+_SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
+# A start is hopeless if so many chunks as good as its last one would not bring it below the best; and where two starts
+# have met, one that is so many times above them after its first chunk.
+_PATIENCE, _FAR = 2, 2.0
+# Ends whose χ² differ by less than this share are one: of those, the start that comes first in the list counts.
+_EQUAL = 1e-9
+NOTHING = Options().negligible
+
+
+@dataclass(slots=True)
+class Descent:
+    """A start, and how far down it has come.
+
+    rate: χ² before its last chunk over χ² after it.  met: another start was on the way to where this one is.
+    """
+
+    start: str
+    values: F64
+    chi2: float
+    damping: float = 0.0
+    iterations: int = 0
+    tries: int = 0
+    rate: float = np.inf
+    converged: bool = False
+    ended: bool = False
+    met: bool = False
+
+
+class Descents:
+    """The problem that all starts have in common.  Raises Underconstrained: nothing joins a variable to the map."""
+
+    def __init__(self, graph: Graph) -> None:
+        options = Options(mode="all-batch")
+        self._rule = options.settle_tolerance, 1e-8 * options.negligible
+        self.graph, none = graph, (0,) * at.COUNTS
+        self._system = System(graph, Incremental(Elimination(options), options))
+        self._suspects = find_unheld(graph, none)
+        if self._suspects.size and (free := find_unanchored(graph, none)) >= 0:
+            raise self._system.underconstrained(
+                free,
+                "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to the "
+                "rest of the map",
+            )
+        self._system.blocks.extend(graph, none)
+
+    def begin(self, start: str, values: F64) -> Descent:
+        """A start.  Raises NotFinite where it has no χ²."""
+        chi2 = self.chi2(values)
+        if not np.isfinite(chi2):
+            raise errors.NotFinite(f"χ² of the start {start!r}")
+        return Descent(start, values, chi2)
+
+    def chi2(self, values: F64) -> float:
+        """Σ rᵀ Ω r at `values`."""
+        graph = self.graph
+        factors = int(graph.counts[at.FACTORS])
+        return max(float(sum_chi2(0, factors, graph.var, graph.fac, values, graph.payload)), 0.0)
+
+    def run(self, descents: list[Descent]) -> Descent:
+        """The lowest end of all of them.  Raises Underconstrained if that is what each of them is."""
+        failed: errors.SolverError | None = None
+        while going := [each for each in descents if not each.ended]:
+            for each in going:
+                try:
+                    self._go_on(each)
+                except errors.Underconstrained as problem:
+                    failed = failed or problem
+                    descents.remove(each)
+                    continue
+                over = [_is_over(each, other) for other in descents if other is not each]
+                each.ended = True in over or each.converged or each.tries >= _MOST
+        if failed is not None and not descents:
+            raise failed
+        lowest = min(each.chi2 for each in descents)
+        equal = [each for each in descents if each.chi2 <= lowest * (1.0 + _EQUAL) + NOTHING]
+        return min(equal, key=lambda each: (not each.converged, STARTS.index(each.start)))
+
+    def _go_on(self, descent: Descent) -> None:
+        """The next few tries."""
+        graph, system = self.graph, self._system
+        graph.values = descent.values.copy()
+        system.begin(self._suspects, Stopwatch(None))
+        if graph.counts[at.COLUMNS] == 0:
+            descent.converged = True
+            return
+        system.anew()
+        tolerance, floor = self._rule
+        course = minimise(system, descent.chi2, descent.damping, Rule(tolerance, floor, _CHUNK, polish=_POLISH))
+        if course.failed >= 0 and course.iterations == 0:
+            raise system.underconstrained(system.variable_of(course.failed))
+        descent.rate = descent.chi2 / course.chi2 if course.chi2 > 0.0 else np.inf
+        descent.values, descent.chi2, descent.damping = graph.values, max(course.chi2, 0.0), course.damping
+        descent.iterations += course.iterations
+        descent.tries += _CHUNK
+        descent.converged = course.converged
+
+
+def _is_over(descent: Descent, other: Descent) -> bool:
+    """Whether `other` makes it needless to go on."""
+    if not other.tries or descent.chi2 < other.chi2:
+        return False
+    level = descent.chi2 <= (1.0 + _SAME_CHI2) * other.chi2 and (descent.converged or descent.rate < 1.0 + _SLOW)
+    if are_close(descent.values, other.values) or (other.converged and level):
+        other.met = True
+        return True
+    if other.converged and descent.tries >= _MOST_OF_OTHERS:
+        return True
+    if other.met and descent.chi2 > _FAR * other.chi2:
+        return True
+    return descent.tries > _CHUNK and descent.chi2 > other.chi2 * descent.rate**_PATIENCE
+
+
+def are_close(first: F64, second: F64) -> bool:
+    """Whether no value differs by more than a small share of how far they reach."""
+    reach = float(np.sqrt(np.mean(np.square(second - second.mean())))) if second.size else 0.0
+    return bool(np.abs(first - second).max(initial=0.0) <= _SAME * reach)

@@ -1,0 +1,263 @@
+"""What the factors of a graph say of places and rotations, in one form for the plane and for space.  MATH §12.1.
+
+A node is the map (0) or a variable (its index + 1).  The map's frame is that of a pose at the origin which is known, so
+a prior is a relative pose from there.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factorbus.solver.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph import Graph
+from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.starts.rotation_matrices import matrices_of_angles, matrices_of_quaternions
+
+MAP = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """The plane or space: its dimension, and its kinds of variables and factors."""
+
+    dim: int
+    pose: int
+    point: int
+    prior: int
+    prior_point: int
+    between: int
+    landmark: int
+    position: int
+    bearing: int
+    linear_pair: int
+    linear: int
+
+
+PLANE = Space(
+    2, at.SE2, at.POINT2, at.PRIOR_SE2, at.PRIOR_POINT2, at.BETWEEN_SE2, at.LANDMARK_SE2, at.POSITION_SE2,
+    at.BEARING_SE2, at.LINEAR_PAIR_SE2, at.LINEAR_SE2,
+)  # fmt: skip
+SPACE = Space(
+    3, at.SE3, at.POINT3, at.PRIOR_SE3, at.PRIOR_POINT3, at.BETWEEN_SE3, at.LANDMARK_SE3, at.POSITION_SE3,
+    at.BEARING_SE3, at.LINEAR_PAIR_SE3, at.LINEAR_SE3,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Relations:
+    """Nodes b seen from nodes a: of each a rotation and a translation, with what they weigh.
+
+    a, b (m,)   R (m, d, d): of b in a   t (m, d): of b in a, metres
+    turn (m,): information of a rotation, one number, 1/rad²; 0: there is none
+    hold (m, d, d): information of t in the frame of a, 1/m²   couple (m, d, ρ): of t with the rotation's residual
+    lever (m, d): a point of b that t is the place of, in b
+    row (m,): of the factor   loss (m,), scale (m,): its loss
+    """
+
+    a: I64
+    b: I64
+    R: F64
+    t: F64
+    turn: F64
+    hold: F64
+    couple: F64
+    lever: F64
+    row: I64
+    loss: I64
+    scale: F64
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def where(self, chosen: np.ndarray) -> "Relations":
+        """Some of them."""
+        return Relations(*(getattr(self, name)[chosen] for name in self.__slots__))
+
+    def weighed(self, weights: F64) -> "Relations":
+        """The same, each counted so many times."""
+        wide = weights[:, None, None]
+        return replace(self, turn=self.turn * weights, hold=self.hold * wide, couple=self.couple * wide)
+
+    def joined(self, other: "Relations") -> "Relations":
+        """These and others behind them."""
+        return Relations(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True)
+class Directions:
+    """R_b s = g: directions s that poses b see where the map has g.  weight (m,)."""
+
+    b: I64
+    seen: F64
+    there: F64
+    weight: F64
+
+    def where(self, chosen: np.ndarray) -> "Directions":
+        """Some of them."""
+        return Directions(*(getattr(self, name)[chosen] for name in self.__slots__))
+
+
+def relations_of(graph: Graph, space: Space) -> tuple[Relations, Directions]:
+    """All that the factors of a graph say of poses and points in one space."""
+    return Relations(*map(np.concatenate, zip(*_parts(graph, space), strict=True))), _directions(graph, space)
+
+
+def _parts(graph: Graph, space: Space) -> list[tuple[np.ndarray, ...]]:
+    parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
+    parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
+    parts += [_positions(graph, space), _linear_pairs(graph, space), _linear(graph, space), _bearings(graph, space)]
+    if space.dim == 2:
+        parts += [_bearing_ranges(graph), _headings(graph)]
+    return parts
+
+
+def _rows(graph: Graph, kind: int) -> tuple[I64, I64, F64, F64]:
+    """(rows, fac of them, measured, information matrices) of the factors of one kind."""
+    declared = FACTOR_KIND_OF_CODE[kind]
+    fac = graph.fac[: graph.counts[at.FACTORS]]
+    rows = np.flatnonzero(fac[:, at.F_KIND] == kind)
+    picked = fac[rows]
+    numbers = graph.payload[picked[:, at.F_AT, None] + np.arange(declared.size + declared.triangle)]
+    i, j = np.triu_indices(declared.dim)
+    information = np.empty((rows.size, declared.dim, declared.dim))
+    information[:, i, j] = information[:, j, i] = numbers[:, declared.size :]
+    return rows, picked, numbers[:, : declared.size], information
+
+
+def _losses(graph: Graph, kind: int, fac: I64) -> tuple[I64, F64]:
+    """The codes of the losses, and their scales."""
+    declared, loss = FACTOR_KIND_OF_CODE[kind], fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
+    scale, robust = np.ones(len(fac)), np.flatnonzero(loss != at.NO_LOSS)
+    scale[robust] = graph.payload[fac[robust, at.F_AT] + declared.size + declared.triangle]
+    return loss, scale
+
+
+def _made(
+    graph: Graph, kind: int, rows: I64, fac: I64, a: I64, b: I64, t: F64, hold: F64, **more: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """A part of `Relations`; what is not given is nothing."""
+    m, d = t.shape
+    nothing = {
+        "R": np.zeros((m, d, d)), "turn": np.zeros(m), "couple": np.zeros((m, d, 1 if d == 2 else 3)),
+        "lever": np.zeros((m, d)),
+    }  # fmt: skip
+    got = nothing | more
+    loss, scale = _losses(graph, kind, fac)
+    return a, b, got["R"], t, got["turn"], hold, got["couple"], got["lever"], rows, loss, scale
+
+
+def poses_apart(numbers: F64) -> tuple[F64, F64]:
+    """(rotation matrices, translations) of poses as they are stored, (n, 3) or (n, 7)."""
+    if numbers.shape[1] == 3:
+        return matrices_of_angles(numbers[:, 2]), numbers[:, :2]
+    return matrices_of_quaternions(numbers[:, 3:]), numbers[:, :3]
+
+
+def _poses(graph: Graph, space: Space, kind: int) -> tuple[np.ndarray, ...]:
+    rows, fac, measured, information = _rows(graph, kind)
+    (R, t), d = poses_apart(measured), space.dim
+    b = fac[:, at.F_J] + 1 if kind == space.between else fac[:, at.F_I] + 1
+    a = fac[:, at.F_I] + 1 if kind == space.between else np.zeros(rows.size, np.int64)
+    hold = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
+    turn, couple = _turn(information, d), R @ information[:, :d, d:]
+    return _made(graph, kind, rows, fac, a, b, t, hold, R=R, turn=turn, couple=couple)
+
+
+def _turn(information: F64, d: int) -> F64:
+    """What a rotation weighs whatever the translation: the mean of the diagonal of the Schur complement, per rad²."""
+    across = information[:, d:, :d]
+    alone = information[:, d:, d:] - across @ np.linalg.solve(information[:, :d, :d], across.transpose(0, 2, 1))
+    mean = np.trace(alone, axis1=1, axis2=2) / alone.shape[1]
+    # A quaternion's vector part is half the angle.
+    return np.maximum(mean, 1e-12 * np.trace(information[:, d:, d:], axis1=1, axis2=2)) * (1.0 if d == 2 else 0.25)
+
+
+def _points(graph: Graph, space: Space, kind: int) -> tuple[np.ndarray, ...]:
+    rows, fac, measured, information = _rows(graph, kind)
+    seen = kind == space.landmark
+    a = fac[:, at.F_I] + 1 if seen else np.zeros(rows.size, np.int64)
+    b = fac[:, at.F_J if seen else at.F_I] + 1
+    return _made(graph, kind, rows, fac, a, b, measured, information)
+
+
+def _bearing_ranges(graph: Graph) -> tuple[np.ndarray, ...]:
+    rows, fac, measured, information = _rows(graph, at.BEARING_RANGE_SE2)
+    bearing, distance = measured.T
+    u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    g = np.stack([np.stack([-u[:, 1], u[:, 0]], axis=1) / distance[:, None], u], axis=1)
+    hold = g.transpose(0, 2, 1) @ information @ g
+    a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
+    return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, hold)
+
+
+def _bearings(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+    """Points on a line: at the distance that they have now, and free to move along it."""
+    rows, fac, measured, information = _rows(graph, space.bearing)
+    u = np.stack([np.cos(measured[:, 0]), np.sin(measured[:, 0])], axis=1) if space.dim == 2 else measured
+    u = u / np.linalg.norm(u, axis=1, keepdims=True)
+    away = _value(graph, fac[:, at.F_J], space.dim) - _value(graph, fac[:, at.F_I], space.dim)
+    distance = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
+    across = np.eye(space.dim) - u[:, :, None] * u[:, None, :]
+    weight = np.trace(information, axis1=1, axis2=2) / information.shape[1] / distance**2
+    a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
+    hold = weight[:, None, None] * across
+    return _made(graph, space.bearing, rows, fac, a, b, distance[:, None] * u, hold)
+
+
+def _value(graph: Graph, variables: I64, numbers: int) -> F64:
+    """The first so many numbers of the present values."""
+    return graph.values[graph.var[variables, at.V_AT, None] + np.arange(numbers)]
+
+
+def _positions(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+    rows, fac, measured, information = _rows(graph, space.position)
+    d, a = space.dim, np.zeros(rows.size, np.int64)
+    b, lever = fac[:, at.F_I] + 1, measured[:, d:]
+    return _made(graph, space.position, rows, fac, a, b, measured[:, :d], information, lever=lever)
+
+
+def _headings(graph: Graph) -> tuple[np.ndarray, ...]:
+    rows, fac, measured, information = _rows(graph, at.HEADING_SE2)
+    R, a = matrices_of_angles(measured[:, 0]), np.zeros(rows.size, np.int64)
+    nothing = np.zeros((rows.size, 2))
+    hold = np.zeros((rows.size, 2, 2))
+    turn = information[:, 0, 0]
+    return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, hold, R=R, turn=turn)
+
+
+def _linear_pairs(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+    """Two poses together: as they are to each other where the factor was linearised."""
+    rows, fac, measured, information = _rows(graph, space.linear_pair)
+    d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
+    (Ra, ta), (Rb, tb) = poses_apart(measured[:, :size]), poses_apart(measured[:, size : 2 * size])
+    H = measured[:, 2 * size + dim * dim : 2 * size + 2 * dim * dim].reshape(-1, dim, dim)
+    weight = np.maximum(np.einsum("mri,mrs,msi->mi", H, information, H), 0.0)
+    back = Ra.transpose(0, 2, 1)
+    t = (back @ (tb - ta)[:, :, None])[:, :, 0]
+    hold = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
+    turn = weight[:, d:].mean(axis=1)
+    a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
+    return _made(graph, space.linear_pair, rows, fac, a, b, t, hold, R=back @ Rb, turn=turn)
+
+
+def _linear(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+    """A pose by itself: where the factor was linearised, if it says something of all of the pose."""
+    rows, fac, measured, information = _rows(graph, space.linear)
+    d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
+    R, t = poses_apart(measured[:, :size])
+    H = measured[:, size : size + dim * dim].reshape(-1, dim, dim)
+    weight = np.einsum("mri,mrs,msi->mi", H, information, H)
+    whole = (weight > 0.0).all(axis=1)
+    weight = np.where(whole[:, None], weight, 0.0)
+    hold = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
+    a, b = np.zeros(rows.size, np.int64), fac[:, at.F_I] + 1
+    return _made(graph, space.linear, rows, fac, a, b, t, hold, R=R, turn=weight[:, d:].mean(axis=1))
+
+
+def _directions(graph: Graph, space: Space) -> Directions:
+    if space.dim == 2:
+        return Directions(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+    _, fac, measured, information = _rows(graph, at.ATTITUDE_SE3)
+    seen, there = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (measured[:, :3], measured[:, 3:]))
+    return Directions(fac[:, at.F_I] + 1, seen, there, np.trace(information, axis1=1, axis2=2) / 3.0)

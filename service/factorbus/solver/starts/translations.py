@@ -1,0 +1,66 @@
+"""Places of poses and points, a linear problem once the rotations are known.  MATH §12.3."""
+
+import numpy as np
+
+from factorbus.solver.kernels._jit import F64
+from factorbus.solver.starts.normal import Normal, summed
+from factorbus.solver.starts.relations import Relations
+from factorbus.solver.starts.rotation_matrices import angles_of, residuals_of
+
+# A pull to where it is, as a share of what holds a node, for what nothing else holds.
+_PULL = 1e-6
+_LEAST = 1e-300
+
+
+def placed(relations: Relations, R: F64, t: F64, known: np.ndarray) -> F64:
+    """Places (N, d) of all nodes, of least χ² with these rotations (N, d, d).
+
+    known (N,): those that stay where they are in t (N, d); so do those that no relation names.
+    """
+    used = relations.where(~(known[relations.a] & known[relations.b]))
+    free = np.zeros(known.size, bool)
+    free[used.a] = free[used.b] = True
+    free &= ~known
+    count, d = int(np.count_nonzero(free)), t.shape[1]
+    if not count:
+        return t
+    number = np.where(free, np.cumsum(free) - 1, -1)
+    i, j = number[used.a], number[used.b]
+    both = (i >= 0) & (j >= 0)
+    normal = Normal(count, d, i[both], j[both])
+    turn, seen = R[used.a], used.t[:, :, None]
+    W = turn @ used.hold @ turn.transpose(0, 2, 1)
+    v = (turn @ seen - R[used.b] @ used.lever[:, :, None])[:, :, 0]
+    pull = _coupled(used, R)
+    diagonal = summed(i, W, count) + summed(j, W, count)
+    force = (W @ (v + t[used.a] * (i < 0)[:, None] - t[used.b] * (j < 0)[:, None])[:, :, None])[:, :, 0] - pull
+    right = summed(j, force, count) - summed(i, force, count)
+    if not normal.factorize(diagonal, -W[both]):
+        least = _PULL * np.trace(diagonal, axis1=1, axis2=2)
+        least = np.maximum(least, 1e-9 * float(least.max()) + _LEAST)
+        if not normal.factorize(diagonal + least[:, None, None] * np.eye(d), -W[both]):
+            return t
+        right += least[:, None] * t[free]
+    made = t.copy()
+    made[free] = normal.solve(right)
+    return made
+
+
+def distances(relations: Relations, R: F64, t: F64) -> F64:
+    """rᵀ Ω r of each relation, without what couples rotation and translation: what a loss goes by."""
+    turn = R[relations.a]
+    v = (turn @ relations.t[:, :, None] - R[relations.b] @ relations.lever[:, :, None])[:, :, 0]
+    off = (turn.transpose(0, 2, 1) @ (t[relations.b] - t[relations.a] - v)[:, :, None])[:, :, 0]
+    angle = angles_of((turn @ relations.R).transpose(0, 2, 1) @ R[relations.b])
+    return np.einsum("mi,mij,mj->m", off, relations.hold, off) + relations.turn * angle**2
+
+
+def _coupled(used: Relations, R: F64) -> F64:
+    """What the residuals of the rotations, which are what they are, push translations with."""
+    with_it = np.flatnonzero((used.couple != 0.0).any(axis=(1, 2)))
+    pull = np.zeros(used.t.shape)
+    if with_it.size:
+        a, b, Z = R[used.a[with_it]], R[used.b[with_it]], used.R[with_it]
+        r = residuals_of((a @ Z).transpose(0, 2, 1) @ b)
+        pull[with_it] = (a @ used.couple[with_it] @ r[:, :, None])[:, :, 0]
+    return pull
