@@ -128,7 +128,8 @@ class Shell:
         self.vitals.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()
         self._jobs = Jobs(self._desk, bus.send_job)
-        self._trips = Trips(self._desk, bus.send_job, self._jobs.heard)
+        self.vitals.chapters["wrong_answers"] = lambda: self._jobs.wrong_answers
+        self._trips = Trips(self._desk, bus.send_job, self._jobs)
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = Features(
@@ -283,7 +284,7 @@ class Shell:
             self._delivery.refuse(query, Internal(reference))
 
     def _look_for_workers(self) -> None:
-        self._trips.look_for(self._jobs.suspects)
+        self._trips.look_for(self._jobs.suspects, self._jobs.distrusted)
         self._worker_rows = [row | self._trips.row(row["name"]) for row in self._jobs.workers()]
 
     def _refuse_if_kept_elsewhere(self, tokens: str) -> None:

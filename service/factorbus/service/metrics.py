@@ -100,6 +100,10 @@ def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     ):
         samples = {row["name"]: row[name] for row in rows if name in row}
         yield _by(f"worker_{name}", "gauge", what, "worker", samples)
+    wrong = {row["name"]: row["wrong"] for row in rows}
+    yield _by("worker_wrong_answers", "counter", "Answers of it that could not be right", "worker", wrong)
+    distrusted = {row["name"]: row["distrusted"] for row in rows}
+    yield _by("worker_distrusted", "gauge", "1 while it gets no jobs because of that", "worker", distrusted)
 
 
 _GAUGES = {
