@@ -129,13 +129,17 @@ class Bus:
         except Refused as refused:
             raise (UnknownMap(name) if refused.code == UnknownMap.code else refused) from None
 
-    def drop(self, name: str, timeout_s: float | None = None, *, revision: int | None = None) -> None:
+    def drop(
+        self, name: str, timeout_s: float | None = None, *, revision: int | None = None, damaged: bool = False
+    ) -> None:
         """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName.
 
         revision: only if it is at this one and nothing is under way; else it stays, and Refused says `moved_on`.
+        damaged: only if it is on disk and does not open: what is there is given up (`not_damaged`: it is open).
         """
-        asked = {"map": keys.checked_name("map", name)}
-        self._admin("drop", asked | ({} if revision is None else {"revision": revision}), codec.decode_map, timeout_s)
+        asked: dict[str, Any] = {"map": keys.checked_name("map", name)}
+        asked |= {} if revision is None else {"revision": revision}
+        self._admin("drop", asked | ({"damaged": True} if damaged else {}), codec.decode_map, timeout_s)
 
     def close(self) -> None:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
@@ -177,4 +181,6 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         revision=fields.integer(where, content, "revision"),
         variables=fields.integer(where, content, "variables"),
         factors=fields.integer(where, content, "factors"),
+        state=fields.text(where, content, "state", default="open"),
+        problem=fields.text(where, content, "problem", default=""),
     )

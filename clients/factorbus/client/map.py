@@ -29,7 +29,11 @@ from factorbus.proto.problems import Problem, Refused, TooLarge, Unavailable
 
 @dataclass(frozen=True, slots=True)
 class MapRow:
-    """A map as the service lists it."""
+    """A map as the service lists it.
+
+    state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
+    (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
+    """
 
     name: str
     mode: str
@@ -37,6 +41,8 @@ class MapRow:
     revision: int
     variables: int
     factors: int
+    state: str = "open"
+    problem: str = ""
 
 
 class Map:

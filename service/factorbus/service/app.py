@@ -94,8 +94,7 @@ def _serve(
         shell = Shell(bus, config, library)
         shell.vitals.chapters["cores"] = cores.account
         try:
-            for name in config.create:
-                shell.maps.create(name, None)
+            shell.maps.create_all(config.create)
             shell.vitals.health.open = True
             shell.tick()  # so that the first who asks is told of all maps
             endpoints = bus.endpoints()
@@ -124,6 +123,7 @@ class Shell:
         lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
+        self.vitals.chapters["unopened"] = self.maps.unopened
         self._worker_rows: list[dict[str, Any]] = []
         self.vitals.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()
@@ -257,10 +257,8 @@ class Shell:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
         try:
             if operation == "maps":
-                rows = [host.core.row() for host in self.maps.hosts().values()]
-                self._delivery.answer(
-                    query, codec.encode_map({"maps": rows, "service": self._service, "version": __version__})
-                )
+                told = {"maps": self.maps.rows(), "service": self._service, "version": __version__}
+                self._delivery.answer(query, codec.encode_map(told))
             elif operation == "stats":
                 self._delivery.answer(query, codec.encode_map(self.vitals.account()))
             elif operation == "create":
@@ -268,7 +266,7 @@ class Shell:
             elif operation == "fork":
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
-                self.maps.drop(query, *read_drop(payload))
+                self.maps.drop(query, read_drop(payload))
             else:
                 ignore(query)  # somebody else's key
         except NotHere as problem:
