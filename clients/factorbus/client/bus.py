@@ -183,4 +183,5 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         factors=fields.integer(where, content, "factors"),
         state=fields.text(where, content, "state", default="open"),
         problem=fields.text(where, content, "problem", default=""),
+        protocol=fields.mapping(where, content, "protocol"),
     )

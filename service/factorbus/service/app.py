@@ -23,6 +23,7 @@ from typing import Any
 
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Busy, Internal, Problem
+from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
 from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.arrival import read_insert
@@ -123,6 +124,7 @@ class Shell:
         lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
+        self.vitals.chapters["protocol"] = known
         self.vitals.chapters["unopened"] = self.maps.unopened
         self._worker_rows: list[dict[str, Any]] = []
         self.vitals.chapters["workers"] = lambda: self._worker_rows
@@ -235,6 +237,7 @@ class Shell:
         return {
             "service": self._service,
             "version": __version__,
+            "protocol": known(),
             "kernels_compiled_s": compiled_seconds(),
             "workers": self._worker_rows,
         }
@@ -257,12 +260,14 @@ class Shell:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
         try:
             if operation == "maps":
-                told = {"maps": self.maps.rows(), "service": self._service, "version": __version__}
+                told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
                 self._delivery.answer(query, codec.encode_map(told))
             elif operation == "stats":
                 self._delivery.answer(query, codec.encode_map(self.vitals.account()))
             elif operation == "create":
-                self._delivery.answer(query, codec.encode_map(self.maps.create(*read_create(payload))))
+                self._delivery.answer(
+                    query, codec.encode_map(self.maps.create(*read_create(payload)) | {"protocol": known()})
+                )
             elif operation == "fork":
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":

@@ -14,6 +14,7 @@ from typing import Any
 from factorbus.journal.problems import JournalFailed
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, ShuttingDown, TooLarge, UnknownMap
+from factorbus.proto.protocol import known
 from factorbus.service.admin import (
     Drop,
     Fork,
@@ -162,7 +163,7 @@ class Maps:
             self._delivery.refuse(asker, problem)
             return
         self._forks[asked.fork.target] = asked.fork
-        self._delivery.answer(asker, codec.encode_map(row))
+        self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         self._desk.hand(give_back)
 
     def drop(self, asker: Asker, drop: Drop) -> None:
@@ -298,7 +299,8 @@ class Maps:
         """Whether this very fork has been made: whoever asks again is answered again."""
         done = bool(fork.request) and self._forks.get(fork.target) == fork
         if done:
-            self._delivery.answer(asker, codec.encode_map(self._maps[fork.target].host.core.row()))
+            row = self._maps[fork.target].host.core.row()
+            self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         return done
 
     def _split(self, asked: _Forking, taken: Snapshot) -> Owned:
