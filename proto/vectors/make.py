@@ -21,7 +21,7 @@ import numpy as np
 from factorbus.proto import asking, codec
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import repair_codec as repairs
-from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES
 from factorbus.proto.messages import (
     Accepted,
     Batch,
@@ -77,6 +77,11 @@ def vectors() -> dict[str, bytes]:
         ),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
+        # What readers do without: `report` is optional.
+        "accepted_without_report": codec.encode_map(
+            {"sequence": 1, "epoch": 7, "revision": 1, "first_factor": 0, "folded": 1}
+        ),
+        "insert_losses": codec.encode_insert(Insert(10, Batch(factors=_losses()), epoch=7)),
         "estimate": codec.encode_estimate(Estimate(7, 2, pair)),
         "estimate_empty": codec.encode_estimate(Estimate(7, 2, ())),
         "delta": codec.encode_delta(Delta(7, 2, 1, (pair[1],), report)),
@@ -193,6 +198,12 @@ def _poses(first: int, values: Any = None, fixed: bool = False) -> Variables:
 def _odometry(first: int) -> Factors:
     keys = np.array([[symbol("x", first), symbol("x", first + 1)]])
     return Factors("between_se2", keys, np.array([[1.5, 0.25, 0.125]]), np.array([[100.0, 0, 0, 100, 0, 400]]))
+
+
+def _losses() -> tuple[Factors, ...]:
+    """An odometry with each loss."""
+    edge = _odometry(0)
+    return tuple(edge._replace(loss=loss, scale=np.array([1.5 + n])) for n, loss in enumerate(LOSSES))
 
 
 def _every_kind() -> Batch:

@@ -1,14 +1,18 @@
 """`proto/README.md` says what the code does: every kind, problem, key and message field is in it."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from factorbus.client import link
 from factorbus.proto import keys, messages, problems
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.proto.protocol import known
 from factorbus.proto.symbols import symbol
+from factorbus.solver.modes import MODES
 
 CONTRACT = (Path(__file__).parents[2] / "proto" / "README.md").read_text()
 CLIENT_SIDE = {"bad_symbol", "bad_endpoint", "bad_information", "bad_setting", "problem"}
@@ -97,3 +101,28 @@ def test_the_bytes_shown_are_those_of_the_golden_insert() -> None:
 def test_every_question_is_explained() -> None:
     for question in keys.QUESTIONS:
         assert f"| `{question}` |" in CONTRACT
+
+
+def test_settings_of_the_session_are_those_of_the_client() -> None:
+    """§14 names the keys of Zenoh's configuration, with the values that the Python client has."""
+    table = CONTRACT.split("by the keys of its configuration:")[1].split("## 15")[0]
+    told = {key: json.loads(value) for key, value in re.findall(r"^\| `([a-z_/]+)` \| `([^`]+)` \|", table, re.M)}
+    ours = link._settings(["tcp/127.0.0.1:1"])
+    assert set(told) == set(ours) - {
+        "connect/endpoints", "scouting/multicast/enabled", "scouting/gossip/enabled",
+    }  # fmt: skip
+    assert told == {key: ours[key] for key in told}
+    assert "`scouting/multicast/enabled` and `scouting/gossip/enabled` false" in table
+
+
+def test_what_a_service_knows_is_explained() -> None:
+    section = CONTRACT.split("**What a service knows**")[1].split("**Another version**")[0]
+    for name in known():
+        assert f"`{name}`" in section
+    assert set(known()["insert"]) == (set(messages.Insert.__match_args__) - {"batch"}) | {"variables", "factors"}
+
+
+def test_modes_and_states_are_listed() -> None:
+    section = CONTRACT.split("## 9.")[1].split("## 10.")[0]
+    for name in (*MODES, "open", "blocked", "damaged", "differs", "other_version", "unreadable"):
+        assert f"`{name}`" in section

@@ -8,7 +8,7 @@ from hypothesis import given
 
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import Refused, Unavailable
-from factorbus.service.dispatch import IN_PLACE, TRIES, Dispatch, Effect, Ended, InPlace, Send
+from factorbus.service.dispatch import IN_PLACE, TRIES, Dispatch, Distrusted, Effect, Ended, InPlace, Send
 
 TIMEOUT = Unavailable("worker", 1.0, "")
 
@@ -51,20 +51,20 @@ def test_the_least_busy_worker_first_and_no_more_than_slots() -> None:
 
 def test_free_is_what_would_be_begun_at_once() -> None:
     dispatch = Dispatch()
-    assert dispatch.free == 0
+    assert dispatch.free("batch") == 0
     dispatch.joined("a", 2)
     dispatch.joined("b", 1)
-    free = [dispatch.free]
+    free = [dispatch.free("batch")]
     sent = []
     for n in range(4):
         sent.append(dispatch.submit(job(f"j{n}"), ahead=n // 2))
-        free.append(dispatch.free)
+        free.append(dispatch.free("batch"))
     assert free == [3, 2, 1, 0, 0]
     assert [places(effects) for effects in sent] == [["a"], ["b"], ["a"], ["b"]]
     dispatch.done(tag_of(sent[1]), done("j1"))
-    assert dispatch.free == 0, "the one ahead was begun"
+    assert dispatch.free("batch") == 0, "the one ahead was begun"
     dispatch.done(tag_of(sent[0]), done("j0"))
-    assert dispatch.free == 1
+    assert dispatch.free("batch") == 1
 
 
 @pytest.mark.parametrize("failure", ["left", "timeout", "internal"])
@@ -98,12 +98,70 @@ def test_tries_are_bounded() -> None:
     assert len(seen) == TRIES
 
 
-def test_a_problem_with_the_job_itself_is_not_tried_again() -> None:
+@pytest.mark.parametrize("known", [{"a": 1}, {"a": 1, "b": 1}])
+def test_a_refusal_is_believed_only_if_the_service_comes_to_it_too(known: dict[str, int]) -> None:
+    dispatch = Dispatch()
+    for name, slots in known.items():
+        dispatch.joined(name, slots)
+    problem = Refused("underconstrained", "x1", {})
+    effects = dispatch.failed(tag_of(dispatch.submit(job("j"))), problem)
+    assert places(effects) == [IN_PLACE]
+    assert dispatch.failed(tag_of(effects), problem) == [Ended("j", IN_PLACE, problem)]
+    assert (dispatch.distrusted, dispatch.wrong_answers) == ([], 0)
+
+
+def test_who_refuses_what_can_be_done_is_distrusted() -> None:
     dispatch = Dispatch()
     dispatch.joined("a", 1)
+    effects = dispatch.failed(tag_of(dispatch.submit(job("j"))), Refused("bad_message", "no map", {}))
+    distrusted, ended = dispatch.done(tag_of(effects), done("j"))
+    assert ended == Ended("j", IN_PLACE, done("j"), 2)
+    assert isinstance(distrusted, Distrusted)
+    assert (distrusted.worker, distrusted.times) == ("a", 1)
+    assert "refused the job, which can be done: no map [bad_message]" in distrusted.why
+    assert places(dispatch.submit(job("k"))) == [IN_PLACE], "it gets nothing for a while"
+
+
+def test_a_wrong_answer_costs_trust_and_the_job_goes_to_another() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 2)
     dispatch.joined("b", 1)
-    problem = Refused("underconstrained", "x1", {})
-    assert dispatch.failed(tag_of(dispatch.submit(job("j"))), problem) == [Ended("j", "a", problem)]
+    first, _, third = (dispatch.submit(job(name)) for name in "jkl")
+    assert [places(first), places(third)] == [["a"], ["a"]]
+    effects = dispatch.wrong(tag_of(first), "answered nonsense")
+    assert effects == [Distrusted("a", "answered nonsense", 1)], "b has no slot: it waits"
+    assert (dispatch.distrusted, dispatch.slots("batch"), dispatch.wrong_answers) == (["a"], 1, 1)
+    more = dispatch.wrong(tag_of(third), "again")
+    assert more == [], "one loss of trust, told once"
+    assert dispatch.wrong_answers == 2
+    assert dispatch.table()[0] == {"name": "a", "slots": 2, "in_flight": 0, "wrong": 2, "distrusted": True}
+    assert places(dispatch.trusted("a")) == [], "it has had both"
+    assert places(dispatch.submit(job("m"))) == ["a"]
+    again = dispatch.distrust("a", "a probe")
+    assert again == [Distrusted("a", "a probe", 2)]
+
+
+def test_a_doubtful_answer_is_decided_in_place() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    effects = dispatch.doubted(tag_of(dispatch.submit(job("j"))), "answered NaN")
+    assert places(effects) == [IN_PLACE]
+    assert dispatch.distrusted == []
+    assert dispatch.done(tag_of(effects), done("j"))[0] == Distrusted("a", "answered NaN", 1)
+
+
+def test_a_worker_gets_no_more_jobs_of_a_kind_it_does_not_know() -> None:
+    dispatch = Dispatch()
+    dispatch.joined("a", 1)
+    unknown = Refused("unknown_kind", "", {})
+    assert places(dispatch.failed(tag_of(dispatch.submit(Job("j", "idp", b""))), unknown)) == [IN_PLACE]
+    assert (dispatch.slots("idp"), dispatch.slots("batch"), dispatch.distrusted) == (0, 1, [])
+    assert places(dispatch.submit(Job("k", "idp", b""))) == [IN_PLACE]
+    assert places(dispatch.submit(job("l"))) == ["a"]
+    dispatch.cannot("a", "batch")
+    assert dispatch.slots("batch") == 0
+    dispatch.joined("a", 1)
+    assert dispatch.slots("idp") == 1, "begun anew it may be another program"
 
 
 def test_a_worker_that_did_not_answer_in_time_gets_nothing_until_it_is_heard_of() -> None:
@@ -112,10 +170,10 @@ def test_a_worker_that_did_not_answer_in_time_gets_nothing_until_it_is_heard_of(
     dispatch.joined("b", 2)
     effects = dispatch.failed(tag_of(dispatch.submit(job("j"))), TIMEOUT)
     assert places(effects) == ["b"]
-    assert (dispatch.suspects, dispatch.slots) == (["a"], 2)
+    assert (dispatch.suspects, dispatch.slots("batch")) == (["a"], 2)
     assert [places(dispatch.submit(job(name))) for name in "klm"] == [["b"], [], []]
     assert places(dispatch.heard("a")) == ["a"]
-    assert (dispatch.suspects, dispatch.slots) == ([], 3)
+    assert (dispatch.suspects, dispatch.slots("batch")) == ([], 3)
     ended, *following = dispatch.done(tag_of(effects), done("j"))
     assert ended == Ended("j", "b", done("j"))
     assert isinstance(ended, Ended)
@@ -155,7 +213,7 @@ def test_a_worker_that_came_back_has_forgotten_its_jobs() -> None:
     dispatch.joined("a", 1)
     dispatch.submit(job("j"))
     assert places(dispatch.joined("a", 1)) == [IN_PLACE]
-    assert dispatch.table() == [{"name": "a", "slots": 1, "in_flight": 0}]
+    assert dispatch.table() == [{"name": "a", "slots": 1, "in_flight": 0, "wrong": 0, "distrusted": False}]
 
 
 def test_a_cancelled_job_is_forgotten_wherever_it_is() -> None:

@@ -36,7 +36,7 @@ _USAGE_CODES = (
     "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting",
     "cannot_listen", "exposed", "port_taken",
 )  # fmt: skip
-_UNAVAILABLE_CODES = ("unavailable", "shutting_down")
+_UNAVAILABLE_CODES = ("unavailable", "shutting_down", "other_protocol")
 
 
 class Stopped(Exception):

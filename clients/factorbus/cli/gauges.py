@@ -17,14 +17,18 @@ class Gauges:
         self._before: dict[tuple[str, int], tuple[float, dict[str, Any]]] = {}
 
     def read(self) -> dict[str, Any]:
-        """For JSON: service, version, answer_ms, maps, clients, workers; `unavailable` says why there are none."""
+        """For JSON: service, version, answer_ms, maps, unopened, clients, workers.
+
+        `unavailable` says why there is nothing.
+        """
         seen: dict[str, Any] = {"unavailable": "", "service": "", "version": "", "answer_ms": 0.0}
-        seen |= {"maps": [], "clients": [], "workers": []}
+        seen |= {"maps": [], "unopened": [], "clients": [], "workers": []}
         try:
             start = time.perf_counter()
             rows = self._bus.maps(_ANSWER_S)
             seen["answer_ms"] = (time.perf_counter() - start) * 1e3
-            for row in rows:
+            seen["unopened"] = [f"{row.name} does not open ({row.state})" for row in rows if row.problem]
+            for row in (row for row in rows if not row.problem):
                 self._read_map(row.name, seen)
         except Unavailable as nobody:
             seen["unavailable"] = nobody.message

@@ -36,6 +36,9 @@ def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     if account["stuck"]:
         seen = f"stuck: {', '.join(account['stuck'])}"
         yield "fail", seen, "look into its log and restart it; WatchdogSec= in its systemd unit does so by itself"
+    for row in account.get("unopened", ()):
+        mend = f"restore its folder from a copy and restart, or `factorbus drop {row['name']} --damaged` gives it up"
+        yield "fail", f"map {row['name']} does not open ({row['state']}): {row['problem']}", mend
     resident, limit = (account["memory"][name] for name in ("resident_bytes", "limit_bytes"))
     if resident > 0.9 * limit:
         state = "fail" if resident > limit else "warn"

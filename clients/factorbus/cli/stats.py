@@ -48,6 +48,8 @@ def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "workers", told or "none: jobs are done in place"
     for row in account["maps"]:
         yield f"map {row['name']}", _map(row)
+    for row in account.get("unopened", ()):
+        yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
     for name, value in account.get("journal", {}).items():
         yield f"journal {name}", str(value)
 

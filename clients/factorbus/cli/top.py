@@ -72,7 +72,8 @@ def _view(seen: dict[str, Any], endpoint: str) -> "RenderableType":
     if seen["unavailable"]:
         return Text(head + f"nobody answers: {seen['unavailable']}; asking again", style="bold")
     head += f"service {seen['service']} {seen['version']}, answers in {seen['answer_ms']:.1f} ms"
-    return Group(Text(head, style="bold"), Text(), _maps(seen), _clients(seen), _workers(seen))
+    closed = [Text(f"map {line}", style="bold red") for line in seen["unopened"]]
+    return Group(Text(head, style="bold"), Text(), *closed, _maps(seen), _clients(seen), _workers(seen))
 
 
 def _maps(seen: dict[str, Any]) -> "RenderableType":
@@ -107,6 +108,7 @@ def _workers(seen: dict[str, Any]) -> "RenderableType":
     table = _table("worker", "slots", "in flight", "trip ms")
     for row in seen["workers"]:
         trip = "" if row.get("trip_ms") is None else f"{row['trip_ms']:.2f}"
+        trip = "distrusted" if row.get("distrusted") else trip
         table.add_row(row["name"], str(row["slots"]), str(row["in_flight"]), trip)
     return table
 

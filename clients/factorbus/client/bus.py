@@ -134,17 +134,25 @@ class Bus:
             raise self._named(name, refused) from None
 
     def drop(
-        self, name: str, timeout_s: float | None = None, *, revision: int | None = None, missing_ok: bool = False
+        self,
+        name: str,
+        timeout_s: float | None = None,
+        *,
+        revision: int | None = None,
+        missing_ok: bool = False,
+        damaged: bool = False,
     ) -> None:
         """Drop map `name` and everything in it.  Raises Refused, Unavailable, BadName, UnknownMap.
 
         missing_ok: it is no error if there is no such map.
 
         revision: only if it is at this one and nothing is under way; else it stays, and Refused says `moved_on`.
+        damaged: only if it is on disk and does not open: what is there is given up (`not_damaged`: it is open).
         """
-        asked = {"map": keys.checked_name("map", name)}
+        asked: dict[str, Any] = {"map": keys.checked_name("map", name)}
+        asked |= {} if revision is None else {"revision": revision}
+        asked |= {"damaged": True} if damaged else {}
         try:
-            asked |= {} if revision is None else {"revision": revision}
             self._admin("drop", asked, codec.decode_map, timeout_s)
         except Refused as refused:
             if not (missing_ok and refused.code == UnknownMap.code):
@@ -199,4 +207,7 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         revision=fields.integer(where, content, "revision"),
         variables=fields.integer(where, content, "variables"),
         factors=fields.integer(where, content, "factors"),
+        state=fields.text(where, content, "state", default="open"),
+        problem=fields.text(where, content, "problem", default=""),
+        protocol=fields.mapping(where, content, "protocol"),
     )

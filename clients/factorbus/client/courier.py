@@ -1,5 +1,8 @@
 """Carries questions and inserts to the service, and carries them again until they are answered.
 
+While there has been nothing but silence, it looks whether the services that are there speak another version of the
+protocol, and then gives up at once; not once somebody has answered: that service may be on its way back.
+
 The first try goes out on the caller's thread, for latency; later ones on the courier's own thread, because a
 callback of the bus must not call the bus.
 """
@@ -13,11 +16,14 @@ from typing import Any
 
 from factorbus.client.link import Link
 from factorbus.client.promise import Promise
-from factorbus.client.replies import Again, Reply, judge
+from factorbus.client.replies import Again, Reply, Silence, judge
+from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import Problem, Refused, Unavailable
 
 # An unanswered try is repeated after this long: a step may take longer, but then repeating costs little.
 TRY_S = 5.0
+# Silence so often in a row, 0.3 s, is worth a look for services of other versions; then again after this long.
+_SILENT, _LOOK_AGAIN_S = 3, 2.0
 
 
 class Errand:
@@ -58,6 +64,8 @@ class Courier:
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
         self._changed = threading.Condition(self._lock)
         self._closed = False
+        self._heard = False  # somebody has answered here, if only with a problem
+        self._look_at = 0.0
         self._thread = threading.Thread(target=self._run, name="factorbus-courier", daemon=True)
         self._thread.start()
 
@@ -109,6 +117,7 @@ class Courier:
 
     def _take(self, errand: Errand, attempt: int, reply: Reply) -> None:
         """On zenoh's thread: only decode, hand over, or put back."""
+        self._heard = self._heard or not isinstance(reply, Silence)
         verdict = judge(reply, attempt, errand.passing)
         if isinstance(verdict, bytes):
             try:
@@ -152,6 +161,21 @@ class Courier:
         while (errand := self._next()) is not None:
             if not errand.future.done():
                 self._try(errand)
+                if errand.attempt >= _SILENT:
+                    self._look_for_other_versions()
+
+    def _look_for_other_versions(self) -> None:
+        if not self._heard and (now := time.monotonic()) >= self._look_at:
+            self._look_at = now + _LOOK_AGAIN_S
+            self._link.ask_versions(LOOK_S, self._looked)
+
+    def _looked(self, versions: set[str]) -> None:
+        """On zenoh's thread."""
+        if not self._heard and (other := other_protocol(versions)) is not None:
+            with self._lock:
+                left = list(self._open)
+            for errand in left:
+                self._finish(errand, other)
 
     def _next(self) -> Errand | None:
         with self._lock:

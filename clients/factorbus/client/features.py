@@ -19,6 +19,7 @@ from factorbus.client.courier import Courier, Errand
 from factorbus.client.grown import Factored, Grown, factored, grown
 from factorbus.client.link import Link
 from factorbus.client.memories import Lent, Memories
+from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import keys
 from factorbus.proto.arrays import F64
 from factorbus.proto.camera import Camera
@@ -30,6 +31,8 @@ from factorbus.proto.segments import PAGE
 
 # A smaller answer is sooner sent than shared memory is made for it.
 _SHARED_FROM_BYTES = 64 << 10
+# No service for so long is worth a look for services of other versions of the protocol.
+_LOOK_AFTER_S = 0.3
 
 
 class Features:
@@ -131,7 +134,11 @@ class Features:
 
     def _any_service(self, timeout_s: float) -> str:
         with self._lock:
-            if not self._changed.wait_for(lambda: self._services, timeout_s):
+            if self._changed.wait_for(lambda: self._services, min(timeout_s, _LOOK_AFTER_S)):
+                return min(self._services)
+        refuse_other_protocol(self._link, timeout_s)
+        with self._lock:
+            if not self._changed.wait_for(lambda: self._services, max(0.0, timeout_s - _LOOK_AFTER_S)):
                 raise Unavailable("features", timeout_s, "no service on this bus makes features: is one running?")
             return min(self._services)
 

@@ -5,12 +5,16 @@ from queue import SimpleQueue
 
 from factorbus.client.link import Link
 from factorbus.client.replies import Again, Reply, Silence, judge
+from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, Unavailable
 
 
 def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
-    """What all who answer `admin/<operation>` say; asked again until somebody does.  Raises Refused, Unavailable."""
+    """What all who answer `admin/<operation>` say; asked again until somebody does.
+
+    Raises Refused, Unavailable, OtherProtocol.
+    """
     end = time.monotonic() + timeout_s
     key, payload, attempt = keys.admin_key(operation), codec.encode_map({}), 0
     while (left := end - time.monotonic()) > 0:
@@ -23,6 +27,8 @@ def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         for verdict in verdicts:
             if isinstance(verdict, Problem):
                 raise verdict
+        if attempt == 2 and all(isinstance(verdict, Again) for verdict in verdicts):
+            refuse_other_protocol(link, max(end - time.monotonic(), 0.001))
         pauses = [verdict.pause_s for verdict in verdicts if isinstance(verdict, Again)]
         # Whoever was busy has said for how long, and of nobody there is nothing to wait on.
         time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))

@@ -16,7 +16,7 @@ from zenoh.handlers import Callback
 
 from factorbus.client.listening import heard
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
-from factorbus.proto import discreet
+from factorbus.proto import discreet, keys
 from factorbus.proto.kept_state import keep_state
 from factorbus.proto.problems import BadEndpoint, BadSetting, NobodyListens, Unavailable
 
@@ -69,6 +69,21 @@ class Link:
             replies.append(_read(reply))
 
         self._query(key, payload, timeout_s, on_reply, lambda: done(replies))
+
+    def ask_versions(self, timeout_s: float, done: Callable[[set[str]], None]) -> None:
+        """Which versions of the protocol do services speak that are there?  `done` is called once."""
+        found: set[str] = set()
+
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found.add(keys.version_of(str(reply.ok.key_expr)))
+
+        with suppress(zenoh.ZError):  # it is closed
+            self._session.liveliness().get(
+                keys.ANY_SERVICE_OF_ANY_VERSION,
+                Callback(on_reply, drop=lambda: done(found), indirect=False),
+                timeout=timeout_s,
+            )
 
     def _query(
         self,

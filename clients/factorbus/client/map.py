@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -26,13 +26,19 @@ from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
-from factorbus.proto.problems import Problem, Refused, TooLarge, Unavailable
+from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Estimate, Graph, Insert
+from factorbus.proto.problems import NotSupported, Problem, Refused, TooLarge, Unavailable
 
 
 @dataclass(frozen=True, slots=True)
 class MapRow:
-    """A map as the service lists it."""
+    """A map as the service lists it.
+
+    state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
+    (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
+    protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
+    list of maps.
+    """
 
     name: str
     mode: str
@@ -40,6 +46,9 @@ class MapRow:
     revision: int
     variables: int
     factors: int
+    state: str = "open"
+    problem: str = ""
+    protocol: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Map:
@@ -176,7 +185,7 @@ class Map:
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
-            listed = changes.listed() if changes is not None else ()
+            listed = self._known(changes) if changes is not None else ()
             insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
             ticket = self._ticket(insert, timeout_s)
             with self._lock:
@@ -288,11 +297,23 @@ class Map:
         two processes that use the same name by mistake do not answer for each other.
         """
         self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
+        self._protocol = row.protocol
         self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)
         self._window: Window[Ticket] = Window(self._size)
         self._presence.close()
         self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
+
+    def _known(self, changes: Changes) -> tuple[Change, ...]:
+        """What is in `changes`.  Raises NotSupported for what the service would skip, or not know."""
+        listed, protocol = changes.listed(), self._protocol
+        if protocol and listed:
+            told = protocol.get("changes") if "changes" in protocol.get("insert", ()) else ()
+            names = told if isinstance(told, list | tuple) else ()
+            for change in listed:
+                if change.change not in names:
+                    raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
+        return listed
 
     def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
         window = self._window

@@ -134,7 +134,7 @@ async def _optimum(maps: Maps, request: Request) -> Response:
         found = await asyncio.wrap_future(joined.map.ask.chi2(True, _OPTIMUM_S))
     told = {name: getattr(found, name) for name in ("revision", "chi2", "batch", "start", "worker", "seconds")}
     notice = None if found.notice is None else {"code": found.notice.code, "message": found.notice.message}
-    return JSONResponse(told | {"notice": notice})
+    return Document(told | {"notice": notice})
 
 
 async def _export(maps: Maps, request: Request) -> Response:

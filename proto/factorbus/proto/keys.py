@@ -17,7 +17,10 @@ import re
 
 from factorbus.proto.problems import BadName
 
-PREFIX = "factorbus/v1"
+VERSION = "v1"
+PREFIX = f"factorbus/{VERSION}"
+# The one key that is the same in every version, so that versions can be told apart.
+ANY_SERVICE_OF_ANY_VERSION = "factorbus/*/features/*/live"
 QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair")
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -123,6 +126,11 @@ def features_token(service: str) -> str:
 def any_features_token() -> str:
     """Matches every service's token for features."""
     return f"{PREFIX}/features/*/live"
+
+
+def version_of(key: str) -> str:
+    """The version of the protocol that a key belongs to, such as `v1`."""
+    return key.split("/")[1]
 
 
 def service_of(token: str) -> str:

@@ -20,6 +20,8 @@
     ├── Unavailable          unavailable          nobody answered (client side)
     │   └── NobodyListens    unavailable          there is nothing at that address
     ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
+    ├── OtherProtocol        other_protocol       only services of another major version are there (client side)
+    ├── NotSupported         not_supported        the service is older than what it is asked for (client side)
     ├── Refused              (the code it carries) a problem that came over the bus, as the client sees it
     └── Internal             internal             a fault of the service itself, with a reference into its log
 
@@ -241,6 +243,30 @@ class Internal(Problem):
 
     def __init__(self, reference: str) -> None:
         super().__init__(f"the service failed on this request and left the map as it was; see {reference} in its log")
+
+
+class OtherProtocol(Problem):
+    code = "other_protocol"
+
+    def __init__(self, versions: list[str], wanted: str) -> None:
+        super().__init__(
+            f"the services here speak version {', '.join(versions)} of the protocol, this client {wanted}, and they do "
+            "not hear each other: update the older of the two",
+            versions=versions,
+            wanted=wanted,
+        )
+
+
+class NotSupported(Problem):
+    code = "not_supported"
+
+    def __init__(self, what: str, product: str) -> None:
+        super().__init__(
+            f"the service (factorbus {product or 'of unknown version'}) does not know {what}; nothing was sent: update "
+            "the service",
+            what=what,
+            product=product,
+        )
 
 
 class Refused(Problem):

@@ -2,7 +2,8 @@
 
     python proto/vectors/features/make.py [FOLDER]        (default: the folder of this file)
 
-The numbers are made up; what stands between them is the form.
+Answers are what workers compute (`workers/MATH.md`): `answer` answers `ask`, and each `shard_done_…` a
+shard of the question in its form, the same on every machine but for the last bits of arc tangents.
 """
 
 import json
@@ -13,6 +14,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from factorbus.idp import job
 from factorbus.proto import codec
 from factorbus.proto import features_codec as features
 from factorbus.proto.camera import Camera
@@ -35,24 +37,23 @@ def main() -> None:
 def vectors() -> dict[str, bytes]:
     """The golden messages by name: two pixels, a filter that has nothing but its camera."""
     ask = features.encode_ask(Ask(_sighting(), "half"))
-    half = ShardDone(0, 2, _ramp(2, 6), cross=_ramp(12, 13), blocks=_ramp(3 * 36))
-    shard = features.encode_shard_done(half)
+    rows = features.encode_ask(Ask(_sighting(), "rows"))
+    factored = features.encode_ask(Ask(_sighting(_RADTAN), "factored"))
+    shard = _done(ask, 0, 2)
     segment = Segment(4711, 12, "1e" * 16, 8192, 4096)
     return {
-        "ask": features.encode_ask(Ask(_sighting(), "rows")),
+        "ask": rows,
         "ask_half": ask,
         "ask_into_segment": features.encode_ask(Ask(_sighting(), "rows", segment)),
-        "ask_radtan": features.encode_ask(Ask(_sighting(_RADTAN), "factored")),
+        "ask_radtan": factored,
         "shard": features.encode_shard(Shard(ask, 0, 2)),
-        "shard_done_rows": features.encode_shard_done(ShardDone(0, 1, _ramp(1, 6), rows=_ramp(6, 25))),
+        "shard_done_rows": _done(rows, 0, 1),
         "shard_done_half": shard,
-        "shard_done_factored": features.encode_shard_done(
-            ShardDone(1, 2, _ramp(1, 6), turn=_ramp(1, 4), own=_ramp(1, 3), U=_ramp(6, 13), S=_ramp(3, 3))
-        ),
-        "shard_done_stored": features.encode_shard_done(ShardDone(0, 2, _ramp(2, 6), stored=True)),
+        "shard_done_factored": _done(factored, 1, 2),
+        "shard_done_stored": _stored(shard),
         "job_idp": codec.encode_job(Job("j2", "idp", features.encode_shard(Shard(ask, 0, 2)))),
         "job_done_idp": codec.encode_job_done(JobDone("j2", "idp", shard, 0.25)),
-        "answer": features.encode_answer([(shard, "w1", 0.25)], clean=True),
+        "answer": features.encode_answer([(_done(rows, 0, 2), "w1", 0.25)], clean=True),
     }
 
 
@@ -71,8 +72,14 @@ def _sighting(camera: Camera = _RADIAL) -> Sighting:
     return Sighting(camera, state, np.eye(13) / 64, pixels, 0.5, 0.25, 1.0)
 
 
-def _ramp(*shape: int) -> np.ndarray:
-    return np.arange(float(np.prod(shape))).reshape(shape) / 8
+def _done(ask: bytes, first: int, last: int) -> bytes:
+    return job.do(features.encode_shard(Shard(ask, first, last)))
+
+
+def _stored(shard: bytes) -> bytes:
+    """The same features, with the rows in shared memory."""
+    done = features.decode_shard_done(shard)
+    return features.encode_shard_done(ShardDone(done.first, done.last, done.y, stored=True))
 
 
 def _plain(content: Any, name: str = "") -> Any:

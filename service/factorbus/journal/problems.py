@@ -50,7 +50,8 @@ class JournalDamaged(Problem):
     def __init__(self, where: Path, what: str) -> None:
         super().__init__(
             f"the journal {where} is damaged: {what}; nothing was changed. `factorbus journal check` says more; "
-            "restore the folder from a copy or `factorbus import` an exported file",
+            "restore the folder from a copy and start the service again, or give the map up with `factorbus drop MAP "
+            "--damaged` and `factorbus import` an exported file",
             what=what,
         )
 

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from factorbus.proto.keys import PREFIX
+from factorbus.proto.keys import ANY_SERVICE_OF_ANY_VERSION, PREFIX
 from factorbus.service.config import BadConfig
 
 ROLES = ("front_end", "viewer", "worker", "operator", "service", "router")
@@ -127,18 +127,19 @@ def _front_end(grant: Grant) -> Iterator[Rule]:
     yield from _inserts(grant)
     yield from _follows(grant)
     yield from _exchange(f"{PREFIX}/features/*/ask")
-    yield from _sees(f"{PREFIX}/features/*/live")
+    yield from _sees(f"{PREFIX}/features/*/live", ANY_SERVICE_OF_ANY_VERSION)
 
 
 def _viewer(grant: Grant) -> Iterator[Rule]:
     yield from _follows(grant)
+    yield from _sees(ANY_SERVICE_OF_ANY_VERSION)
 
 
 def _operator(grant: Grant) -> Iterator[Rule]:
     yield from _exchange(f"{PREFIX}/admin/*")
     yield from _inserts(grant)
     yield from _follows(grant)
-    yield from _sees(f"{PREFIX}/features/*/live", f"{PREFIX}/worker/*/live/*")
+    yield from _sees(f"{PREFIX}/features/*/live", f"{PREFIX}/worker/*/live/*", ANY_SERVICE_OF_ANY_VERSION)
 
 
 def _worker(grant: Grant) -> Iterator[Rule]:

@@ -39,8 +39,24 @@ class MapExists(Problem):
 
     code = "map_exists"
 
+    def __init__(self, name: str, state: str = "open") -> None:
+        what, way = f"a map {name!r} already", "drop it"
+        if state != "open":
+            what = f"a map {name!r} on disk, which does not open ({state})"
+            way = f"`factorbus drop {name} --damaged` gives it up"
+        super().__init__(f"there is {what}; {way}, or give the new one another name", map=name, state=state)
+
+
+class NotDamaged(Problem):
+    """A map that was to be given up for being damaged is open."""
+
+    code = "not_damaged"
+
     def __init__(self, name: str) -> None:
-        super().__init__(f"there is a map {name!r} already; drop it, or give the new one another name", map=name)
+        super().__init__(
+            f"map {name!r} is open, so it is not damaged, and was not dropped; to drop an open map leave out `damaged`",
+            map=name,
+        )
 
 
 class KeptElsewhere(Problem):
@@ -84,13 +100,25 @@ def read_create(payload: bytes) -> tuple[str, str]:
     return _map_name(content, "create"), mode
 
 
-def read_drop(payload: bytes) -> tuple[str, int | None]:
-    """(map, revision) of an admin/drop; the revision is None if any will do.  Raises BadMessage, BadName, TooLarge."""
+class Drop(NamedTuple):
+    """Map `name` is to go: whatever revision it has, or only at this one; or only if it does not open (`damaged`)."""
+
+    name: str
+    revision: int | None = None
+    damaged: bool = False
+
+
+def read_drop(payload: bytes) -> Drop:
+    """What an admin/drop asks for.  Raises BadMessage, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="drop")
-    revision = content.get("revision")
+    revision, damaged = content.get("revision"), content.get("damaged", False)
     if revision is not None and (type(revision) is not int or revision < 0):
         raise BadMessage("drop.revision", f"is {revision!r:.40}", "a revision, from 0")
-    return _map_name(content, "drop"), revision
+    if type(damaged) is not bool:
+        raise BadMessage("drop.damaged", f"is {damaged!r:.40}", "true or false")
+    if damaged and revision is not None:
+        raise BadMessage("drop.revision", f"is {revision}", "none with `damaged`: what does not open has no revision")
+    return Drop(_map_name(content, "drop"), revision, damaged)
 
 
 def read_fork(payload: bytes) -> Fork:

@@ -23,6 +23,7 @@ from typing import Any
 
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Busy, Internal, Problem
+from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
 from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.arrival import read_insert
@@ -94,8 +95,7 @@ def _serve(
         shell = Shell(bus, config, library)
         shell.vitals.chapters["cores"] = cores.account
         try:
-            for name in config.create:
-                shell.maps.create(name, None)
+            shell.maps.create_all(config.create)
             shell.vitals.health.open = True
             shell.tick()  # so that the first who asks is told of all maps
             endpoints = bus.endpoints()
@@ -124,11 +124,14 @@ class Shell:
         lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
+        self.vitals.chapters["protocol"] = known
+        self.vitals.chapters["unopened"] = self.maps.unopened
         self._worker_rows: list[dict[str, Any]] = []
         self.vitals.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()
         self._jobs = Jobs(self._desk, bus.send_job)
-        self._trips = Trips(self._desk, bus.send_job, self._jobs.heard)
+        self.vitals.chapters["wrong_answers"] = lambda: self._jobs.wrong_answers
+        self._trips = Trips(self._desk, bus.send_job, self._jobs)
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = Features(
@@ -234,6 +237,7 @@ class Shell:
         return {
             "service": self._service,
             "version": __version__,
+            "protocol": known(),
             "kernels_compiled_s": compiled_seconds(),
             "workers": self._worker_rows,
         }
@@ -256,18 +260,18 @@ class Shell:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
         try:
             if operation == "maps":
-                rows = [host.core.row() for host in self.maps.hosts().values()]
-                self._delivery.answer(
-                    query, codec.encode_map({"maps": rows, "service": self._service, "version": __version__})
-                )
+                told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
+                self._delivery.answer(query, codec.encode_map(told))
             elif operation == "stats":
                 self._delivery.answer(query, codec.encode_map(self.vitals.account()))
             elif operation == "create":
-                self._delivery.answer(query, codec.encode_map(self.maps.create(*read_create(payload))))
+                self._delivery.answer(
+                    query, codec.encode_map(self.maps.create(*read_create(payload)) | {"protocol": known()})
+                )
             elif operation == "fork":
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
-                self.maps.drop(query, *read_drop(payload))
+                self.maps.drop(query, read_drop(payload))
             else:
                 ignore(query)  # somebody else's key
         except NotHere as problem:
@@ -283,7 +287,7 @@ class Shell:
             self._delivery.refuse(query, Internal(reference))
 
     def _look_for_workers(self) -> None:
-        self._trips.look_for(self._jobs.suspects)
+        self._trips.look_for(self._jobs.suspects, self._jobs.distrusted)
         self._worker_rows = [row | self._trips.row(row["name"]) for row in self._jobs.workers()]
 
     def _refuse_if_kept_elsewhere(self, tokens: str) -> None:

@@ -22,6 +22,7 @@ from factorbus.proto.problems import Problem, Unavailable
 from factorbus.service.config import BadConfig, Config
 from factorbus.service.events import Asker
 from factorbus.service.exposure import refuse_exposed
+from factorbus.service.job_check import WrongAnswer
 from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE, zenoh_settings
 
 log = logging.getLogger(__name__)
@@ -222,4 +223,4 @@ def _job_result(reply: zenoh.Reply, silence: Problem) -> Any:
         payload = reply.err.payload.to_bytes() if reply.err is not None else b""
         return silence if payload == _TIMED_OUT else codec.decode_problem(payload)
     except Problem as unreadable:
-        return unreadable
+        return WrongAnswer(f"sent what cannot be read: {unreadable.message}")

@@ -84,6 +84,7 @@ class MapCore:
             "revision": self.revision,
             "variables": self.variables,
             "factors": self.factors,
+            "state": "blocked" if self._admission.blocked else "open",
         }
 
     def created(self) -> list[Effect]:

@@ -8,10 +8,14 @@ every sending has a tag of its own, and an answer to any but the latest is dropp
 
 A worker that did not answer in time is a suspect: it may be frozen, and would cost every job that it is given another
 deadline.  It gets nothing more until it is heard of again, in whatever way the shell finds out.
+
+A worker whose answer cannot be right is distrusted: it gets nothing for a while, and its job goes to another one.  What
+a worker says against the job itself (a refusal), and an answer that is doubtful, is not believed: the job is done in
+place, and that decides; if it can be done, the worker is distrusted.
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, TypeAlias
@@ -19,8 +23,8 @@ from typing import Any, TypeAlias
 from factorbus.proto.messages import Job, JobDone
 
 TRIES = 3
-# A worker's word for "not my fault as a job": another worker, or a later try, may well succeed.
-_TRY_ANOTHER = frozenset({"internal", "shutting_down", "busy", "unknown_kind", "too_large"})
+# Codes with which a worker says nothing about the job: another worker, or a later try, may well succeed.
+_TRY_ANOTHER = frozenset({"internal", "shutting_down", "busy", "unknown_kind", "too_large", "unavailable"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,16 @@ class Ended:
     tries: int = field(default=1, compare=False)
 
 
-Effect: TypeAlias = Send | InPlace | Ended
+@dataclass(frozen=True, slots=True)
+class Distrusted:
+    """`worker` gets no job until it is `trusted` again.  times: how often it has come to that since it joined."""
+
+    worker: str
+    why: str
+    times: int
+
+
+Effect: TypeAlias = Send | InPlace | Ended | Distrusted
 IN_PLACE = "in-place"
 
 
@@ -62,14 +75,26 @@ class _Worker:
     slots: int
     tags: set[int] = field(default_factory=set)
     suspect: bool = False
+    distrusted: bool = False
+    wrong: int = 0  # answers
+    times: int = 0  # distrusted
+    cannot: set[str] = field(default_factory=set)  # kinds of jobs
+
+    def takes(self, kind: str) -> bool:
+        """Whether it is to get jobs of `kind`."""
+        return not (self.suspect or self.distrusted or kind in self.cannot)
 
 
 @dataclass(slots=True)
 class _Open:
-    """A job that is not done: where it was tried, and where it is (tag 0: waiting for a slot)."""
+    """A job that is not done: where it was tried, and where it is (tag 0: waiting for a slot).
+
+    doubted: by worker, what it said that doing the job in place is to decide.
+    """
 
     job: Job
     ahead: int
+    doubted: dict[str, str] = field(default_factory=dict)
     tried: set[str] = field(default_factory=set)
     tries: int = 0
     tag: int = 0
@@ -84,21 +109,20 @@ class Dispatch:
         self._by_tag: dict[int, tuple[str, str]] = {}  # tag -> (job, worker)
         self._waiting: deque[str] = deque()
         self._tags = count(1)
+        self.wrong_answers = 0  # of all workers, since this began
 
     @property
     def open_jobs(self) -> int:
         """Jobs that are not done."""
         return len(self._jobs)
 
-    @property
-    def slots(self) -> int:
-        """Jobs that the workers which are not suspect take at a time."""
-        return sum(worker.slots for worker in self._workers.values() if not worker.suspect)
+    def slots(self, kind: str) -> int:
+        """Jobs of `kind` that workers take at a time now."""
+        return sum(worker.slots for worker in self._workers.values() if worker.takes(kind))
 
-    @property
-    def free(self) -> int:
-        """Jobs that would be begun at once."""
-        idle = sum(max(0, worker.slots - len(worker.tags)) for worker in self._workers.values() if not worker.suspect)
+    def free(self, kind: str) -> int:
+        """Jobs of `kind` that would be begun at once."""
+        idle = sum(max(0, w.slots - len(w.tags)) for w in self._workers.values() if w.takes(kind))
         return max(0, idle - len(self._waiting))
 
     @property
@@ -106,9 +130,17 @@ class Dispatch:
         """Workers that did not answer in time and have not been heard of since."""
         return [name for name, worker in self._workers.items() if worker.suspect]
 
+    @property
+    def distrusted(self) -> list[str]:
+        """Workers that get nothing at the moment because of what they answered."""
+        return [name for name, worker in self._workers.items() if worker.distrusted]
+
     def table(self) -> list[dict[str, Any]]:
-        """Who works here: rows of name, slots and jobs in flight."""
-        return [{"name": n, "slots": w.slots, "in_flight": len(w.tags)} for n, w in sorted(self._workers.items())]
+        """Who works here: rows of name, slots, jobs in flight, wrong answers, and whether it is distrusted."""
+        return [
+            {"name": n, "slots": w.slots, "in_flight": len(w.tags), "wrong": w.wrong, "distrusted": w.distrusted}
+            for n, w in sorted(self._workers.items())
+        ]
 
     def joined(self, worker: str, slots: int) -> list[Effect]:
         """A worker announced itself; one that was known came back, and has forgotten its jobs."""
@@ -142,25 +174,73 @@ class Dispatch:
             self._waiting.remove(job)
 
     def done(self, tag: int, done: JobDone) -> list[Effect]:
-        """The sending `tag` was answered."""
+        """The sending `tag` was answered, and the answer has been checked."""
         job, worker = self._release(tag)
         if not self._is_latest(job, tag):
             return self._place_waiting()
-        tries = self._jobs.pop(job).tries
-        return [Ended(job, worker, done, tries), *self._place_waiting()]
+        found = self._jobs.pop(job)
+        doubted = found.doubted.items() if worker == IN_PLACE else ()
+        return [*self._distrust(doubted), Ended(job, worker, done, found.tries), *self._place_waiting()]
 
     def failed(self, tag: int, problem: Any) -> list[Effect]:
         """The sending `tag` was refused, timed out or came to nothing."""
         job, worker = self._by_tag.get(tag, ("", ""))
-        if problem.code == "unavailable" and worker in self._workers:
-            self._workers[worker].suspect = True
-        retry = worker != IN_PLACE and problem.code in _TRY_ANOTHER | {"unavailable"}
-        if retry or not self._is_latest(job, tag):
+        known = self._workers.get(worker)
+        if known is not None and problem.code == "unavailable":
+            known.suspect = True
+        if known is not None and problem.code == "unknown_kind" and job in self._jobs:
+            known.cannot.add(self._jobs[job].job.kind)
+        if worker != IN_PLACE and problem.code not in _TRY_ANOTHER:
+            return self.doubted(tag, f"refused the job, which can be done: {problem.message} [{problem.code}]")
+        if worker != IN_PLACE or not self._is_latest(job, tag):
             self._again(tag)
             return self._place_waiting()
         self._release(tag)
         tries = self._jobs.pop(job).tries
         return [Ended(job, worker, problem, tries), *self._place_waiting()]
+
+    def doubted(self, tag: int, why: str) -> list[Effect]:
+        """What the sending `tag` came to is not believed: the job is done in place next, and that decides."""
+        job, worker = self._by_tag.get(tag, ("", ""))
+        if self._is_latest(job, tag):
+            self._jobs[job].doubted[worker] = why
+        self._again(tag)
+        return self._place_waiting()
+
+    def wrong(self, tag: int, why: str) -> list[Effect]:
+        """The answer to the sending `tag` cannot be right."""
+        worker = self._by_tag.get(tag, ("", ""))[1]
+        self._again(tag)
+        return [*self._distrust([(worker, why)]), *self._place_waiting()]
+
+    def distrust(self, worker: str, why: str) -> list[Effect]:
+        """`worker` answered wrongly, to something that is no job of anybody's."""
+        return self._distrust([(worker, why)])
+
+    def trusted(self, worker: str) -> list[Effect]:
+        """`worker` has been distrusted for long enough."""
+        if worker in self._workers:
+            self._workers[worker].distrusted = False
+        return self._place_waiting()
+
+    def cannot(self, worker: str, kind: str) -> None:
+        """`worker` does no jobs of `kind`."""
+        if worker in self._workers:
+            self._workers[worker].cannot.add(kind)
+
+    def _distrust(self, wrong: Iterable[tuple[str, str]]) -> list[Effect]:
+        """Count the wrong answers (worker, why); who had been trusted until now is not any more."""
+        effects: list[Effect] = []
+        for name, why in wrong:
+            self.wrong_answers += 1
+            worker = self._workers.get(name)
+            if worker is None:  # it has left
+                continue
+            worker.wrong += 1
+            if not worker.distrusted:
+                worker.distrusted, worker.times = True, worker.times + 1
+                effects.append(Distrusted(name, why, worker.times))
+        return effects
 
     def _is_latest(self, job: str, tag: int) -> bool:
         return job in self._jobs and self._jobs[job].tag == tag
@@ -193,10 +273,12 @@ class Dispatch:
     def _place(self, found: _Open) -> Effect | None:
         """Where it goes now; None: it waits for a slot."""
         untried: Mapping[str, _Worker] = {
-            name: worker for name, worker in self._workers.items() if name not in found.tried and not worker.suspect
+            name: worker
+            for name, worker in self._workers.items()
+            if name not in found.tried and worker.takes(found.job.kind)
         }
         tag = next(self._tags)
-        if found.tries >= TRIES or not untried:
+        if found.doubted or found.tries >= TRIES or not untried:
             worker, effect = IN_PLACE, InPlace(tag, found.job)
         else:
             free = [name for name, worker in untried.items() if len(worker.tags) < worker.slots + found.ahead]

@@ -107,7 +107,7 @@ class Features:
                 raise ShuttingDown
             ask = decode_ask(payload, self._limits)
             work, rates = work_of(ask), self._rates or self.measure()
-            count = shards_for(work, rates, self._trips.known, self._jobs.slots)
+            count = shards_for(work, rates, self._trips.known, self._jobs.slots("idp"))
             if count == 0:
                 self._here(asker, payload, ask.sighting.count)
                 return
@@ -138,7 +138,7 @@ class Features:
             return
         self._open += 1
         # Into no more shards than are begun at once: a shard that waits only repeats what every shard does.
-        count = min(cutting.most, max(1, self._jobs.free))
+        count = min(cutting.most, max(1, self._jobs.free("idp")))
         deadline_s = min(self._deadline_s, _BESIDES_S + _PATIENCE * seconds(cutting.work, cutting.rates, count))
         shards = [Shard(cutting.payload, first, last) for first, last in cuts(cutting.ask, count)]
         question = _Question(asker, [None] * len(shards))

@@ -1,6 +1,7 @@
 """Jobs on their way: to a worker, to the next one when that fails, in place when there is none, and back.
 
-Everything here runs on one lane (the desk); workers and the in-place threads only hand their results to it.
+Everything here runs on one lane (the desk); workers and the in-place threads only hand their results to it.  No answer
+of a worker is passed on unchecked; what takes long to check is checked on a lane of its own.
 """
 
 import logging
@@ -13,11 +14,15 @@ from typing import Any, TypeAlias
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable
 from factorbus.service import inplace
-from factorbus.service.dispatch import Dispatch, Effect, Ended, InPlace, Send
+from factorbus.service.dispatch import Dispatch, Distrusted, Effect, Ended, InPlace, Send
+from factorbus.service.job_check import DoubtfulAnswer, WrongAnswer, is_quick, judged
 from factorbus.service.lane import Lane
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
+
+# For how long a worker that answered wrongly gets no job: the first time, and at most; it doubles.
+_DISTRUST_S = (60.0, 3600.0)
 
 # send(worker, job, deadline_s, done): done gets a JobDone or a problem, once, on any thread.
 SendJob: TypeAlias = Callable[[str, Job, float, Callable[[Any], None]], None]
@@ -39,16 +44,26 @@ class Jobs:
         self._dispatch = Dispatch()
         self._open: dict[str, _Open] = {}
         self._in_place: dict[str, Lane] = {}  # by kind, started when first needed
+        self._checks: Lane | None = None  # for answers that take long to check, started when first needed
+        self._until: dict[str, float] = {}  # by worker that is distrusted
+
+    def slots(self, kind: str) -> int:
+        """Jobs of `kind` that workers take at a time now."""
+        return self._dispatch.slots(kind)
+
+    def free(self, kind: str) -> int:
+        """Jobs of `kind` that a worker would begin at once."""
+        return self._dispatch.free(kind)
 
     @property
-    def slots(self) -> int:
-        """Jobs that workers take at a time now."""
-        return self._dispatch.slots
+    def wrong_answers(self) -> int:
+        """Answers of workers that were wrong, since the service began."""
+        return self._dispatch.wrong_answers
 
     @property
-    def free(self) -> int:
-        """Jobs that a worker would begin at once."""
-        return self._dispatch.free
+    def distrusted(self) -> list[str]:
+        """Workers that get nothing at the moment because of what they answered."""
+        return self._dispatch.distrusted
 
     @property
     def suspects(self) -> list[str]:
@@ -56,22 +71,32 @@ class Jobs:
         return self._dispatch.suspects
 
     def workers(self) -> list[dict[str, Any]]:
-        """Who works here: rows of name, slots and jobs in flight."""
+        """Who works here: rows of name, slots, jobs in flight, wrong answers, and whether it is distrusted."""
         return self._dispatch.table()
 
     def joined(self, worker: str, slots: int) -> None:
-        """A worker announced itself."""
+        """A worker announced itself; who was distrusted and begins anew is trusted."""
+        self._until.pop(worker, None)
         log.info("worker %s joined with %d slots", worker, slots, extra={"worker": worker})
         self._perform(self._dispatch.joined(worker, slots))
 
     def left(self, worker: str) -> None:
         """A worker is gone."""
+        self._until.pop(worker, None)
         log.info("worker %s left", worker, extra={"worker": worker})
         self._perform(self._dispatch.left(worker))
 
     def heard(self, worker: str) -> None:
         """A worker that was silent answers again."""
         self._perform(self._dispatch.heard(worker))
+
+    def distrust(self, worker: str, why: str) -> None:
+        """A worker answered a probe wrongly."""
+        self._perform(self._dispatch.distrust(worker, why))
+
+    def cannot(self, worker: str, kind: str) -> None:
+        """A worker does no jobs of `kind`."""
+        self._dispatch.cannot(worker, kind)
 
     def submit(
         self,
@@ -92,8 +117,12 @@ class Jobs:
         self._perform(self._dispatch.submit(job, ahead))
 
     def tick(self) -> None:
-        """Give up what has taken too long."""
+        """Give up what has taken too long, and try again whoever has been distrusted for long enough."""
         now = time.monotonic()
+        for worker in [worker for worker, until in self._until.items() if until < now]:
+            del self._until[worker]
+            log.info("worker %s gets jobs again", worker, extra={"worker": worker})
+            self._perform(self._dispatch.trusted(worker))
         for job in [job for job, found in self._open.items() if found.until < now]:
             late = self._open[job].timeout_s
             self._give_up(job, Unavailable("the job", late, "allow more with timeout_s or add workers"))
@@ -113,19 +142,51 @@ class Jobs:
             match effect:
                 case Send(tag, worker, job):
                     deadline_s = self._open[job.job].deadline_s
-                    self._send(worker, job, deadline_s, lambda r, t=tag: self._desk.hand(self._came, t, r))
+                    self._send(worker, job, deadline_s, lambda r, t=tag, j=job: self._answered(t, j, r))
                 case InPlace(tag, job):
                     lane = self._in_place.get(job.kind) or Lane(f"in-place {job.kind}")
                     self._in_place[job.kind] = lane
                     lane.hand(self._do_in_place, tag, job)
                 case Ended():
                     self._open.pop(effect.job).ended(effect)
+                case Distrusted():
+                    self._distrusted(effect)
+
+    def _distrusted(self, effect: Distrusted) -> None:
+        first_s, longest_s = _DISTRUST_S
+        seconds = min(first_s * 2.0 ** (effect.times - 1), longest_s)
+        self._until[effect.worker] = time.monotonic() + seconds
+        log.warning(
+            "worker %s %s; it gets no job for %g s, and what it had is done elsewhere: mend it and start it again",
+            effect.worker, effect.why, seconds, extra={"worker": effect.worker},
+        )  # fmt: skip
+
+    def _answered(self, tag: int, job: Job, result: JobDone | Any) -> None:
+        """On any thread."""
+        if not isinstance(result, JobDone):
+            self._desk.hand(self._came, tag, result)
+        elif is_quick(result):
+            self._desk.hand(self._judge, tag, job, result)
+        else:
+            self._desk.hand(self._hand_to_checks, tag, job, result)
+
+    def _hand_to_checks(self, tag: int, job: Job, result: JobDone) -> None:
+        self._checks = self._checks or Lane("checks")
+        self._checks.hand(lambda: self._desk.hand(self._came, tag, judged(job, result)))
+
+    def _judge(self, tag: int, job: Job, result: JobDone) -> None:
+        self._came(tag, judged(job, result))
 
     def _came(self, tag: int, result: JobDone | Any) -> None:
         if isinstance(result, JobDone):
-            self._perform(self._dispatch.done(tag, result))
+            effects = self._dispatch.done(tag, result)
+        elif isinstance(result, DoubtfulAnswer):
+            effects = self._dispatch.doubted(tag, result.message)
+        elif isinstance(result, WrongAnswer):
+            effects = self._dispatch.wrong(tag, result.message)
         else:
-            self._perform(self._dispatch.failed(tag, result))
+            effects = self._dispatch.failed(tag, result)
+        self._perform(effects)
 
     def _do_in_place(self, tag: int, job: Job) -> None:
         """On an in-place lane."""

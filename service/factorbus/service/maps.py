@@ -7,14 +7,25 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from factorbus.journal.problems import JournalFailed
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, ShuttingDown, TooLarge, UnknownMap
-from factorbus.service.admin import Fork, KeptElsewhere, MapExists, NotHere, OtherMode, ours, settled_mode
+from factorbus.proto.protocol import known
+from factorbus.service.admin import (
+    Drop,
+    Fork,
+    KeptElsewhere,
+    MapExists,
+    NotDamaged,
+    NotHere,
+    OtherMode,
+    ours,
+    settled_mode,
+)
 from factorbus.service.bus import Bus, Place
 from factorbus.service.config import Config
 from factorbus.service.core import MapCore
@@ -30,6 +41,8 @@ from factorbus.service.questions import Copied, Question, Snapshot
 from factorbus.service.reordering import Reordering
 
 log = logging.getLogger(__name__)
+
+_STATES = {"journal_damaged": "damaged", "journal_differs": "differs", "journal_version": "other_version"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +74,7 @@ class Maps:
         self._delivery, self._desk, self._memory = delivery, desk, memory
         self._maps: dict[str, Owned] = {}
         self._leaving: list[Owned] = []
-        self._unopened: dict[str, Problem] = {}  # that are on disk and cannot be trusted
+        self._unopened: dict[str, Problem] = {}  # that are on disk and do not open
         self._forks: dict[str, Fork] = {}  # what maps were forked from, since this service began
         self._stopping = False
         self._seat = threading.Lock()  # of the one callback that may solve
@@ -73,6 +86,18 @@ class Maps:
     def hosts(self) -> dict[str, Host]:
         """All there are, by name."""
         return {name: found.host for name, found in list(self._maps.items())}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """What admin/maps says: of those that are open, and of those that are on disk and do not open."""
+        return [host.core.row() for host in self.hosts().values()] + self.unopened()
+
+    def unopened(self) -> list[dict[str, Any]]:
+        """Rows of the maps that are on disk and do not open; `code` and `problem` say why."""
+        nothing = {"mode": "", "epoch": 0, "revision": 0, "variables": 0, "factors": 0}
+        return [
+            {"name": name, **nothing, "state": _state(problem), "code": problem.code, "problem": problem.message}
+            for name, problem in list(self._unopened.items())
+        ]
 
     def missing(self, name: str) -> Problem | None:
         """What to say of a map that is not here; None: at a router, somebody else may have it."""
@@ -107,6 +132,12 @@ class Maps:
         self._check_room()
         return self._open(name, self._make(name, settled_mode(mode or "auto")))
 
+    def create_all(self, names: Iterable[str]) -> None:
+        """Have maps of these names; one that is on disk and does not open keeps the others from nothing."""
+        for name in names:
+            if name not in self._unopened:
+                self.create(name, None)
+
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
         found = self._maps.get(fork.source)
@@ -132,12 +163,21 @@ class Maps:
             self._delivery.refuse(asker, problem)
             return
         self._forks[asked.fork.target] = asked.fork
-        self._delivery.answer(asker, codec.encode_map(row))
+        self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         self._desk.hand(give_back)
 
-    def drop(self, asker: Asker, name: str, revision: int | None) -> None:
-        """Drop map `name`, if it is at `revision`, and answer when it is gone.  Raises MovedOn; what is `missing`."""
+    def drop(self, asker: Asker, drop: Drop) -> None:
+        """Drop a map as `drop` says, and answer when it is gone.
+
+        Raises MovedOn, NotDamaged, JournalFailed; what is `missing`.
+        """
+        name, revision, damaged = drop
         found = self._maps.get(name)
+        if damaged and found is not None:
+            raise NotDamaged(name)
+        if damaged and name in self._unopened and self._library is not None:
+            self._give_up(asker, name, self._library)
+            return
         if found is None:
             raise self.missing(name) or NotHere(name, self._config.maps)
 
@@ -155,6 +195,13 @@ class Maps:
         self._forks.pop(name, None)
         self._leaving.append(found)
         found.place.withdraw()
+
+    def _give_up(self, asker: Asker, name: str, library: Library) -> None:
+        """Remove what is on disk of a map that does not open.  Raises JournalFailed."""
+        library.remove(name)
+        problem = self._unopened.pop(name)
+        log.warning("map %s given up: %s", name, problem, extra={"map": name})
+        self._delivery.answer(asker, codec.encode_map({}))
 
     def show(self, changed: set[str], stuck: set[str]) -> None:
         """Alive means askable: while its solver is stuck, a map has no token."""
@@ -240,7 +287,9 @@ class Maps:
         """The same, and KeptElsewhere, MapExists where none of this name can."""
         if not ours(self._config.maps, name):
             raise KeptElsewhere(name, self._config.maps)
-        if name in self._maps or name in self._unopened or any(name == gone.host.core.name for gone in self._leaving):
+        if problem := self._unopened.get(name):
+            raise MapExists(name, _state(problem))
+        if name in self._maps or any(name == gone.host.core.name for gone in self._leaving):
             raise MapExists(name)
         if self._library is not None and self._library.is_taken(name):
             raise MapExists(name)
@@ -250,7 +299,8 @@ class Maps:
         """Whether this very fork has been made: whoever asks again is answered again."""
         done = bool(fork.request) and self._forks.get(fork.target) == fork
         if done:
-            self._delivery.answer(asker, codec.encode_map(self._maps[fork.target].host.core.row()))
+            row = self._maps[fork.target].host.core.row()
+            self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         return done
 
     def _split(self, asked: _Forking, taken: Snapshot) -> Owned:
@@ -300,3 +350,8 @@ class Maps:
         self._desk.hand(stop)
         reached.wait()
         return list(self._maps.values())
+
+
+def _state(problem: Problem) -> str:
+    """In a word, why a map does not open."""
+    return _STATES.get(problem.code, "unreadable")

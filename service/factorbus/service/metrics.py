@@ -93,6 +93,7 @@ def families(account: Mapping[str, Any]) -> Iterator[Family]:
     yield _one("pieces", "counter", "Pieces of eliminations made on other cores than the map's own", cores["pieces"])
     yield from _of_workers(account.get("workers", ()))
     yield from _of_maps(account["maps"])
+    yield _one("maps_unopened", "gauge", "Maps on disk that do not open", len(account.get("unopened", ())))
     yield from _extra("journal", "", {"": account.get("journal", {})})
 
 
@@ -106,6 +107,10 @@ def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     ):
         samples = {row["name"]: row[name] for row in rows if name in row}
         yield _by(f"worker_{name}", "gauge", what, "worker", samples)
+    wrong = {row["name"]: row["wrong"] for row in rows if "wrong" in row}
+    yield _by("worker_wrong_answers", "counter", "Answers of it that could not be right", "worker", wrong)
+    distrusted = {row["name"]: row["distrusted"] for row in rows if "distrusted" in row}
+    yield _by("worker_distrusted", "gauge", "1 while it gets no jobs because of that", "worker", distrusted)
 
 
 _GAUGES = {

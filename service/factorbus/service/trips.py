@@ -1,18 +1,20 @@
 """What the way to each worker takes: measured when it joins, with jobs too small to matter.  For the desk.
 
-One that does not answer is asked again and again until it does.
+One that does not answer is asked again and again until it does.  One that does no jobs of kind `idp` says so once, and
+has no way to measure; one that answers wrongly is distrusted, as with any job.
 """
 
 import logging
 import secrets
 import time
-from collections.abc import Callable
 from typing import Any
 
 from factorbus.proto.features import Shard, answer_size
 from factorbus.proto.features_codec import encode_ask, encode_shard
 from factorbus.proto.messages import Job, JobDone
-from factorbus.service.jobs import SendJob
+from factorbus.proto.problems import UnknownKind
+from factorbus.service.job_check import WrongAnswer, judged
+from factorbus.service.jobs import Jobs, SendJob
 from factorbus.service.lane import Lane
 from factorbus.service.rates import example
 from factorbus.service.sharding import Trip
@@ -27,9 +29,10 @@ _DEADLINE_S = 2.0
 class Trips:
     """The ways to the workers of one service."""
 
-    def __init__(self, desk: Lane, send: SendJob, heard: Callable[[str], None]) -> None:
-        self._desk, self._send, self._heard = desk, send, heard
+    def __init__(self, desk: Lane, send: SendJob, jobs: Jobs) -> None:
+        self._desk, self._send, self._jobs = desk, send, jobs
         self._here: set[str] = set()
+        self._other: set[str] = set()  # of these, those that do other kinds of jobs
         self._asked: set[str] = set()  # of these, those that have not answered yet
         self._known: dict[str, Trip] = {}
         self._payloads = {n: _payload(n) for n in (_SMALL, _LARGE)}
@@ -47,21 +50,23 @@ class Trips:
     def joined(self, worker: str) -> None:
         """Measure the way to a worker that is new here."""
         self._here.add(worker)
+        self._other.discard(worker)
         self._known.pop(worker, None)
         self._ask(worker, _ALL, {})
 
     def left(self, worker: str) -> None:
         """Forget it."""
         self._here.discard(worker)
+        self._other.discard(worker)
         self._known.pop(worker, None)
 
-    def look_for(self, suspects: list[str]) -> None:
+    def look_for(self, suspects: list[str], distrusted: list[str]) -> None:
         """Time went by: ask again whoever could not be measured, and ask suspects for a sign."""
-        for worker in self._here - self._asked:
-            if worker not in self._known:
-                self._ask(worker, _ALL, {})
-            elif worker in suspects:
+        for worker in self._here - self._asked - set(distrusted):
+            if worker in suspects:
                 self._ask(worker, (_SMALL,), {})
+            elif worker not in self._known and worker not in self._other:
+                self._ask(worker, _ALL, {})
 
     def _ask(self, worker: str, sizes: tuple[int, ...], took: dict[int, float]) -> None:
         """Send the first of `sizes`, and when it is answered the others, one after the other."""
@@ -69,18 +74,33 @@ class Trips:
         sent = time.perf_counter()
 
         def done(result: Any) -> None:
-            way = time.perf_counter() - sent - (result.seconds if isinstance(result, JobDone) else 0.0)
-            self._desk.hand(self._came, worker, sizes, took, result, way)
+            there_s = result.seconds if isinstance(result, JobDone) else 0.0
+            way = max(0.0, time.perf_counter() - sent - there_s)
+            self._desk.hand(self._came, worker, sizes, took, job, result, way)
 
         job = Job(f"probe-{secrets.token_hex(4)}", "idp", self._payloads[sizes[0]])
         self._send(worker, job, _DEADLINE_S, done)
 
-    def _came(self, worker: str, sizes: tuple[int, ...], took: dict[int, float], result: Any, way: float) -> None:
+    def _came(
+        self, worker: str, sizes: tuple[int, ...], took: dict[int, float], job: Job, result: Any, way: float
+    ) -> None:
         self._asked.discard(worker)
-        if not isinstance(result, JobDone) or worker not in self._here:
-            log.debug("no sign of worker %s: %s", worker, result)
+        if worker not in self._here:
             return
-        self._heard(worker)
+        answer = judged(job, result) if isinstance(result, JobDone) else result
+        if isinstance(answer, WrongAnswer):
+            self._known.pop(worker, None)
+            self._jobs.distrust(worker, answer.message)
+            return
+        if getattr(answer, "code", "") == UnknownKind.code:
+            self._other.add(worker)
+            self._jobs.cannot(worker, job.kind)
+            self._jobs.heard(worker)
+            return
+        if not isinstance(answer, JobDone):
+            log.debug("no sign of worker %s: %s", worker, answer)
+            return
+        self._jobs.heard(worker)
         took[sizes[0]] = min(took.get(sizes[0], way), way)
         if len(sizes) > 1:
             self._ask(worker, sizes[1:], took)

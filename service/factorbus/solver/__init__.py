@@ -11,6 +11,7 @@
 from factorbus.solver import errors
 from factorbus.solver.batch import BatchResult, solve_batch
 from factorbus.solver.errors import SolverError
+from factorbus.solver.evaluate import chi2_at
 from factorbus.solver.fingerprint import fingerprint
 from factorbus.solver.groups import FactorGroup, Group
 from factorbus.solver.kernels._jit import compiled_seconds
@@ -27,6 +28,7 @@ __all__ = [
     "Solver",
     "SolverError",
     "StepReport",
+    "chi2_at",
     "compiled_seconds",
     "errors",
     "fingerprint",

@@ -1,0 +1,128 @@
+"""A service of another major version is told apart from silence; of a service of ours, what it knows is asked first."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from faulty.service import MAP, Service, _peer, endpoint_in
+
+from factorbus.client import Changes, Draft, connect
+from factorbus.client.bus import Bus
+from factorbus.proto.camera import Camera
+from factorbus.proto.problems import NotSupported, OtherProtocol, Unavailable
+from factorbus.proto.protocol import known
+
+pytestmark = pytest.mark.timeout(60)
+CAMERA = Camera("pinhole", (400.0, 400.0, 320.0, 240.0))
+
+
+@contextmanager
+def someone_of(version: str, folder: Path) -> Iterator[None]:
+    """A service of another version: all that we know of it is where its token is."""
+    with zenoh.open(_peer(folder)) as session:
+        token = session.liveliness().declare_token(f"factorbus/{version}/features/s/live")
+        yield
+        token.undeclare()
+
+
+ASKS: dict[str, Callable[[Bus], object]] = {
+    "map": lambda bus: bus.map("m", mirror=False),
+    "existing": lambda bus: bus.map("m", create=False),
+    "maps": lambda bus: bus.maps(),
+    "stats": lambda bus: bus.stats(),
+    "drop": lambda bus: bus.drop("m"),
+    "features": lambda bus: bus.features(CAMERA).factor(np.zeros(13), np.eye(13), np.zeros((1, 2))),
+}
+
+
+@pytest.mark.parametrize("ask", ASKS)
+@pytest.mark.parametrize("version", ["v2", "v0", "v1.1"])
+def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, version: str) -> None:
+    with someone_of(version, tmp_path), connect(endpoint_in(tmp_path), timeout_s=50) as bus:
+        started = time.monotonic()
+        with pytest.raises(OtherProtocol) as refused:
+            ASKS[ask](bus)
+        assert time.monotonic() - started < 25, "long before it gives up on silence"
+        assert refused.value.detail == {"versions": [version], "wanted": "v1"}
+        assert f"speak version {version} of the protocol, this client v1" in refused.value.message
+
+
+def test_the_command_line_says_so_too(tmp_path: Path) -> None:
+    with someone_of("v2", tmp_path):
+        ran = subprocess.run(
+            [sys.executable, "-m", "factorbus.cli", "stats", "--connect", endpoint_in(tmp_path), "--wait", "40"],
+            capture_output=True,
+            text=True,
+            timeout=50,
+            check=False,
+        )
+    assert ran.returncode == 4
+    assert "[other_protocol]" in ran.stderr
+
+
+@pytest.mark.parametrize("ask", ["map", "maps", "features"])
+def test_silence_of_nobody_is_silence(tmp_path: Path, ask: str) -> None:
+    with zenoh.open(_peer(tmp_path)), connect(endpoint_in(tmp_path), timeout_s=1.5) as bus, pytest.raises(Unavailable):
+        ASKS[ask](bus)
+
+
+def test_who_has_been_heard_of_is_waited_for(tmp_path: Path) -> None:
+    """At a router one service may be away for a moment while another, newer one is there."""
+    service = Service(tmp_path)
+    with connect(endpoint_in(tmp_path), timeout_s=20) as bus:
+        kitchen = bus.map(MAP)
+        kitchen.insert(Draft().point2("l1", (1.0, 2.0)))
+        service.close()
+        with someone_of("v2", tmp_path):
+            ticket = kitchen.send(Draft().point2("l2", (1.0, 2.0)))
+            # Longer than it takes to find that the other one is there, had it looked.
+            with pytest.raises(Unavailable):
+                kitchen.stats(timeout_s=2.0)
+            assert not ticket.future.done()
+
+
+class Older(Service):
+    """A service that knows less than this client."""
+
+    def __init__(self, folder: Path, protocol: dict) -> None:
+        self.protocol = protocol
+        super().__init__(folder)
+
+    def _row(self) -> dict:
+        return super()._row() | {"protocol": self.protocol}
+
+
+@pytest.mark.parametrize(
+    "protocol",
+    [
+        known() | {"insert": ["sequence", "epoch", "settle", "variables", "factors"]},
+        known() | {"changes": ["fix", "free"]},
+        {"version": 1, "insert": ["sequence", "changes"]},
+    ],
+)
+def test_changes_that_would_be_skipped_are_not_sent(tmp_path: Path, protocol: dict) -> None:
+    service = Older(tmp_path, protocol)
+    try:
+        with connect(endpoint_in(tmp_path)) as bus, bus.map(MAP, mirror=False) as kitchen:
+            with pytest.raises(NotSupported) as refused:
+                kitchen.change(Changes().weigh([0], 0.5))
+            assert refused.value.detail["what"] == "the change 'weigh'"
+            assert service.revision == 0
+            assert kitchen.insert(Draft().point2("l1", (1, 2))).sequence == 1, "its number was not used"
+    finally:
+        service.close()
+
+
+def test_what_it_knows_is_sent(tmp_path: Path) -> None:
+    service = Older(tmp_path, known())
+    try:
+        with connect(endpoint_in(tmp_path)) as bus, bus.map(MAP, mirror=False) as kitchen:
+            assert kitchen.change(Changes().weigh([0], 0.5)).sequence == 1
+    finally:
+        service.close()

@@ -1,0 +1,168 @@
+"""The worked example of the contract: its bytes, and every number of its answers computed again with dense matrices."""
+
+import json
+import runpy
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+from naive.dense_covariances import DenseCovariance
+from naive.dense_factors import jacobians, residual
+from naive.dense_least_squares import CONNECTS, DenseGraph, rho
+from scipy.stats import chi2 as chi2_distribution
+
+from factorbus.proto import asking_codec as asked
+from factorbus.proto import codec
+from factorbus.proto.messages import Accepted, Delta, Estimate, Graph
+
+ROOT = Path(__file__).parents[2] / "proto" / "vectors"
+WORKED = ROOT / "worked"
+NAMES = sorted(path.stem for path in WORKED.glob("*.msgpack"))
+DESCRIBED = runpy.run_path(str(ROOT / "make.py"))["described"]
+
+
+def read(name: str) -> bytes:
+    return (WORKED / f"{name}.msgpack").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def dense() -> DenseGraph:
+    """The map of the example, at its optimum as we find it."""
+    graph = DenseGraph()
+    for name in ("insert", "insert_more"):
+        batch = codec.decode_insert(read(name)).batch
+        graph.add(batch)
+        graph.put(batch.variables)
+    assert graph.gauss_newton(100) < 1e-10
+    return graph
+
+
+@pytest.fixture(scope="module")
+def known(dense: DenseGraph) -> DenseCovariance:
+    return DenseCovariance(dense)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_descriptions_are_of_the_bytes_and_these_in_the_shortest_form(name: str) -> None:
+    data = read(name)
+    assert DESCRIBED(data) == (WORKED / f"{name}.json").read_text()
+    assert msgpack.packb(msgpack.unpackb(data)) == data
+    assert json.loads((WORKED / f"{name}.json").read_text())
+
+
+def test_the_estimate_is_the_optimum(dense: DenseGraph) -> None:
+    for told in (codec.decode_estimate(read("estimate")), codec.decode_graph(read("graph")).batch):
+        assert isinstance(told, Estimate) or told.factors
+        for group in told.variables:
+            for key, row in zip(group.keys.tolist(), group.values, strict=True):
+                np.testing.assert_allclose(row, dense.values[key], atol=1e-7)
+    for name in ("chi2", "chi2_batch"):
+        assert codec.decode_chi2(read(name)).chi2 == pytest.approx(dense.chi2(), rel=1e-9)
+    assert codec.decode_chi2(read("chi2_batch")).batch == pytest.approx(dense.chi2(), rel=1e-9)
+    accepted = codec.decode_accepted(read("accepted_more"))
+    assert isinstance(accepted, Accepted)
+    assert accepted.first_factor == 7
+    assert accepted.report["chi2"] == pytest.approx(dense.chi2(), rel=1e-9)
+
+
+def test_deltas_lead_to_the_estimate_bit_for_bit() -> None:
+    first, second = (codec.decode_delta(read(name)) for name in ("delta", "delta_more"))
+    assert isinstance(first, Delta)
+    assert (first.previous, first.revision, second.previous, second.revision) == (0, 1, 1, 2)
+    rows: dict[int, bytes] = {}
+    for message in (first, second):
+        for group in message.variables:
+            rows.update(zip(group.keys.tolist(), (row.tobytes() for row in group.values), strict=True))
+    estimate = codec.decode_estimate(read("estimate"))
+    assert rows == {
+        key: row.tobytes()
+        for group in estimate.variables
+        for key, row in zip(group.keys.tolist(), group.values, strict=True)
+    }
+
+
+def test_covariances_are_those_of_the_map(known: DenseCovariance) -> None:
+    for group in asked.decode_covariances(read("covariances")).groups:
+        for key, block in zip(group.keys.tolist(), group.covariance, strict=True):
+            np.testing.assert_allclose(block, known.joint([key]), rtol=1e-7, atol=1e-11)
+    joint = asked.decode_covariances(read("covariances_joint"))
+    np.testing.assert_allclose(joint.covariance, known.joint(joint.keys.tolist()), rtol=1e-7, atol=1e-11)
+    cross = asked.decode_covariances(read("covariances_cross"))
+    rows, columns = cross.keys.tolist(), cross.others.tolist()
+    whole = known.joint(rows + columns)
+    size = int(cross.dims.sum())
+    np.testing.assert_allclose(cross.covariance, whole[:size, size:], rtol=1e-7, atol=1e-11)
+
+
+def test_gates_gains_and_pairs_are_those_of_the_map(known: DenseCovariance) -> None:
+    gate, gated = asked.decode_ask_gate(read("ask_gated")), asked.decode_gated(read("gated"))
+    gained = asked.decode_gained(read("gained"))
+    rows = [
+        (group.kind, keys, z, upper)
+        for group in gate.factors
+        for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True)
+    ]
+    for n, (kind, keys, z, upper) in enumerate(rows):
+        r, spread, noise = known.innovation(kind, keys, z, upper)
+        assert gated.distance[n] == pytest.approx(r @ np.linalg.solve(spread + noise, r), rel=1e-7)
+        assert gated.threshold[n] == pytest.approx(chi2_distribution.ppf(gate.probability, len(r)), rel=1e-9)
+        assert gained.gain[n] == pytest.approx(
+            0.5 * np.linalg.slogdet(np.eye(len(r)) + np.linalg.solve(noise, spread))[1], rel=1e-7
+        )
+    assert gated.plausible.tolist() == (gated.distance <= gated.threshold).tolist()
+    assert set(gated.plausible.tolist()) == {True, False}, "the example has both"
+    seen, found = asked.decode_ask_associate(read("ask_associated")), asked.decode_associated(read("associated"))
+    for sighting, landmark, distance in zip(found.sightings, found.candidates, found.distances, strict=True):
+        ends, z, upper = [seen.pose, int(landmark)], seen.measured[sighting], seen.information[sighting]
+        r, spread, noise = known.innovation(seen.kind, ends, z, upper)
+        assert distance == pytest.approx(r @ np.linalg.solve(spread + noise, r), rel=1e-7)
+
+
+def test_why_is_what_the_equations_say(dense: DenseGraph, known: DenseCovariance) -> None:
+    told = asked.decode_why(read("why_factor")).factor
+    kind, keys, z, W = dense.factors[told["factor"]]
+    ends = [dense.values[key] for key in keys]
+    r = residual(kind, ends, z)
+    H = np.hstack(jacobians(kind, CONNECTS[kind], ends, z))
+    spread = H @ known.joint(keys) @ H.T
+    assert (told["kind"], told["keys"], told["loss"]) == (kind, keys, "")
+    np.testing.assert_allclose(told["residual"], r, atol=1e-7)
+    np.testing.assert_allclose(told["weighted"], np.linalg.cholesky(W).T @ r, atol=1e-6)
+    assert told["chi2"] == pytest.approx(r @ W @ r, rel=1e-5)
+    assert told["influence"] == pytest.approx(np.trace(W @ spread), rel=1e-7)
+    without = r @ np.linalg.solve(np.linalg.inv(W) - spread, r)
+    assert told["without"] == pytest.approx(without, rel=1e-5)
+    variable = asked.decode_why(read("why_variable")).variable
+    block = known.joint([variable["key"]])
+    np.testing.assert_allclose(variable["covariance"], block, rtol=1e-7, atol=1e-11)
+    np.testing.assert_allclose(variable["sigmas"], np.sqrt(np.diag(block)), rtol=1e-7)
+
+
+def test_what_is_repaired_is_false(dense: DenseGraph) -> None:
+    content = msgpack.unpackb(read("repaired"))
+    (false,) = np.frombuffer(content["factors"], "<i8").tolist()
+    (distance,) = np.frombuffer(content["distance"], "<f8")
+    repaired = DenseGraph()
+    for name in ("insert", "insert_more"):
+        repaired.add(codec.decode_insert(read(name)).batch)
+    repaired.put(codec.decode_insert(read("insert")).batch.variables)
+    repaired.factors.pop(false), repaired.losses.pop(false)
+    assert repaired.gauss_newton(100) < 1e-10
+    kind, keys, z, W = dense.factors[false]
+    r = residual(kind, [repaired.values[key] for key in keys], z)
+    assert distance == pytest.approx(r @ W @ r, rel=1e-3)
+    assert rho("geman-mcclure", 3.0, distance) < distance
+
+
+def test_a_form_in_pieces_says_what_it_stands_for() -> None:
+    graph = codec.decode_graph(read("graph_pieces"))
+    assert isinstance(graph, Graph)
+    pieces = DenseGraph()
+    pieces.add(graph.batch)
+    pieces.put(graph.batch.variables)
+    assert any(kind.startswith("linear") for kind, *_ in pieces.factors)
+    known = DenseCovariance(pieces)
+    for group in asked.decode_covariances(read("covariances_pieces")).groups:
+        for key, block in zip(group.keys.tolist(), group.covariance, strict=True):
+            np.testing.assert_allclose(block, known.joint([key]), rtol=1e-6, atol=1e-10)
