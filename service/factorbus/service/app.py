@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 from factorbus.proto import codec, keys
-from factorbus.proto.problems import Busy, Internal, Problem
+from factorbus.proto.problems import Busy, Internal, Problem, UnknownQuestion
 from factorbus.proto.version import __version__
 from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.arrival import read_insert
@@ -50,6 +50,7 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.25
 _ADMIN_WAITING = 1024
 _TOKEN_S = 10.0
+_FIRST = 1  # the number that is wanted of a client that is not known
 
 
 def serve(
@@ -183,15 +184,15 @@ class Shell:
         try:
             name, client = sender = self._senders.find(key)
         except Problem as problem:
-            self._delivery.refusals.hand(refuse, query, problem)
+            self._delivery.refusals.hand(refuse, query, problem, _FIRST)
             return
         found = self.maps.get(name)
         if found is None:
-            self._delivery.refusals.hand(self._no_map, query, name)
+            self._delivery.refusals.hand(self._no_map, query, name, _FIRST)
             return
         read = read_insert(query, client, payload, self._decoding, time.monotonic())
         if isinstance(read, Refuse):
-            self._delivery.refusals.hand(refuse, query, read.problem)
+            found.host.unread(client, read)
             return
         self._senders.remember(key, sender)
         if (full := self.vitals.memory.no_room(read.size)) is not None:
@@ -244,9 +245,9 @@ class Shell:
     def _fork(self, asker: Asker, question: Question, taken: Snapshot) -> None:
         self._desk.hand(self.maps.forked, asker, question, taken)
 
-    def _no_map(self, query: Asker, name: str) -> None:
+    def _no_map(self, query: Asker, name: str, following: int | None = None) -> None:
         if problem := self.maps.missing(name):
-            refuse(query, problem)
+            refuse(query, problem, following)
         else:
             ignore(query)
 
@@ -268,8 +269,10 @@ class Shell:
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
                 self.maps.drop(query, *read_drop(payload))
+            elif self._config.connect:
+                ignore(query)  # another service at the router may know it
             else:
-                ignore(query)  # somebody else's key
+                raise UnknownQuestion(f"admin/{operation}", "maps, stats, create, fork or drop")
         except NotHere as problem:
             if self._config.connect:
                 ignore(query)  # for another service at the router

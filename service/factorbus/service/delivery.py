@@ -110,7 +110,7 @@ class MapDelivery:
             elif isinstance(effect, Drained):
                 self._drained()
             elif isinstance(effect, Refuse):
-                self._all.refusals.hand(refuse, effect.asker, effect.problem)
+                self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
             else:
                 sending.append(effect)
         if sending:
@@ -128,7 +128,7 @@ class MapDelivery:
                 sending.append(effect)
                 size += len(effect.message)
             elif isinstance(effect, Refuse):
-                self._all.refusals.hand(refuse, effect.asker, effect.problem)
+                self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
         if sending:
             hand = self._all.outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._all.outbox.hand
             hand(_send, self._place, sending)

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.proto import codec
+from factorbus.proto import codec, fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
-from factorbus.proto.problems import BadMessage, Problem, UnknownQuestion
+from factorbus.proto.problems import Problem, UnknownQuestion
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.service.lacking import NotInMap
 from factorbus.service.uncertain import DECODE, Uncertain, is_near
@@ -25,6 +25,7 @@ from factorbus.solver.errors import SolverError
 from factorbus.solver.repair import repair
 
 _FORMATS = ("g2o", "tum", "kitti")
+_WAIT_S = (0.001, 86_400.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +87,11 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, ask=decode_ask_repair(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
-        return Question(name, batch=_flag(content, "batch"), timeout_s=_seconds(content, "timeout_s", 60.0))
-    if name == "export" and content.get("format", "g2o") not in _FORMATS:
-        raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {content['format']!r:.40}")
-    return Question(name, format=content.get("format", "g2o"))
+        timeout_s = fields.parameter("question", content, "timeout_s", _WAIT_S, "from 0.001 to 86400 seconds", 60.0)
+        return Question(name, batch=fields.flag("question", content, "batch"), timeout_s=timeout_s)
+    if name == "export":
+        return Question(name, format=fields.word("question", content, "format", _FORMATS, "g2o"))
+    return Question(name)
 
 
 def snapshot(
@@ -210,17 +212,3 @@ def _text(kind: str, batch: Batch) -> str:
     from factorbus.formats import g2o_text, kitti_text, tum_text  # only who asks for an export pays for it
 
     return {"g2o": g2o_text, "tum": tum_text, "kitti": kitti_text}[kind](batch)
-
-
-def _flag(content: dict[str, Any], name: str) -> bool:
-    value = content.get(name, False)
-    if type(value) is not bool:
-        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "true or false")
-    return value
-
-
-def _seconds(content: dict[str, Any], name: str, default: float) -> float:
-    value = content.get(name, default)
-    if type(value) not in (int, float) or not 0 < value <= 86_400:
-        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "seconds, more than 0 and at most a day")
-    return float(value)

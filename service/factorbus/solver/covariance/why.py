@@ -25,7 +25,7 @@ _STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)
 class FactorAccount:
     """One factor at the estimate.
 
-    residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all without its loss
+    residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
     loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one   rho: ρ(s), what it counts in χ²; s without a loss
     asleep: why a sight has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
     influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
