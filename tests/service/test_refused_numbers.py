@@ -1,5 +1,6 @@
-"""Whatever is wrong with inserts, who follows §6 of the contract gets on: every refusal tells whether its number is used
-up, and no message is sent for ever.
+"""Whatever is wrong with inserts, who follows §6 of the contract gets on.
+
+Every refusal tells whether its number is used up, and no message is sent for ever.
 """
 
 import random

@@ -40,6 +40,7 @@ from factorbus.service.maps import Maps
 from factorbus.service.metrics import open_metrics
 from factorbus.service.optima import Optima
 from factorbus.service.questions import Question, Snapshot
+from factorbus.service.room import Room
 from factorbus.service.senders import Senders
 from factorbus.service.start import get_ready_to_compute
 from factorbus.service.trips import Trips
@@ -133,8 +134,9 @@ class Shell:
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = Features(
-            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s
-        )
+            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s,
+            Room(self.vitals.memory, limits.answer_bytes),
+        )  # fmt: skip
         if config.warm:
             log.info("features: %s", self._features.measure())
         chunk = config.maps.replace("*", "$*") if config.maps != "*" else "*"

@@ -3,6 +3,7 @@
     SolverError
     ├── UnknownMode            unknown_mode            a mode of solving that does not exist
     ├── BadOption              bad_option              a setting out of its range
+    ├── TooLarge               too_large               more than is searched through in one piece
     ├── NoBackend              no_backend              a backend whose package is not installed
     ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
     ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
@@ -72,6 +73,15 @@ class BadOption(SolverError):
 
     def __init__(self, name: str, seen: str, wanted: str) -> None:
         super().__init__(f"option {name}: seen {seen}, wanted {wanted}", name=name, seen=seen, wanted=wanted)
+
+
+class TooLarge(SolverError):
+    code = "too_large"
+
+    def __init__(self, what: str, size: int, limit: int, unit: str) -> None:
+        super().__init__(
+            f"{what} has {size} {unit}, the limit is {limit}; ask for less at a time", size=size, limit=limit
+        )
 
 
 class NoBackend(SolverError):
