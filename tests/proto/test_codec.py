@@ -1,6 +1,7 @@
 """Messages to bytes and back: golden bytes, round trips, and decoders that take anything without harm."""
 
 import json
+import re
 import runpy
 from collections.abc import Callable
 from pathlib import Path
@@ -419,3 +420,24 @@ def decodes_or_refuses(decode: Callable[[bytes], Any], data: bytes) -> None:
         decode(data)
     except (BadMessage, TooLarge) as problem:
         codec.decode_problem(codec.encode_problem(problem))  # and it can be told
+
+
+def test_a_documented_field_of_a_report_can_always_be_asked_for() -> None:
+    """Services tell what their steps have; a reader need not know which."""
+    page = (Path(__file__).parents[2] / "proto" / "README.md").read_text(encoding="utf-8")
+    table = page[page.index("**report** is open") : page.index("`vectors/` has each of these")]
+    named = [
+        name
+        for line in table.splitlines()
+        if line.startswith("| `")
+        for name in re.findall(r"`(\w+)`", line[: line.index("|", 2)])
+    ]
+    assert {"mode", "because", "chi2", "converged", "step_ms", "solver_ms", "removed_factors"} <= set(named)
+    accepted = codec.decode_accepted(
+        msgpack.packb({"sequence": 1, "epoch": 1, "revision": 1, "first_factor": 0, "folded": 1})
+    )
+    for name in named:
+        accepted.report[name]
+        assert name not in accepted.report
+    with pytest.raises(KeyError):
+        accepted.report["chi"]

@@ -20,6 +20,7 @@ from factorbus.proto.columns import factors_to_maps, read_batch, read_values, va
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Graph, Insert, Job, JobDone, Optimum
 from factorbus.proto.problems import Refused
+from factorbus.proto.report import Report
 
 _INDEX = (0.0, sys.float_info.max)  # what a linearity index may be compared with
 _pack = cast(Callable[..., bytes], msgpack.packb)
@@ -84,7 +85,7 @@ def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:
         revision=fields.integer("", content, "revision"),
         first_factor=fields.integer("", content, "first_factor"),
         folded=fields.integer("", content, "folded"),
-        report=fields.mapping("", content, "report"),
+        report=Report(fields.mapping("", content, "report")),
     )
 
 
@@ -130,7 +131,7 @@ def decode_delta(data: bytes, limits: Limits = ANSWER_LIMITS) -> Delta:
         revision=fields.integer("", content, "revision"),
         previous=fields.integer("", content, "previous"),
         variables=read_values(content),
-        report=fields.mapping("", content, "report"),
+        report=Report(fields.mapping("", content, "report")),
     )
 
 

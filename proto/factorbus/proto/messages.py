@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.report import Report
 
 
 class Variables(NamedTuple):
@@ -117,7 +118,7 @@ class Accepted:
     revision: int
     first_factor: int
     folded: int
-    report: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=Report)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +138,7 @@ class Delta:
     revision: int
     previous: int
     variables: tuple[Variables, ...]
-    report: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=Report)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """What answers of questions about uncertainty come to in bytes, and what computing them takes beside.
 
-Memory as an upper bound.  Of an answer the numbers, without keys and names: the whole of it is measured when it is made.
+Memory as an upper bound.  Of an answer the numbers, without keys and names: all of it is measured when it is made.
 """
 
 from typing import NamedTuple

@@ -12,7 +12,8 @@
     marginalise        keys (n,)                        these variables go; what their factors say of others is kept as
                                                         linear factors (`marginal`)
 
-Changes are made one after the other: what the first has removed the second cannot name.
+Changes are made one after the other: what the first has removed the second cannot name.  Each names what it is about
+once.
 """
 
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalise")
 _NONE = np.empty(0, np.int64)
 _QUATERNION_TOLERANCE = 1e-3
+_WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
 
 class ChangeLike(Protocol):
@@ -84,7 +86,7 @@ class Edits:
 def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
-    Raises UnknownKind, UnknownFactor, NotInMap, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
+    Raises UnknownKind, UnknownFactor, NotInMap, NamedTwice, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
     NotFinite, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
     """
     edits = unchanged(graph)
@@ -164,8 +166,9 @@ def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarra
 def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
     rows = _factors(graph, edits, change)
     weight = _numbers("weigh", "weight", change.weight, rows.size)
-    if (bad := np.flatnonzero(~(np.isfinite(weight) & (weight > 0.0)))).size:
-        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]))
+    least, most = _WEIGHTS
+    if (bad := np.flatnonzero(~((weight >= least) & (weight <= most)))).size:
+        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]), f"from {least:g} to {most:g}")
     np.multiply.at(edits.weight, rows, weight)
     touched[rows] = True
 
@@ -242,6 +245,8 @@ def _factors(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
     missing = np.flatnonzero([row < 0 or not edits.kept[row] for row in rows.tolist()])
     if missing.size:
         raise errors.UnknownFactor(int(ids[missing[0]]), graph.next_id)
+    if (twice := _twice(ids)) is not None:
+        raise errors.NamedTwice(change.change, f"factor {twice}", factor=twice)
     return rows
 
 
@@ -252,7 +257,15 @@ def _variables(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
     missing = np.flatnonzero([v < 0 or not edits.stays[v] for v in found.tolist()])
     if missing.size:
         raise errors.NotInMap(int(keys[missing[0]]), change.change)
+    if (twice := _twice(keys)) is not None:
+        raise errors.NamedTwice(change.change, errors.printed(twice), key=twice)
     return found
+
+
+def _twice(named: I64) -> int | None:
+    """One of those that are named more than once."""
+    different, counts = np.unique(named, return_counts=True)
+    return int(different[counts > 1][0]) if different.size < named.size else None
 
 
 def _numbers(change: str, name: str, given: F64 | None, count: int) -> F64:
