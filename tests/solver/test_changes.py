@@ -298,7 +298,7 @@ BAD: dict[str, tuple[type[errors.SolverError], list[Change]]] = {
     "a weight beyond all": (errors.BadWeight, [Change("weigh", np.array([5]), weight=np.full(1, 1e300))]),
     "a factor twice": (errors.NamedTwice, [Change("weigh", np.array([5, 4, 5]), weight=np.ones(3))]),
     "a factor removed twice": (errors.NamedTwice, [Change("remove_factors", np.array([5, 5]))]),
-    "a variable twice": (errors.NamedTwice, [Change("fix", np.array([symbol("x", 2)] * 2))]),
+    "a variable twice": (errors.NamedTwice, [Change("fix", keys=np.array([symbol("x", 2)] * 2))]),
     "a variable placed twice": (
         errors.NamedTwice,
         [Change("place", keys=np.array([symbol("x", 2)] * 2), kind="se2", values=np.zeros((2, 3)))],
