@@ -26,7 +26,7 @@ class Report(dict[str, Any]):
             return 0
         if name in _NUMBERS:
             return math.nan
-        if name == "converged":
+        if name in ("converged", "converging"):
             return False
         if name == "phases_ms":
             return {}
