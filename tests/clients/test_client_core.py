@@ -102,6 +102,29 @@ def test_an_insert_waits_only_for_one_that_is_still_being_sent() -> None:
     assert not window.waits_for(2, 3)
 
 
+def refused(following: int) -> Problem:
+    return Problem("no", next=following)
+
+
+def test_a_number_that_was_refused_and_used_up_is_not_used_again() -> None:
+    window: Window[str] = Window(4)
+    window.sent("a")
+    window.answered(1, refused(2))
+    assert (window.full, window.next) == (False, 2)
+
+
+def test_a_number_that_was_refused_and_not_used_up_is_used_again_when_nothing_is_in_flight() -> None:
+    window: Window[str] = Window(4)
+    for item in "abcd":
+        window.sent(item)
+    window.answered(1, None)
+    window.answered(3, refused(2))
+    assert window.full, "what would be sent now would be refused as well"
+    window.answered(2, refused(2))
+    window.answered(4, refused(2))
+    assert (window.full, window.idle, window.next) == (False, True, 2)
+
+
 def test_a_window_holds_at_least_one() -> None:
     with pytest.raises(ValueError, match="at least 1"):
         Window(0)

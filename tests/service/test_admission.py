@@ -76,7 +76,7 @@ def test_the_same_number_later_gets_the_first_answer(admission: Admission) -> No
         admission.admit(arrived("a", sequence))
         admission.answer(admission.take(1)[0], answer)
     assert admission.admit(arrived("a", 1, asker="again")) == [Answer("again", b"first")]
-    assert admission.admit(arrived("a", 2, asker="again")) == [Refuse("again", refusal)]
+    assert admission.admit(arrived("a", 2, asker="again")) == [Refuse("again", refusal, 3)]
 
 
 def test_an_answer_too_old_is_not_made_up(admission: Admission) -> None:

@@ -106,7 +106,7 @@ def test_a_run_is_not_short_when_it_is_large_settles_reads_or_follows_another(co
 def test_a_refusal_is_answered_and_counted(core: MapCore) -> None:
     problem = UnknownMap("x")
     run = run_of(core.insert(insert("a", 1)))
-    assert solved(core, run, problem) == [Refuse("a1", problem)]
+    assert solved(core, run, problem) == [Refuse("a1", problem, 2)]
     assert core.revision == 0
     assert core.stats(3.0)["inserts"] == {"accepted": 0, "refused": 1, "busy": 0}
 
@@ -143,8 +143,9 @@ def test_stats_do_not_wait_for_the_solver(core: MapCore) -> None:
         ("estimate", b"\xc1", "bad_message"),
         ("estimate", codec.encode_map({"keys": b"1234567"}), "bad_message"),
         ("chi2", codec.encode_map({"batch": 1}), "bad_message"),
-        ("chi2", codec.encode_map({"timeout_s": -1}), "bad_message"),
-        ("export", codec.encode_map({"format": "pdf"}), "unknown_question"),
+        ("chi2", codec.encode_map({"timeout_s": -1}), "bad_option"),
+        ("chi2", codec.encode_map({"timeout_s": "1"}), "bad_message"),
+        ("export", codec.encode_map({"format": "pdf"}), "bad_option"),
         ("graph", b"\x93\x01\x02\x03", "bad_message"),
     ],
 )

@@ -88,8 +88,19 @@ def test_only_those_named_are_looked_at() -> None:
     assert set(found.false.tolist()) <= set(named.tolist())
     with pytest.raises(errors.UnknownFactor):
         repair(solver.content(), np.array([10**9]))
-    with pytest.raises(errors.BadOption):
-        repair(solver.content(), probability=1.0)
+    for outside in (1.0, 0.0, -1.0, 1e-300, 5e-324, float("nan"), float("inf")):
+        with pytest.raises(errors.BadOption):
+            repair(solver.content(), probability=outside)
+
+
+@pytest.mark.parametrize("probability", [1e-12, 1.0 - 1e-12])
+def test_at_the_ends_of_its_range_a_probability_does_no_harm(probability: float) -> None:
+    """Nothing is right, or everything."""
+    solver, _, _ = driven(1, 0.3)
+    found = repair(solver.content(), probability=probability)
+    assert 0 <= found.false.size <= found.suspects
+    assert np.isfinite([found.before, found.after, *found.distance]).all()
+    assert all(np.isfinite(group.values).all() for group in found.groups)
 
 
 def test_the_graph_that_is_looked_at_stays_as_it_is() -> None:

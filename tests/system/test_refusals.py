@@ -158,7 +158,7 @@ def test_what_is_not_there_says_so(client: Bare, key: str, code: str) -> None:
     [
         ("create", {}, "bad_message"),
         ("create", {"map": "a/b"}, "bad_name"),
-        ("create", {"map": "a", "mode": "magic"}, "bad_message"),
+        ("create", {"map": "a", "mode": "magic"}, "bad_option"),
         ("drop", {"map": "nowhere"}, "unknown_map"),
     ],
 )

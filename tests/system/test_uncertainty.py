@@ -146,7 +146,7 @@ def test_refusals_carry_their_codes(square: tuple[Map, Solver], named: list[str]
     assert refused.value.code == "unknown_variable"
     with pytest.raises(Refused) as refused:
         joined.doubt.gate(Draft().between_se2("x1", "x2", (1, 0, 0), sigmas=SIGMAS), probability=1.5)
-    assert refused.value.code == "bad_message"
+    assert refused.value.code == "bad_option"
 
 
 def test_an_empty_map_has_no_last_pose(endpoint: str) -> None:

@@ -321,13 +321,15 @@ def _variable_rows(account: Any) -> list[tuple[str, str]]:
 
 
 def _factor_line(account: Any) -> str:
-    without = account["without"]
-    fall = "nothing else measures this" if without is None else f"without it χ² falls by {without:.3g}"
-    share = f"{account['influence']:.2f} of {account['dims']} known from it"
-    told = f"χ² {account['chi2']:.3g}, {share}, {fall}"
     if account.get("asleep"):
         return f"asleep: {account['asleep']}"
-    return f"{told}, weight {account['weight']:.2g} by {account['loss']}" if account.get("loss") else told
+    without, loss = account["without"], account.get("loss")
+    fall = "nothing else measures this" if without is None else f"without it χ² falls by {without:.3g}"
+    share = f"{account['influence']:.2f} of {account['dims']} known from it"
+    if not loss:
+        return f"χ² {account['chi2']:.3g}, {share}, {fall}"
+    counts = f"rᵀΩr {account['chi2']:.3g}, of which {loss} counts {account['rho']:.3g} (weight {account['weight']:.2g})"
+    return f"{counts}, {share}, {fall}"
 
 
 def _told(account: Any) -> str:

@@ -2,6 +2,9 @@
 
 Inserts are numbered 1, 2, 3, ...; the same number always goes with the same insert, however often it is sent, so
 the service takes each exactly once.  At most `size` are unanswered at a time.
+
+A refusal tells in `detail.next` whether its number is used up: where `next` is not above it, the service has taken
+nothing from `next` on.  Then no further insert is sent until all are answered, and numbering goes on from there.
 """
 
 from typing import Generic, TypeVar
@@ -21,11 +24,12 @@ class Window(Generic[T]):
         self.last = 0
         self._unanswered: dict[int, T] = {}
         self._refused: list[tuple[T, Problem]] = []
+        self._back_to = 0  # the number that the service wants of those that it refused without taking them; 0: none
 
     @property
     def full(self) -> bool:
         """No further insert may be sent now."""
-        return len(self._unanswered) >= self.size
+        return len(self._unanswered) >= self.size or bool(self._back_to)
 
     @property
     def idle(self) -> bool:
@@ -56,6 +60,11 @@ class Window(Generic[T]):
         item = self._unanswered.pop(sequence, None)
         if refusal is not None and item is not None:
             self._refused.append((item, refusal))
+            following = refusal.detail.get("next")
+            if type(following) is int and 1 <= following <= sequence:
+                self._back_to = min(following, self._back_to or following)
+        if self._back_to and not self._unanswered:
+            self.last, self._back_to = self._back_to - 1, 0
 
     def take_refused(self) -> list[tuple[T, Problem]]:
         """What was refused since the last call, and why, oldest answer first."""

@@ -21,9 +21,10 @@ def explain(why: Why) -> dict[str, Any]:
     """{key, kind, value, fixed, revision, sigmas, conditioning, chi2, factors, step, text} of one variable; its worst
     factors first.
 
-    sigmas: standard deviations in its tangent space, metres and radians.  A factor has id, kind, keys, chi2 = rᵀ Ω r,
-    misfit = √(chi2 / dim): about 1 where the information is right; known: the share of what it measures that is known
-    from it and not from the others; without: by how much χ² would fall without it, null: nothing else measures it.
+    sigmas: standard deviations in its tangent space, metres and radians.  chi2: what its factors count in χ².  A factor
+    has id, kind, keys, chi2 = rᵀ Ω r, loss, weight and rho, what it counts with its loss; misfit = √(chi2 / dim): about
+    1 where the information is right; known: the share of what it measures that is known from it and not from the
+    others; without: by how much χ² would fall without it, null: nothing else measures it.
     """
     account = why.variable
     rows = sorted(map(_row, account["factors"]), key=lambda row: -row["chi2"])
@@ -36,7 +37,7 @@ def explain(why: Why) -> dict[str, Any]:
         "revision": why.revision,
         "sigmas": account["sigmas"],
         "conditioning": account["conditioning"],
-        "chi2": sum(row["chi2"] for row in rows),
+        "chi2": sum(row["rho"] for row in rows),
         "factors": rows,
         "step": f"{why.step['strategy']}: {why.step['because']}" if why.step else "",
         "text": _text(name, account, rows),
@@ -49,6 +50,9 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
         "kind": factor["kind"],
         "keys": [format_symbol(key) for key in factor["keys"]],
         "chi2": factor["chi2"],
+        "loss": factor["loss"],
+        "weight": factor["weight"],
+        "rho": factor["rho"],
         "misfit": math.sqrt(max(factor["chi2"], 0.0) / factor["dims"]),  # pieces of one factor may have less than 0
         "known": factor["influence"] / factor["dims"],
         "without": factor["without"],

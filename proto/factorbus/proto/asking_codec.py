@@ -30,6 +30,8 @@ from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Factors
 from factorbus.proto.problems import BadMessage, UnknownKind
 
+# Where quantiles of χ² are numbers that can be computed with.
+_SURE = (1e-12, 1.0 - 1e-12)
 _SIGHTS = ("landmark_se2", "landmark_se3", "bearing_range_se2")  # of a point, from a pose
 
 
@@ -45,9 +47,7 @@ def encode_ask_covariance(ask: AskCovariance) -> bytes:
 def decode_ask_covariance(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskCovariance:
     """The question; no bytes at all: the whole diagonal."""
     content = fields.read_map("question", data, limits) if data else {}
-    blocks = fields.text("", content, "blocks", default="diagonal")
-    if blocks not in BLOCKS:
-        raise BadMessage("question.blocks", f"is {blocks!r:.40}", f"one of {', '.join(BLOCKS)}")
+    blocks = fields.word("question", content, "blocks", BLOCKS, "diagonal")
     keys = _keys(content, "keys", needed=blocks in ("joint", "cross", "relative"))
     others = _keys(content, "others", needed=blocks == "cross")
     if blocks == "relative" and keys is not None:
@@ -98,7 +98,7 @@ def encode_ask_gate(ask: AskGate) -> bytes:
 def decode_ask_gate(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskGate:
     """The question that `data` is."""
     content = fields.read_map("question", data, limits)
-    return AskGate(_factors(content, limits), _probability(content))
+    return AskGate(_factors(content, limits), probability(content, 0.95))
 
 
 def encode_gated(message: Gated) -> bytes:
@@ -175,7 +175,7 @@ def decode_ask_associate(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskAss
         measured.reshape(count, size),
         information.reshape(count, -1) if count else information.reshape(0, FACTOR_KINDS[kind].information_size),
         _keys(content, "landmarks", needed=False),
-        _probability(content),
+        probability(content, 0.95),
     )
 
 
@@ -259,17 +259,15 @@ def _factors(content: Map, limits: Limits) -> tuple[Factors, ...]:
     return read_batch({"factors": content.get("factors")}, limits).factors
 
 
-def _probability(content: Map) -> float:
-    value = content.get("probability", 0.95)
-    if type(value) is not float or not 0.0 < value < 1.0:
-        raise BadMessage("question.probability", f"is {value!r:.40}", "a number above 0 and below 1")
-    return value
+def probability(content: Map, default: float) -> float:
+    """The parameter of that name.  Raises BadMessage, BadOption."""
+    return fields.parameter("question", content, "probability", _SURE, "from 1e-12 to 1 - 1e-12", default)
 
 
 def _key(content: Map, name: str) -> int:
     value = content.get(name)
     if type(value) is not int or not -(2**63) <= value <= fields.MAX_INTEGER:
-        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "a variable's key, an integer")
+        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "a variable's key, an integer of 64 bits")
     return value
 
 

@@ -28,7 +28,7 @@ class BadCamera(Problem):
     code = "bad_camera"
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"camera: {where} is {seen}; wanted {wanted}", where=where)
+        super().__init__(f"camera: {where} is {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
 @dataclass(frozen=True, slots=True)

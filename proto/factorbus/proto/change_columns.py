@@ -10,7 +10,7 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import CHANGES, LOSSES, VARIABLE_KINDS
 from factorbus.proto.messages import Change
-from factorbus.proto.problems import BadMessage, UnknownKind
+from factorbus.proto.problems import BadLoss, BadMessage, UnknownKind
 
 
 def changes_to_maps(changes: Sequence[Change]) -> list[dict[str, Any]]:
@@ -19,7 +19,7 @@ def changes_to_maps(changes: Sequence[Change]) -> list[dict[str, Any]]:
 
 
 def read_changes(message: Map) -> tuple[Change, ...]:
-    """The changes in `message`.  Raises BadMessage, UnknownKind."""
+    """The changes in `message`.  Raises BadMessage; UnknownKind and BadLoss are such."""
     return tuple(_read(i, content) for i, content in enumerate(fields.maps("", message, "changes")))
 
 
@@ -66,7 +66,7 @@ def _read(index: int, content: Map) -> Change:
     if not loss:
         return Change(name, named)
     if loss not in LOSSES:
-        raise BadMessage(f"{place()}.loss", f"is {loss[:64]!r}", f"one of {', '.join(LOSSES)}, or no such field")
+        raise BadLoss(f"{place()}.loss", repr(loss[:64]), f"one of {', '.join(LOSSES)}, or no such field")
     return Change(name, named, loss=loss, scale=fields.rows(place, content, "scale", named.size, 1).reshape(-1))
 
 

@@ -1,11 +1,12 @@
 """Messages to bytes and back: MessagePack maps with string keys, columns as raw little-endian bytes in bin.
 
-Encoders take well-formed messages.  Decoders take anything: they raise BadMessage (UnknownKind is one) or TooLarge
-and nothing else, allocate no more than a small multiple of what `limits` admits, ignore fields they do not know,
-and return arrays that are read-only views into the message.  Whether numbers are finite, an information matrix is
-positive definite or a key is known is not judged here: that is the solver's business.
+Encoders take well-formed messages.  Decoders take anything: they raise BadMessage (UnknownKind, BadLoss and BadOption
+are such) or TooLarge and nothing else, allocate no more than a small multiple of what `limits` admits, ignore fields
+they do not know, and return arrays that are read-only views into the message.  Whether numbers are finite, an
+information matrix is positive definite or a key is known is not judged here: that is the solver's business.
 """
 
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
@@ -19,7 +20,9 @@ from factorbus.proto.columns import factors_to_maps, read_batch, read_values, va
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Graph, Insert, Job, JobDone, Optimum
 from factorbus.proto.problems import Refused
+from factorbus.proto.report import Report
 
+_INDEX = (0.0, sys.float_info.max)  # what a linearity index may be compared with
 _pack = cast(Callable[..., bytes], msgpack.packb)
 
 
@@ -49,7 +52,7 @@ def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
         batch=read_batch(content, limits),
         settle=fields.flag("", content, "settle"),
         epoch=fields.integer("", content, "epoch", default=0),
-        points_below=fields.number("", content, "points_below") if "points_below" in content else 0.0,
+        points_below=fields.parameter("insert", content, "points_below", _INDEX, "0 or more, and finite", 0.0),
         changes=read_changes(content) if "changes" in content else (),
     )
 
@@ -82,7 +85,7 @@ def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:
         revision=fields.integer("", content, "revision"),
         first_factor=fields.integer("", content, "first_factor"),
         folded=fields.integer("", content, "folded"),
-        report=fields.mapping("", content, "report"),
+        report=Report(fields.mapping("", content, "report")),
     )
 
 
@@ -128,7 +131,7 @@ def decode_delta(data: bytes, limits: Limits = ANSWER_LIMITS) -> Delta:
         revision=fields.integer("", content, "revision"),
         previous=fields.integer("", content, "previous"),
         variables=read_values(content),
-        report=fields.mapping("", content, "report"),
+        report=Report(fields.mapping("", content, "report")),
     )
 
 
@@ -239,9 +242,15 @@ def decode_optimum(data: bytes, limits: Limits = ANSWER_LIMITS) -> Optimum:
     )
 
 
-def encode_problem(problem: Any) -> bytes:
-    """The bytes of anything with `code`, `message` and `detail`: a Problem or an error of the solver."""
-    return _pack(_problem_map(problem), default=_plain)
+def encode_problem(problem: Any, following: int | None = None) -> bytes:
+    """The bytes of anything with `code`, `message` and `detail`: a Problem or an error of the solver.
+
+    following: of a refused insert, `detail.next` unless the problem has one already.
+    """
+    content = _problem_map(problem)
+    if following is not None:
+        content["detail"].setdefault("next", following)
+    return _pack(content, default=_plain)
 
 
 def decode_problem(data: bytes, limits: Limits = ANSWER_LIMITS) -> Refused:

@@ -11,7 +11,7 @@ from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadMessage, TooLarge, UnknownKind
+from factorbus.proto.problems import BadLoss, BadMessage, TooLarge, UnknownKind
 
 
 def variables_to_maps(groups: Sequence[Variables]) -> list[dict[str, Any]]:
@@ -112,8 +112,9 @@ def _read_factors(index: int, content: Map) -> Factors:
     if loss is None:
         return Factors(known.name, keys, measured, information, ids=ids)
     if type(loss) is not str or loss not in LOSSES:
-        seen = repr(loss[:64]) if type(loss) is str else "not a string"
-        raise BadMessage(f"{place()}.loss", seen, f"one of {', '.join(LOSSES)}, or no such field")
+        if type(loss) is not str:
+            raise BadMessage(f"{place()}.loss", "not a string", f"one of {', '.join(LOSSES)}, or no such field")
+        raise BadLoss(f"{place()}.loss", repr(loss[:64]), f"one of {', '.join(LOSSES)}, or no such field")
     scale = fields.rows(place, content, "scale", len(keys), 1).reshape(-1)
     return Factors(known.name, keys, measured, information, loss, scale, ids)
 

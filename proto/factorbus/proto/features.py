@@ -36,7 +36,7 @@ class BadState(Problem):
     code = "bad_state"
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where} is {seen}; wanted {wanted}", where=where)
+        super().__init__(f"{where} is {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,9 +57,7 @@ def encode_ask(message: Ask) -> bytes:
 def decode_ask(data: bytes, limits: Limits = REQUEST_LIMITS) -> Ask:
     """The question that `data` is.  Raises BadMessage, BadCamera, TooLarge."""
     content = fields.read_map("ask", data, limits)
-    form = fields.text("", content, "form", default="rows")
-    if form not in FORMS:
-        raise BadMessage("form", f"is {form[:64]!r}", f"one of {', '.join(FORMS)}")
+    form = fields.word("", content, "form", FORMS, "rows")
     sighting = Sighting(
         _camera(fields.mapping("", content, "camera")),
         _array(content, "state", CAMERA_STATE).reshape(-1)[:CAMERA_STATE],

@@ -3,7 +3,8 @@
 Decoding is on the path of every insert, so a place ("factors[1].keys") is put together only when it is needed.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgpack
@@ -11,13 +12,15 @@ import numpy as np
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.limits import Limits
-from factorbus.proto.problems import BadMessage, TooLarge
+from factorbus.proto.problems import BadMessage, BadOption, TooLarge
 
 F8 = np.dtype("<f8")
 I8 = np.dtype("<i8")
 MAX_INTEGER = (1 << 63) - 1
 # A message this short cannot hold enough containers to matter, and is spared the counting.
 _COUNTED_ABOVE = 65_536
+MAX_NESTING = 1024  # of arrays and maps, by the decoder itself
+_TOO_MANY = re.compile(r"(\d+) exceeds max_(?:array|map)_len")
 
 Map = Mapping[str, Any]
 
@@ -32,8 +35,10 @@ def read_map(what: str, data: bytes, limits: Limits) -> Map:
             data, max_array_len=limits.max_elements, max_map_len=limits.max_elements, strict_map_key=True, **hooks
         )
     except msgpack.StackError:
-        raise BadMessage(what, "nested too deep", "at most a few levels") from None
+        raise TooLarge(what, MAX_NESTING + 1, MAX_NESTING, "levels of nesting") from None
     except (ValueError, TypeError, OverflowError) as error:
+        if found := _TOO_MANY.match(str(error)):
+            raise TooLarge(what, int(found[1]), limits.max_elements, "elements in one array or map") from None
         raise BadMessage(what, f"not readable ({error})", "one MessagePack map, and nothing after it") from None
     if type(content) is not dict:
         raise BadMessage(what, f"is {_name(content)}", "a map")
@@ -56,6 +61,24 @@ def number(where: str, fields: Map, name: str) -> float:
     if type(value) is float or (type(value) is int and abs(value) <= MAX_INTEGER):
         return float(value)
     raise BadMessage(_place(where, name), _seen(fields, name), "a number")
+
+
+def parameter(where: str, fields: Map, name: str, span: tuple[float, float], wanted: str, default: float) -> float:
+    """An optional number from span[0] to span[1], both included.  Raises BadMessage, BadOption."""
+    if fields.get(name) is None:
+        return default
+    value = number(where, fields, name)
+    if not span[0] <= value <= span[1]:
+        raise BadOption(_place(where, name), f"is {value:.17g}", wanted)
+    return value
+
+
+def word(where: str, fields: Map, name: str, known: Sequence[str], default: str) -> str:
+    """An optional string that is one of `known`.  Raises BadMessage, BadOption."""
+    value = text(where, fields, name, default)
+    if value not in known:
+        raise BadOption(_place(where, name), f"is {value[:64]!r}", f"one of {', '.join(known)}")
+    return value
 
 
 def flag(where: str, fields: Map, name: str) -> bool:

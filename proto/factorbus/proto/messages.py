@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.problems import Problem
+from factorbus.proto.report import Report
 
 # What a batch optimum may be found from: the values that the graph has, composed odometry, averaged rotations.
 STARTS = ("values", "odometry", "rotations")
@@ -123,7 +124,7 @@ class Accepted:
     revision: int
     first_factor: int
     folded: int
-    report: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=Report)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ class Delta:
     revision: int
     previous: int
     variables: tuple[Variables, ...]
-    report: Mapping[str, Any] = field(default_factory=dict)
+    report: Mapping[str, Any] = field(default_factory=Report)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,14 +7,15 @@
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
-    ├── BadLoss              bad_loss             a loss that does not exist, a scale that is not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
-    │   └── UnknownKind      unknown_kind         a kind of variable or factor that this version does not know
+    │   ├── UnknownKind      unknown_kind         a kind of variable, factor or change that this version does not know
+    │   ├── BadLoss          bad_loss             a loss that does not exist, a scale that is not positive
+    │   └── BadOption        bad_option           a parameter of the right type whose value is not one it takes
     ├── TooLarge             too_large            a message, an insert or a map over its limit
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
     ├── UnknownMap           unknown_map          no such map here
-    ├── UnknownQuestion      unknown_question     no such question, or parameters it does not take
+    ├── UnknownQuestion      unknown_question     no such question or operation
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
@@ -89,28 +90,32 @@ class BadShape(Problem):
     code = "bad_shape"
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
 class BadInformation(Problem):
     code = "bad_information"
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
-
-
-class BadLoss(Problem):
-    code = "bad_loss"
-
-    def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{where}: of the loss seen {seen}; wanted {wanted}", where=where)
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
 class BadMessage(Problem):
     code = "bad_message"
 
-    def __init__(self, where: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where)
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
+
+
+class BadLoss(BadMessage):
+    code = "bad_loss"
+
+    def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(where, f"of the loss seen {seen}", wanted)
+
+
+class BadOption(BadMessage):
+    code = "bad_option"
 
 
 class UnknownKind(BadMessage):
@@ -214,6 +219,7 @@ class NobodyListens(Unavailable):
         Problem.__init__(
             self, f"nothing listens at {endpoint}; start a service there with `factorbus serve`, or check the address"
         )
+
 
 class BetterOptimum(Problem):
     """A notice, not a refusal: it comes in the answer to ask/chi2."""

@@ -7,6 +7,7 @@ import numpy as np
 from factorbus.proto import fields
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import AskRepair, Repaired
+from factorbus.proto.asking_codec import probability
 from factorbus.proto.codec import encode_map
 from factorbus.proto.columns import read_values, variables_to_maps
 from factorbus.proto.fields import F8, I8, Map
@@ -27,11 +28,8 @@ def encode_ask_repair(ask: AskRepair) -> bytes:
 def decode_ask_repair(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskRepair:
     """The question that `data` is; no bytes at all: everything as by default."""
     content = fields.read_map("question", data, limits) if data else {}
-    probability = fields.number("question", content, "probability") if "probability" in content else 0.99
-    if not 0.0 < probability < 1.0:
-        raise BadMessage("question.probability", f"is {probability:g}", "above 0 and below 1")
     factors = None if content.get("factors") is None else _integers("question", content, "factors")
-    return AskRepair(factors, probability, fields.flag("question", content, "values"))
+    return AskRepair(factors, probability(content, 0.99), fields.flag("question", content, "values"))
 
 
 def encode_repaired(message: Repaired) -> bytes:

@@ -12,10 +12,10 @@ def sealed(entry: Entry) -> Entry:
 
 def digest_of(entry: Entry) -> int:
     """64 bits of all else in `entry`: the same in every process and version."""
-    _, _, _, outcome, revision, first_factor, together, problem, message = entry
+    _, _, _, outcome, revision, first_factor, together, answer, message = entry
     digest = blake2b(digest_size=8)
     digest.update(f"{entry.client} {entry.sequence} {outcome} {revision} {first_factor} {together} ".encode())
-    digest.update(len(problem).to_bytes(8, "little"))
-    digest.update(problem)
+    digest.update(len(answer).to_bytes(8, "little"))
+    digest.update(answer)
     digest.update(message)
     return int.from_bytes(digest.digest(), "little", signed=True)

@@ -13,8 +13,8 @@ UNTRIED = 2  # refused before the solver saw it
 class Entry(NamedTuple):
     """One insert, in its place.
 
-    revision, first_factor, together: of the answer, where it was accepted; problem: the bytes of the one it was
-    refused with.  digest: of all the rest (`digest.sealed`).
+    revision, first_factor, together: where it was accepted.  answer: the bytes it was answered with, an accepted or a
+    problem, so that whoever asks again gets the same.  digest: of all the rest (`digest.sealed`).
     """
 
     client: str
@@ -24,7 +24,7 @@ class Entry(NamedTuple):
     revision: int
     first_factor: int
     together: int
-    problem: bytes
+    answer: bytes
     message: bytes
 
 

@@ -21,7 +21,7 @@ from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
 from factorbus.ownership import private_file
 
 NAME = "journal.db"
-FORM = 2  # 1: an entry's digest was of its message only
+FORM = 3  # 2: the answer to what was accepted was not kept whole
 _APPLICATION = 0x46427573  # "FBus"
 _LOG_BYTES = 64 << 20  # what a log that was longer is cut to, once it is in the database
 # Ways to open it for reading.  The last: where no file can be made beside it, which the log of a database needs.
@@ -38,12 +38,12 @@ CREATE TABLE fold (
 CREATE TABLE entry (
     number INTEGER PRIMARY KEY, fold INTEGER NOT NULL, client TEXT NOT NULL, sequence INTEGER NOT NULL,
     digest INTEGER NOT NULL, outcome INTEGER NOT NULL, revision INTEGER NOT NULL, first_factor INTEGER NOT NULL,
-    together INTEGER NOT NULL, problem BLOB NOT NULL, message BLOB NOT NULL
+    together INTEGER NOT NULL, answer BLOB NOT NULL, message BLOB NOT NULL
 );
 CREATE INDEX entry_of_client ON entry (client);
 CREATE TABLE snapshot (fold INTEGER PRIMARY KEY, fingerprint TEXT NOT NULL, bytes INTEGER NOT NULL);
 """
-_ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, problem"
+_ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
 
 
 class Saved(NamedTuple):

@@ -2,11 +2,10 @@
 
 from typing import NamedTuple
 
-from factorbus.proto import codec
+from factorbus.proto import codec, fields
 from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.problems import BadMessage, Problem
-from factorbus.solver.errors import UnknownMode
 from factorbus.solver.modes import MODES, mode_named
 
 
@@ -90,14 +89,9 @@ class Fork(NamedTuple):
 
 
 def read_create(payload: bytes) -> tuple[str, str]:
-    """(map, mode) of an admin/create.  Raises BadMessage, BadName, TooLarge."""
+    """(map, mode) of an admin/create.  Raises BadMessage, BadOption, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="create")
-    mode = content.get("mode", "auto")
-    try:
-        mode_named(mode if isinstance(mode, str) else "")
-    except UnknownMode as unknown:
-        raise BadMessage("create.mode", f"is {mode!r:.40}", f"one of {', '.join(MODES)}") from unknown
-    return _map_name(content, "create"), mode
+    return _map_name(content, "create"), fields.word("create", content, "mode", tuple(MODES), "auto")
 
 
 class Drop(NamedTuple):
@@ -111,11 +105,8 @@ class Drop(NamedTuple):
 def read_drop(payload: bytes) -> Drop:
     """What an admin/drop asks for.  Raises BadMessage, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="drop")
-    revision, damaged = content.get("revision"), content.get("damaged", False)
-    if revision is not None and (type(revision) is not int or revision < 0):
-        raise BadMessage("drop.revision", f"is {revision!r:.40}", "a revision, from 0")
-    if type(damaged) is not bool:
-        raise BadMessage("drop.damaged", f"is {damaged!r:.40}", "true or false")
+    revision = fields.integer("drop", content, "revision") if content.get("revision") is not None else None
+    damaged = fields.flag("drop", content, "damaged")
     if damaged and revision is not None:
         raise BadMessage("drop.revision", f"is {revision}", "none with `damaged`: what does not open has no revision")
     return Drop(_map_name(content, "drop"), revision, damaged)
@@ -124,9 +115,7 @@ def read_drop(payload: bytes) -> Drop:
 def read_fork(payload: bytes) -> Fork:
     """What an admin/fork asks for.  Raises BadMessage, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="fork")
-    request = content.get("request", 0)
-    if type(request) is not int or request < 0:
-        raise BadMessage("fork.request", f"is {request!r:.40}", "an int, from 0")
+    request = fields.integer("fork", content, "request", default=0)
     return Fork(_map_name(content, "fork"), _map_name(content, "fork", "as"), request)
 
 
@@ -141,7 +130,4 @@ def ours(pattern: str, name: str) -> bool:
 
 
 def _map_name(content: dict, where: str, field: str = "map") -> str:
-    name = content.get(field)
-    if type(name) is not str:
-        raise BadMessage(f"{where}.{field}", "missing" if name is None else f"is {name!r:.40}", "the name of a map")
-    return checked_name("map", name)
+    return checked_name("map", fields.text(where, content, field))

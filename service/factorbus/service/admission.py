@@ -12,6 +12,9 @@ The rules, in the order they are tried (n is the number that the client has to s
     after n, within the window          parked until the gap is closed; no room: busy; gap not closed: bad_sequence
     further                             bad_sequence
 
+Every refusal tells what goes on from it (`Refuse.following`): a number above the insert's where that is used up, and n,
+which is not above it, where it is not.
+
 Parked inserts have room of their own: were they to fill the inbox, the one that closes the gap would find it full.
 
 Nobody stands in another's way by sending much.  Who has nothing waiting finds room for one insert (not a huge one) in a
@@ -87,7 +90,12 @@ class Admission:
         try:
             return self._judge(arrived)
         except Problem as problem:
-            return [Refuse(arrived.askers[0], problem)]
+            return [Refuse(arrived.askers[0], problem, self.wanted(arrived.client))]
+
+    def wanted(self, name: str) -> int:
+        """The number that client `name` has to send next; 1 of one that is not known."""
+        client = self._clients.get(name)
+        return client.next if client is not None else 1
 
     def take_alone(self, arrived: Arrived) -> bool:
         """Take the insert, if it is next, and nothing else waits here or is parked; if not, `admit` it."""
@@ -140,7 +148,7 @@ class Admission:
             client.answered.popitem(last=False)
         if answered is not None and len(insert.askers) == 1:
             return []
-        return [_reply(asker, answer) for asker in insert.askers if asker is not answered]
+        return [_reply(asker, answer, insert.sequence) for asker in insert.askers if asker is not answered]
 
     def is_open(self, insert: Arrived) -> bool:
         """Has `insert` no answer yet?"""
@@ -168,11 +176,11 @@ class Admission:
         effects: list[Effect] = []
         for client in self._clients.values():
             gone = list(client.open.values()) if given else [*client.ready, *client.parked.values()]
+            client.next = min([*(insert.sequence for insert in gone), client.next])
             for insert in gone:
-                effects += [Refuse(asker, problem) for asker in insert.askers]
+                effects += [Refuse(asker, problem, client.next) for asker in insert.askers]
                 del client.open[insert.sequence]
                 self._bytes -= insert.size
-            client.next = min([*(insert.sequence for insert in gone), client.next])
             client.ready.clear()
             client.parked.clear()
         self._turns.clear()
@@ -210,7 +218,7 @@ class Admission:
         if arrived.sequence in client.open:
             return self._ask_again(client.open[arrived.sequence], arrived, client.next)
         if arrived.sequence < client.next:
-            return [_reply(arrived.askers[0], _remembered(client, arrived))]
+            return [_reply(arrived.askers[0], _remembered(client, arrived), arrived.sequence)]
         if self._closing is not None:
             raise self._closing
         if self._blocked is not None:
@@ -253,7 +261,9 @@ class Admission:
         if insert.digest != arrived.digest:
             raise BadSequence(arrived.client, arrived.sequence, "a number not used for another insert", following)
         insert.askers.append(arrived.askers[0])
-        return [Refuse(insert.askers.pop(0), self._busy())] if len(insert.askers) > _ASKERS else []
+        if len(insert.askers) <= _ASKERS:
+            return []
+        return [Refuse(insert.askers.pop(0), self._busy(), min(following, insert.sequence))]
 
     def _admit_next(self, client: _Client, arrived: Arrived) -> None:
         """Into the inbox, and with it whatever waited for just this one."""
@@ -295,7 +305,7 @@ class Admission:
         effects: list[Effect] = []
         for sequence, insert in client.parked.items():
             why = problem or BadSequence(insert.client, sequence, _wanted(client), client.next)
-            effects += [Refuse(asker, why) for asker in insert.askers]
+            effects += [Refuse(asker, why, client.next) for asker in insert.askers]
             del client.open[sequence]
             self._bytes -= insert.size
         self._parked -= len(client.parked)
@@ -326,5 +336,6 @@ def _wanted(client: _Client) -> str:
     return f"{client.next} first"
 
 
-def _reply(asker: Asker, answer: object) -> Effect:
-    return Answer(asker, answer) if isinstance(answer, bytes) else Refuse(asker, answer)
+def _reply(asker: Asker, answer: object, sequence: int) -> Effect:
+    """The final answer to the insert of that number, which is used up."""
+    return Answer(asker, answer) if isinstance(answer, bytes) else Refuse(asker, answer, sequence + 1)

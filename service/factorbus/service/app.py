@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 from factorbus.proto import codec, keys
-from factorbus.proto.problems import Busy, Internal, Problem
+from factorbus.proto.problems import Busy, Internal, Problem, UnknownQuestion
 from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
 from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
@@ -41,6 +41,7 @@ from factorbus.service.maps import Maps
 from factorbus.service.metrics import open_metrics
 from factorbus.service.optima import Optima
 from factorbus.service.questions import Question, Snapshot
+from factorbus.service.room import Room
 from factorbus.service.senders import Senders
 from factorbus.service.start import get_ready_to_compute
 from factorbus.service.trips import Trips
@@ -51,6 +52,7 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.25
 _ADMIN_WAITING = 1024
 _TOKEN_S = 10.0
+_FIRST = 1  # the number that is wanted of a client that is not known
 
 
 def serve(
@@ -135,8 +137,9 @@ class Shell:
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = Features(
-            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s
-        )
+            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s,
+            Room(self.vitals.memory, limits.answer_bytes),
+        )  # fmt: skip
         if config.warm:
             log.info("features: %s", self._features.measure())
         chunk = config.maps.replace("*", "$*") if config.maps != "*" else "*"
@@ -186,15 +189,15 @@ class Shell:
         try:
             name, client = sender = self._senders.find(key)
         except Problem as problem:
-            self._delivery.refusals.hand(refuse, query, problem)
+            self._delivery.refusals.hand(refuse, query, problem, _FIRST)
             return
         found = self.maps.get(name)
         if found is None:
-            self._delivery.refusals.hand(self._no_map, query, name)
+            self._delivery.refusals.hand(self._no_map, query, name, _FIRST)
             return
         read = read_insert(query, client, payload, self._decoding, time.monotonic())
         if isinstance(read, Refuse):
-            self._delivery.refusals.hand(refuse, query, read.problem)
+            found.host.unread(client, read)
             return
         self._senders.remember(key, sender)
         if (full := self.vitals.memory.no_room(read.size)) is not None:
@@ -248,9 +251,9 @@ class Shell:
     def _fork(self, asker: Asker, question: Question, taken: Snapshot) -> None:
         self._desk.hand(self.maps.forked, asker, question, taken)
 
-    def _no_map(self, query: Asker, name: str) -> None:
+    def _no_map(self, query: Asker, name: str, following: int | None = None) -> None:
         if problem := self.maps.missing(name):
-            refuse(query, problem)
+            refuse(query, problem, following)
         else:
             ignore(query)
 
@@ -272,8 +275,10 @@ class Shell:
                 self.maps.fork(query, read_fork(payload))
             elif operation == "drop":
                 self.maps.drop(query, read_drop(payload))
+            elif self._config.connect:
+                ignore(query)  # another service at the router may know it
             else:
-                ignore(query)  # somebody else's key
+                raise UnknownQuestion(f"admin/{operation}", "maps, stats, create, fork or drop")
         except NotHere as problem:
             if self._config.connect:
                 ignore(query)  # for another service at the router

@@ -5,6 +5,7 @@ import numpy as np
 from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.messages import Insert
+from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
 from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Asker, Located, Refuse
@@ -21,7 +22,8 @@ _SHAPE = (_GROUPS + 1, layout.G_WIDTH)
 def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
     """The arrival of the insert in `payload`; a refusal when not even its sequence number can be read.
 
-    A message that is wrong inside still uses up its number, so that the ones after it need not wait for it.
+    A message that is wrong inside still uses up its number, so that the ones after it need not wait for it; whether it
+    did, `detail.next` tells.
     """
     size = len(payload)
     if size <= _SHORT_BYTES and (located := try_locate(payload, limits)):
@@ -30,7 +32,7 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
     try:
         insert = codec.decode_insert(payload, limits)
     except Problem as problem:
-        place = _place(payload)
+        place = find_place(payload)
         if place is None:
             return Refuse(asker, problem)
         return Arrived([asker], client, *place, size, digest_of(payload), problem, now, payload)
@@ -58,13 +60,3 @@ def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] 
     if not sequence:
         return None
     return int(sequence), int(epoch), int(digest), Located(payload, groups, bool(settle))
-
-
-def _place(payload: bytes) -> tuple[int, int] | None:
-    """(sequence, epoch) of a message that is otherwise wrong."""
-    try:
-        content = codec.decode_map(payload, ANSWER_LIMITS)
-    except Problem:
-        return None
-    sequence, epoch = content.get("sequence"), content.get("epoch", 0)
-    return (sequence, epoch) if type(sequence) is int and sequence >= 1 and type(epoch) is int else None

@@ -202,11 +202,11 @@ def reply(query: zenoh.Query, message: bytes) -> None:
             log.warning("not answered on %s: %s", query.key_expr, error)
 
 
-def refuse(query: zenoh.Query, problem: Any) -> None:
-    """Answer with a problem: anything with code, message and detail."""
+def refuse(query: zenoh.Query, problem: Any, following: int | None = None) -> None:
+    """Answer with a problem: anything with code, message and detail.  following: of an insert, `detail.next`."""
     with query:
         try:
-            query.reply_err(codec.encode_problem(problem))
+            query.reply_err(codec.encode_problem(problem, following))
         except zenoh.ZError as error:
             log.warning("not refused on %s: %s", query.key_expr, error)
 

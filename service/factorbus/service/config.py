@@ -42,6 +42,7 @@ class Limits:
     unwritten: int = 1024  # inserts that the journal has yet to write before the solver gets more
     parked_s: float = 5.0  # how long an insert waits for the one before it
     message_bytes: int = 64 << 20
+    answer_bytes: int = 256 << 20  # of one answer, which clients must be able to receive
     insert_variables: int = 1_000_000
     insert_factors: int = 1_000_000
     variables: int = 20_000_000

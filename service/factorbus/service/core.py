@@ -10,6 +10,7 @@ At most one Run is out at a time, so what the solver does next is decided when i
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from factorbus.proto import codec
@@ -104,6 +105,11 @@ class MapCore:
             if isinstance(effect, Refuse):
                 self._account.refused(effect.problem)
         return self._go_on(effects + judged, arrived.now)
+
+    def unread(self, client: str, refuse: Refuse) -> list[Effect]:
+        """An insert of `client` came in of which not even the number can be read."""
+        self._account.refused(refuse.problem)
+        return [replace(refuse, following=self._admission.wanted(client))]
 
     def ask(self, asked: Asked, now: float) -> list[Effect]:
         """A question came in."""

@@ -16,7 +16,7 @@ from factorbus.proto.problems import Internal, Problem
 from factorbus.service.bus import Place, refuse, reply
 from factorbus.service.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
 from factorbus.service.lane import Lane, Lanes
-from factorbus.service.questions import Question, Snapshot, answer
+from factorbus.service.questions import Question, Snapshot, answer, check_ready
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -75,6 +75,7 @@ class Delivery:
 
     def _read(self, place: Place, read: Read, taken: Snapshot) -> None:
         try:
+            check_ready(read.question, taken)
             if read.question.name == "keyframe":
                 # Behind the delta of the same revision: a mirror that had the keyframe first would skip the delta.
                 self.outbox.hand(place.publish, "keyframe", answer(read.question, taken))
@@ -110,7 +111,7 @@ class MapDelivery:
             elif isinstance(effect, Drained):
                 self._drained()
             elif isinstance(effect, Refuse):
-                self._all.refusals.hand(refuse, effect.asker, effect.problem)
+                self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
             else:
                 sending.append(effect)
         if sending:
@@ -128,7 +129,7 @@ class MapDelivery:
                 sending.append(effect)
                 size += len(effect.message)
             elif isinstance(effect, Refuse):
-                self._all.refusals.hand(refuse, effect.asker, effect.problem)
+                self._all.refusals.hand(refuse, effect.asker, effect.problem, effect.following)
         if sending:
             hand = self._all.outbox.hand_or_do if size <= _AT_ONCE_BYTES else self._all.outbox.hand
             hand(_send, self._place, sending)

@@ -152,10 +152,14 @@ class Tell:
 
 @dataclass(frozen=True, slots=True)
 class Refuse:
-    """Answer `asker` with a problem: anything with code, message and detail."""
+    """Answer `asker` with a problem: anything with code, message and detail.
+
+    following: of an insert, `detail.next`: above its number where that is used up; else what is wanted next.
+    """
 
     asker: Asker
     problem: Any
+    following: int | None = None
 
 
 class Publish(NamedTuple):

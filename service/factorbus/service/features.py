@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from factorbus.proto.features import Ask, Shard
+from factorbus.proto.features import Ask, Shard, answer_size
 from factorbus.proto.features_codec import decode_ask, encode_answer, encode_shard
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Job, JobDone
@@ -22,6 +22,7 @@ from factorbus.service.events import Asker
 from factorbus.service.jobs import Jobs, do_here
 from factorbus.service.lane import Lane
 from factorbus.service.rates import measured
+from factorbus.service.room import COPIES, Room
 from factorbus.service.sharding import Rates, Work, cuts, seconds, shards_for, work_of
 from factorbus.service.trips import Trips
 
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 _PATIENCE, _BESIDES_S = 20.0, 1.0
 # Nobody waits longer than this for features; every shard is done long before, in place if need be.
 _GIVE_UP_S = 600.0
+_UNBOUNDED = Room()
 
 
 @dataclass(slots=True)
@@ -67,10 +69,11 @@ class Features:
         limits: Limits,
         most: int,
         deadline_s: float,
+        room: Room = _UNBOUNDED,
     ) -> None:
         self._desk, self._jobs, self._trips = desk, jobs, trips
         self._reply, self._refuse = reply, refuse
-        self._limits, self._most, self._deadline_s = limits, most, deadline_s
+        self._limits, self._most, self._deadline_s, self._room = limits, most, deadline_s, room
         self._rates: Rates | None = None
         self._open = 0  # on the desk
         self._stopping = False
@@ -106,6 +109,7 @@ class Features:
             if self._stopping:
                 raise ShuttingDown
             ask = decode_ask(payload, self._limits)
+            self._check(ask)
             work, rates = work_of(ask), self._rates or self.measure()
             count = shards_for(work, rates, self._trips.known, self._jobs.slots("idp"))
             if count == 0:
@@ -119,6 +123,12 @@ class Features:
             self._refuse(asker, Internal(reference))
         else:
             self._desk.hand(self._submit, asker, _Cutting(payload, ask, count, work, rates))
+
+    def _check(self, ask: Ask) -> None:
+        """Is there room for the answer?  Raises TooLarge, OutOfMemory."""
+        size = answer_size(ask)
+        self._room.fits("the answer", size)
+        self._room.check(COPIES * size)
 
     def _here(self, asker: Asker, payload: bytes, count: int) -> None:
         done = do_here(Job("in-place", "idp", encode_shard(Shard(payload, 0, count))))

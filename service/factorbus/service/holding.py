@@ -20,6 +20,7 @@ from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
 from factorbus.service.events import Stepped
 from factorbus.service.questions import Copied, Question, Snapshot, snapshot
+from factorbus.service.room import Room
 from factorbus.service.uncertain import Uncertain
 from factorbus.solver.divergence import check_step, is_usual, undone
 
@@ -57,12 +58,19 @@ class Holding:
         self._held = (0, 0)  # variables and factors that were accepted
         self._broken = ""
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
+        self._room = Room()
+
+    def bound(self, room: Room) -> None:
+        """Questions may take no more than this."""
+        self._room = room
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
-        taken = snapshot(self._solver, self._epoch, self._revision, questions, self._account, self._uncertain)
+        taken = snapshot(
+            self._solver, self._epoch, self._revision, questions, self._account, self._uncertain, self._room
+        )
         self._uncertain = taken.uncertain
         rooms = [question.ask.room for question in questions if question.name == "copy"]
         return replace(taken, copied=self._copied(min(rooms))) if rooms else taken

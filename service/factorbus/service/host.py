@@ -103,6 +103,12 @@ class Host:
         else:
             self._perform(effects)
 
+    def unread(self, client: str, refuse: Refuse) -> None:
+        """An insert of `client` came in of which not even the number can be read."""
+        with self._lock:
+            effects = self.core.unread(client, refuse)
+        self._perform(effects)
+
     def ask(self, asked: Asked) -> None:
         """A question came in."""
         with self._lock:

@@ -12,9 +12,12 @@ class NotInMap(Problem):
     code = "unknown_variable"
 
     def __init__(self, keys: Iterable[int]) -> None:
-        names = [format_symbol(int(key)) for key in keys]
-        shown = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-        super().__init__(f"the map has no {shown}; ask without keys for all there are", keys=names[:100])
+        missing = [int(key) for key in keys]
+        names = ", ".join(map(format_symbol, missing[:5]))
+        shown = names + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        super().__init__(
+            f"the map has no {shown}; ask without keys for all there are", key=missing[0], keys=missing[:100]
+        )
 
 
 class NoPose(Problem):

@@ -152,7 +152,7 @@ class Kept:
         limits, epoch = self._config.limits, self.header.epochs[-1]
         senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
         core.restore(
-            [(sender.client, sender.next, answers(sender, epoch.epoch)) for sender in senders],
+            [(sender.client, sender.next, answers(sender)) for sender in senders],
             restored(self.folder),
         )
 

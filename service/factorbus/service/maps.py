@@ -39,6 +39,7 @@ from factorbus.service.library import Kept, Library, make_folder, restored
 from factorbus.service.memory import Memory, OutOfMemory
 from factorbus.service.questions import Copied, Question, Snapshot
 from factorbus.service.reordering import Reordering
+from factorbus.service.room import Room
 
 log = logging.getLogger(__name__)
 
@@ -234,6 +235,7 @@ class Maps:
 
     def _at_work(self, core: MapCore, folder: Folder, kept: Kept | None) -> Owned:
         name = core.name
+        folder.bound(Room(self._memory, self._config.limits.answer_bytes))
         place, options = self._bus.place(name, self._service), folder.options()
 
         def more() -> dict[str, Any]:

@@ -5,6 +5,7 @@ grow is refused, and who is refused is told why; questions, jobs and dropping ma
 """
 
 import os
+import threading
 
 from factorbus.proto.problems import Problem
 from factorbus.service.control_groups import limit_files
@@ -14,6 +15,8 @@ _SHARE = 0.8
 # What an insert comes to in memory, by its bytes on the wire: as a message, in the graph, in Λ and in R.  Measured:
 # 6 to 9 for poses along a trajectory, with arrays that double as they grow; loops fill R further.
 _GROWTH = 10
+# Questions may have this share of the limit also where maps have come up to it.
+_QUESTIONS = 1 / 4
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -33,6 +36,17 @@ class OutOfMemory(Problem):
         )
 
 
+class NoRoom(OutOfMemory):
+    """A question whose answer would take more memory than there is for questions."""
+
+    def __init__(self, resident: int, limit: int, more: int) -> None:
+        super().__init__(resident, limit, more)
+        self.args = (
+            f"to answer this question takes {_megabytes(more)} MiB of memory; the service has {resident >> 20} MiB and "
+            f"its limit is {limit >> 20} MiB: ask for less at a time, or give it more with limits.memory_bytes",
+        )
+
+
 class Memory:
     """Of this process.  limit: bytes; 0: four fifths of what the container or the machine has."""
 
@@ -41,6 +55,7 @@ class Memory:
         self._file = os.open("/proc/self/statm", os.O_RDONLY)
         self.resident = self._measure()
         self._promised = 0  # bytes taken in since that was measured
+        self._lent, self._lending = 0, threading.Lock()  # bytes that questions being answered may come to
 
     def look(self) -> None:
         """Measure anew; a few microseconds."""
@@ -62,12 +77,35 @@ class Memory:
         self.look()
         return max(self.limit - self.resident, 0)
 
+    def lend(self, size: int) -> None:
+        """Bytes for a question, until `give_back`; all of them together have what is left, or a quarter of the limit.
+
+        Raises OutOfMemory: then nothing is lent.
+        """
+        with self._lending:
+            more = self._lent + size
+            if more > _QUESTIONS * self.limit and self.resident + more > self.limit:
+                self.look()
+                if self.resident + more > self.limit:
+                    raise NoRoom(self.resident, self.limit, size)
+            self._lent = more
+
+    def give_back(self, size: int) -> None:
+        """They are free again."""
+        with self._lending:
+            self._lent -= size
+
     def close(self) -> None:
         """No more measuring."""
         os.close(self._file)
 
     def _measure(self) -> int:
         return int(os.pread(self._file, 128, 0).split()[1]) * _PAGE
+
+
+def _megabytes(size: int) -> int:
+    """At least 1."""
+    return max(size >> 20, 1)
 
 
 def available() -> int:

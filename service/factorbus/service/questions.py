@@ -11,21 +11,26 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.proto import codec
+from factorbus.proto import codec, fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
-from factorbus.proto.problems import BadMessage, Problem, UnknownQuestion
+from factorbus.proto.problems import BadOption, Problem, UnknownQuestion
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.service.lacking import NotInMap
-from factorbus.service.uncertain import DECODE, Uncertain, is_near
+from factorbus.service.room import COPIES, Room
+from factorbus.service.uncertain import DECODE, Uncertain, check_keys, is_near
 from factorbus.solver.errors import SolverError
 from factorbus.solver.repair import repair
 
 _FORMATS = ("g2o", "tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
+_WAIT_S = (0.001, 86_400.0)
+# How many times the bytes of the solver it takes to repair a map, and to factorise one in a mode that keeps no R.
+_REPAIR, _FRESH = 4, 3
+_UNBOUNDED = Room()
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +65,8 @@ class Snapshot:
     """Copies of what some questions need, all of one revision.
 
     uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
-    solver's copy of everything.  copied: the folder's, and after which fold of the journal that was.
+    solver's copy of everything.  copied: the folder's, and after which fold of the journal that was.  room: for what
+    is made of it.
     """
 
     epoch: int
@@ -73,6 +79,7 @@ class Snapshot:
     content: Any = None
     copied: Copied | None = None
     fold: int = 0
+    room: Room = _UNBOUNDED
 
     @property
     def graph(self) -> Graph:
@@ -92,23 +99,22 @@ def parse(name: str, payload: bytes) -> Question:
         return Question(name, ask=decode_ask_repair(payload))
     content = codec.decode_map(payload, REQUEST_LIMITS, what="question")
     if name == "chi2":
-        batch, values = _flag(content, "batch"), _flag(content, "values")
-        return Question(name, batch=batch, values=values, timeout_s=_seconds(content, "timeout_s", 60.0))
+        timeout_s = fields.parameter("question", content, "timeout_s", _WAIT_S, "from 0.001 to 86400 seconds", 60.0)
+        batch, values = fields.flag("question", content, "batch"), fields.flag("question", content, "values")
+        return Question(name, batch=batch, values=values, timeout_s=timeout_s)
     return _export(content) if name == "export" else Question(name)
 
 
 def _export(content: dict[str, Any]) -> Question:
-    """The question for a file.  Raises UnknownQuestion, BadMessage."""
-    format, ids, robot = content.get("format", "g2o"), content.get("ids", "auto"), content.get("robot")
-    if format not in _FORMATS:
-        raise UnknownQuestion("export", f"a format of {', '.join(_FORMATS)}, not {format!r:.40}")
-    if ids not in _IDS:
-        raise UnknownQuestion("export", f"ids of {', '.join(_IDS)}, not {ids!r:.40}")
-    if robot is not None and not (isinstance(robot, str) and len(robot) <= 1):
-        raise BadMessage("question.robot", f"is {robot!r:.40}", "one letter, or an empty string")
+    """The question for a file.  Raises BadMessage, BadOption."""
+    format = fields.word("question", content, "format", _FORMATS, "g2o")
+    ids = fields.word("question", content, "ids", _IDS, "auto")
+    robot = fields.text("question", content, "robot", "") if content.get("robot") is not None else None
+    if robot is not None and (len(robot) > 1 or (robot and not (robot.isascii() and robot.isalpha()))):
+        raise BadOption("question.robot", f"is {robot[:40]!r}", "one ASCII letter, or an empty string")
     if robot is not None and format == "g2o":
-        raise UnknownQuestion("export", "robot of a trajectory (tum, kitti): g2o has the whole map")
-    return Question("export", format=format, robot=robot, strict=_flag(content, "strict"), ids=ids)
+        raise BadOption("question.robot", f"is {robot!r}", "none with g2o, which has the whole map")
+    return Question("export", format=format, robot=robot, strict=fields.flag("question", content, "strict"), ids=ids)
 
 
 def snapshot(
@@ -118,11 +124,14 @@ def snapshot(
     questions: Sequence[Question],
     account: Mapping[str, Any],
     uncertain: Uncertain | None = None,
+    room: Room = _UNBOUNDED,
 ) -> Snapshot:
     """What `questions` need of `solver`, copied.  account: of its last step.  uncertain: R, if it is copied already.
 
-    Raises SolverError.
+    room: what has no room is refused by itself.  Raises SolverError.
     """
+    ready = _refused(solver, questions, uncertain is not None, room)
+    questions = [question for question in questions if id(question) not in ready]
     names = {question.name for question in questions}
     whole = bool(names & {"graph", "export"}) or any(q.batch for q in questions)
     variables, factors = solver.graph() if whole else ((), ())
@@ -132,15 +141,46 @@ def snapshot(
     asked = [question for question in questions if question.name in DECODE]
     view = solver.try_view() if any(is_near(question.ask) for question in asked) else None
     near = [question for question in asked if view is not None and is_near(question.ask)]
-    ready = {}
     if view is not None:
-        here = Uncertain(view, epoch, revision, keeps_steps=True, account=account)
-        ready = {id(question): _answer_or_problem(here, question) for question in near}
+        here = Uncertain(view, epoch, revision, True, account, room)
+        ready |= {id(question): _answer_or_problem(here, question) for question in near}
     if uncertain is None and len(near) < len(asked):
         keeps_steps = view is not None or solver.try_view() is not None
-        uncertain = Uncertain(solver.factored(), epoch, revision, keeps_steps, account)
+        try:
+            uncertain = Uncertain(solver.factored(), epoch, revision, keeps_steps, account, room)
+        except SolverError as problem:  # of those questions only
+            ready |= {id(question): problem for question in asked if id(question) not in ready}
     content = solver.content() if "repair" in names else None
-    return Snapshot(epoch, revision, as_variables(variables), as_factors(factors), chi2, uncertain, ready, content)
+    groups = as_variables(variables), as_factors(factors)
+    return Snapshot(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)
+
+
+def _refused(solver: Any, questions: Sequence[Question], has_copy: bool, room: Room) -> dict[int, bytes | Exception]:
+    """Why there is no answer, by the identity of the question, of those that there is no room for."""
+    refused: dict[int, bytes | Exception] = {}
+    for question in questions:
+        try:
+            _check(solver, question, has_copy, room)
+        except Problem as problem:
+            refused[id(question)] = problem
+    return refused
+
+
+def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
+    """Is there room for what `question` needs copied, and for its answer?  Raises TooLarge, OutOfMemory."""
+    name = question.name
+    if name in ("estimate", "graph", "export") or question.batch:
+        variables, factors = solver.columns_bytes()
+        size = variables if name == "estimate" else variables + factors
+        if name == "graph" or (name == "estimate" and question.keys is None):
+            room.fits("the answer", size)
+        room.check(COPIES * size)
+    elif name == "repair":
+        room.check(_REPAIR * solver.memory_bytes())
+    elif name in DECODE:
+        check_keys(question.ask, room)
+        if not has_copy and not (is_near(question.ask) and solver.try_view() is not None):
+            room.check((1 if solver.try_view() is not None else _FRESH) * solver.memory_bytes())
 
 
 def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
@@ -155,13 +195,25 @@ def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
 
 def answer(question: Question, taken: Snapshot) -> bytes:
     """The answer to any question but stats and chi2 against batch.  Raises Problem, SolverError."""
+    message = _answer(question, taken)
+    if question.name != "keyframe":
+        taken.room.fits("the answer", len(message))
+    return message
+
+
+def check_ready(question: Question, taken: Snapshot) -> None:
+    """Raises what `question` was refused with when the snapshot was taken."""
+    if isinstance(ready := taken.ready.get(id(question)), Exception):
+        raise ready
+
+
+def _answer(question: Question, taken: Snapshot) -> bytes:
+    check_ready(question, taken)
     if question.name == "repair":
         return _repaired(taken, question.ask)
     if question.ask is not None:
         ready = taken.ready.get(id(question))
-        if isinstance(ready, Exception):
-            raise ready
-        return ready if ready is not None else _uncertain(taken).answer(question.ask)
+        return ready if isinstance(ready, bytes) else _uncertain(taken).answer(question.ask)
     if question.name in ("estimate", "keyframe"):
         chosen = taken.variables if question.keys is None else _chosen(taken.variables, question.keys)
         return codec.encode_estimate(Estimate(taken.epoch, taken.revision, chosen))
@@ -228,17 +280,3 @@ def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
         written = as_g2o(batch, question.strict, question.ids)
         return written.text, list(written.notes)
     return {"tum": tum_text, "kitti": kitti_text}[question.format](batch, question.robot), []
-
-
-def _flag(content: dict[str, Any], name: str) -> bool:
-    value = content.get(name, False)
-    if type(value) is not bool:
-        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "true or false")
-    return value
-
-
-def _seconds(content: dict[str, Any], name: str, default: float) -> float:
-    value = content.get(name, default)
-    if type(value) not in (int, float) or not 0 < value <= 86_400:
-        raise BadMessage(f"question.{name}", f"is {value!r:.40}", "seconds, more than 0 and at most a day")
-    return float(value)

@@ -17,8 +17,8 @@ from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold, S
 from factorbus.journal.snapshots import file_of, read_snapshot
 from factorbus.journal.store import Last, Store
 from factorbus.proto import codec
-from factorbus.proto.messages import Accepted
 from factorbus.service.arrival import read_again
+from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Judged, Stepped
 from factorbus.service.fold import Folder
 
@@ -116,18 +116,11 @@ class _History:
         return present
 
 
-def answers(sender: Sender, epoch: int) -> Iterator[tuple[int, int, object]]:
-    """What a client was answered: (sequence, digest, answer).  The step's account of work is not among what is kept."""
+def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:
+    """What a client was answered: (sequence, digest, answer), to the byte."""
     for entry in sender.entries:
-        yield entry.sequence, read_again(entry.message)[0], _answer(entry, epoch)
-
-
-def _answer(entry: Entry, epoch: int) -> object:
-    if entry.outcome == ACCEPTED:
-        return codec.encode_accepted(
-            Accepted(entry.sequence, epoch, entry.revision, entry.first_factor, entry.together)
-        )
-    return codec.decode_problem(entry.problem)
+        accepted = entry.outcome == ACCEPTED
+        yield entry.sequence, digest_of(entry.message), entry.answer if accepted else codec.decode_problem(entry.answer)
 
 
 def _from_snapshot(store: Store, folder: Folder, fingerprint: str) -> Last:

@@ -2,6 +2,7 @@
 
 A few variables are looked up in R where it lies, between two steps: a path to the root, microseconds.  For more R is
 copied there, and the answer computed on the thread that sends it.  One copy serves all questions about its revision.
+What an answer comes to is known before anything is allocated for it (`costs`).
 """
 
 import threading
@@ -14,13 +15,14 @@ from factorbus.proto import asking, asking_codec
 from factorbus.proto.arrays import I64
 from factorbus.proto.asking import Associated, CovarianceGroup, Covariances, Gained, Gated, Why
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Factors
 from factorbus.proto.problems import TooLarge
+from factorbus.service import costs
 from factorbus.service.lacking import NoPose, NotInMap
+from factorbus.service.room import Room, Taken
 from factorbus.solver.covariance.association import associate
 from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.candidates import Candidates, judge_candidates
 from factorbus.solver.covariance.factored import Factored
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
@@ -31,6 +33,10 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 # Measured on city10000: a path to the root takes 0.1 ms, a copy of R 5 ms.
 _NEAR = 8  # variables of a question that is answered from R where it lies
 _MOST = 100_000  # candidates, or pairs of sighting and landmark, in one question: some 100 MB of Jacobians
+_MOST_FACTORS = 10_000  # of a variable that is asked about: some seconds
+_OF_AN_ACCOUNT = 100  # numbers that an account of a factor comes to, with its names, at most
+_SMALLEST = min(kind.dim for kind in VARIABLE_KINDS.values())
+_UNBOUNDED = Room()
 
 DECODE: Mapping[str, Callable[[bytes], Any]] = {
     "covariance": asking_codec.decode_ask_covariance,
@@ -54,56 +60,70 @@ def is_near(ask: Any) -> bool:
 class Uncertain:
     """R at one revision.  Threads take turns: candidates are put into the graph, and taken out again.
 
-    keeps_steps: the solver notes when each variable moved.  account: of the last step.
+    keeps_steps: the solver notes when each variable moved.  account: of the last step.  room: for answers.
     """
 
     def __init__(
-        self, factored: Factored, epoch: int, revision: int, keeps_steps: bool, account: Mapping[str, Any]
+        self,
+        factored: Factored,
+        epoch: int,
+        revision: int,
+        keeps_steps: bool,
+        account: Mapping[str, Any],
+        room: Room = _UNBOUNDED,
     ) -> None:
-        self._blocks, self._graph = Blocks(factored), factored.graph
+        self._blocks, self._graph, self._room = Blocks(factored), factored.graph, room
         self._when = epoch, revision
         self._keeps_steps, self._account = keeps_steps, account
         self._turn = threading.Lock()
 
     def answer(self, ask: Any) -> bytes:
         """The bytes of the answer.  Raises Problem, SolverError."""
-        with self._turn:
-            return _ANSWER[type(ask)](self, ask)
+        with self._turn, self._room.taken() as taken:
+            return _ANSWER[type(ask)](self, ask, taken)
 
-    def covariance(self, ask: asking.AskCovariance) -> bytes:
+    def covariance(self, ask: asking.AskCovariance, taken: Taken) -> bytes:
         """ask/covariance"""
         if ask.blocks == "diagonal":
             every = np.arange(self._blocks.factored.count) if ask.keys is None else self._find(ask.keys)
-            return self._grouped("diagonal", every)
+            return self._grouped("diagonal", every, taken)
         if ask.blocks == "last":
-            return self._grouped("last", self._last_pose())
+            return self._grouped("last", self._last_pose(), taken)
         keys = np.empty(0, np.int64) if ask.keys is None else ask.keys
         if ask.blocks == "relative":
             first, second = self._find(keys.reshape(-1)).reshape(-1, 2).T
+            width = self._blocks.width
+            self._afford(costs.of_candidates(self._blocks, len(first), width * width + width + 3), taken)
             found = relative(self._blocks, np.ascontiguousarray(first), np.ascontiguousarray(second))
             groups = [CovarianceGroup(each.kind, keys[each.rows], each.covariance, each.values) for each in found]
             return asking_codec.encode_covariances(Covariances(*self._when, "relative", tuple(groups)))
-        return self._together(ask.blocks, keys, ask.others)
+        return self._together(ask.blocks, keys, ask.others, taken)
 
-    def gate(self, ask: asking.AskGate) -> bytes:
+    def gate(self, ask: asking.AskGate, taken: Taken) -> bytes:
         """ask/gate"""
-        found = judge_candidates(self._blocks, _checked(ask.factors))
+        found = self._judge(ask.factors, 3, taken)
         allowed = threshold(found.dims, ask.probability)
         plausible = found.distance <= allowed
         return asking_codec.encode_gated(Gated(*self._when, found.distance, found.dims, allowed, plausible))
 
-    def gain(self, ask: asking.AskGain) -> bytes:
+    def gain(self, ask: asking.AskGain, taken: Taken) -> bytes:
         """ask/gain"""
-        found = judge_candidates(self._blocks, _checked(ask.factors))
+        found = self._judge(ask.factors, 1, taken)
         return asking_codec.encode_gained(Gained(*self._when, found.gain))
 
-    def associate(self, ask: asking.AskAssociate) -> bytes:
+    def associate(self, ask: asking.AskAssociate, taken: Taken) -> bytes:
         """ask/associate"""
         pose = int(self._find(np.array([ask.pose]))[0])
         landmarks = self._landmarks(ask.kind) if ask.landmarks is None else self._find(np.unique(ask.landmarks))
-        _check_size("the question", len(ask.measured) * landmarks.size, "pairs of sighting and landmark")
+        pairs = len(ask.measured) * landmarks.size
+        _check_size("the question", pairs, _MOST, "pairs of sighting and landmark")
+        self._afford(costs.of_candidates(self._blocks, pairs, 3), taken)
+
+        def weigh(variables: I64, numbers: int) -> None:
+            taken.take(costs.of_joint_innovations(self._blocks, variables, numbers))
+
         found = associate(
-            self._blocks, ask.kind, pose, ask.measured, ask.information, landmarks, ask.probability
+            self._blocks, ask.kind, pose, ask.measured, ask.information, landmarks, ask.probability, weigh
         )  # fmt: skip
         matched = found.landmark >= 0
         allowed = float(threshold(np.array([found.dims]), ask.probability)[0]) if found.dims else 0.0
@@ -122,19 +142,36 @@ class Uncertain:
             )
         )
 
-    def why(self, ask: asking.AskWhy) -> bytes:
+    def why(self, ask: asking.AskWhy, taken: Taken) -> bytes:
         """ask/why"""
         variable: dict[str, Any] = {}
         factor: dict[str, Any] = {}
         if ask.key is not None:
             index = int(self._find(np.array([ask.key]))[0])
+            count = self._graph.count_factors(index)
+            _check_size("the account of this variable", count, _MOST_FACTORS, "factors")
+            self._afford(costs.of_candidates(self._blocks, count, _OF_AN_ACCOUNT), taken)
             variable = why_variable(self._blocks, index, self._keeps_steps).as_dict()
         elif ask.factor is not None:
             factor = why_factor(self._blocks, ask.factor).as_dict()
         return asking_codec.encode_why(Why(*self._when, variable, factor, self._account))
 
-    def _grouped(self, blocks: str, variables: I64) -> bytes:
+    def _judge(self, factors: Sequence[Factors], numbers: int, taken: Taken) -> Candidates:
+        """Without their losses: a gate is to judge the measurement as it is.  numbers: that are answered of each."""
+        count = sum(len(group.keys) for group in factors)
+        _check_size("the question", count, _MOST, "candidates")
+        self._afford(costs.of_candidates(self._blocks, count, numbers), taken)
+        plain = [Factors(group.kind, group.keys, group.measured, group.information) for group in factors]
+        return judge_candidates(self._blocks, plain)
+
+    def _afford(self, cost: costs.Cost, taken: Taken) -> None:
+        """Raises TooLarge, OutOfMemory."""
+        self._room.fits("the answer", cost.answer)
+        taken.take(cost.memory)
+
+    def _grouped(self, blocks: str, variables: I64, taken: Taken) -> bytes:
         """Blocks of single variables, by kind."""
+        self._afford(costs.of_blocks(self._blocks, variables), taken)
         found, graph, groups = self._blocks.of(variables), self._graph, []
         codes = graph.var[variables, at.V_KIND]
         for code in np.unique(codes).tolist():
@@ -143,24 +180,19 @@ class Uncertain:
             groups.append(CovarianceGroup(kind.name, graph.keys[variables[rows]], covariance))
         return asking_codec.encode_covariances(Covariances(*self._when, blocks, tuple(groups)))
 
-    def _together(self, blocks: str, keys: I64, others: I64 | None) -> bytes:
+    def _together(self, blocks: str, keys: I64, others: I64 | None, taken: Taken) -> bytes:
         """One matrix: of all keys, or between keys and others."""
         rows = self._find(keys)
         columns = rows if others is None or blocks == "joint" else self._find(others)
         dims, other_dims = self._blocks.factored.dims[rows], self._blocks.factored.dims[columns]
-        every = np.unique(np.concatenate([rows, columns]))
-        size = 8 * int(self._blocks.factored.dims[every].sum()) ** 2
-        if size > ANSWER_LIMITS.max_bytes:
-            raise TooLarge("the joint covariance", size, ANSWER_LIMITS.max_bytes, "bytes")
+        self._afford(costs.of_matrix(self._blocks, rows, columns), taken)
+        covariance = self._blocks.between(rows, columns)
         if blocks == "joint":
-            covariance = self._blocks.joint(rows)
             return asking_codec.encode_covariances(
                 Covariances(*self._when, blocks, (), keys, dims, covariance=covariance)
             )
-        both = self._blocks.joint(np.concatenate([rows, columns]))
-        split = int(dims.sum())
         return asking_codec.encode_covariances(
-            Covariances(*self._when, blocks, (), keys, dims, others, other_dims, both[:split, split:])
+            Covariances(*self._when, blocks, (), keys, dims, others, other_dims, covariance)
         )
 
     def _find(self, keys: I64) -> I64:
@@ -184,18 +216,19 @@ class Uncertain:
         return np.flatnonzero(self._graph.var[: self._blocks.factored.count, at.V_KIND] == code)
 
 
-def _checked(groups: Sequence[Factors]) -> Sequence[Factors]:
-    """Without their losses: a gate is to judge the measurement as it is."""
-    _check_size("the question", sum(len(group.keys) for group in groups), "candidates")
-    return [Factors(group.kind, group.keys, group.measured, group.information) for group in groups]
+def check_keys(ask: Any, room: Room) -> None:
+    """Could a client receive the answer, if every variable were of the smallest kind?  Raises TooLarge."""
+    if isinstance(ask, asking.AskCovariance) and ask.blocks in ("joint", "cross") and ask.keys is not None:
+        others = ask.keys if ask.blocks == "joint" or ask.others is None else ask.others
+        room.fits("the answer", 8 * _SMALLEST * _SMALLEST * ask.keys.size * others.size)
 
 
-def _check_size(what: str, count: int, unit: str) -> None:
-    if count > _MOST:
-        raise TooLarge(what, count, _MOST, unit)
+def _check_size(what: str, count: int, most: int, unit: str) -> None:
+    if count > most:
+        raise TooLarge(what, count, most, unit)
 
 
-_ANSWER: Mapping[type, Callable[[Uncertain, Any], bytes]] = {
+_ANSWER: Mapping[type, Callable[[Uncertain, Any, Taken], bytes]] = {
     asking.AskCovariance: Uncertain.covariance,
     asking.AskGate: Uncertain.gate,
     asking.AskGain: Uncertain.gain,

@@ -28,7 +28,7 @@ def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | S
 
 def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:
     if isinstance(outcome.answer, bytes):
-        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, b""
+        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, outcome.answer
     else:
         tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
         answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)

@@ -12,7 +12,8 @@
     marginalise        keys (n,)                        these variables go; what their factors say of others is kept as
                                                         linear factors (`marginal`)
 
-Changes are made one after the other: what the first has removed the second cannot name.
+Changes are made one after the other: what the first has removed the second cannot name.  Each names what it is about
+once.
 """
 
 from collections.abc import Sequence
@@ -37,6 +38,7 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalise")
 _NONE = np.empty(0, np.int64)
 _QUATERNION_TOLERANCE = 1e-3
+_WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
 
 class ChangeLike(Protocol):
@@ -90,7 +92,7 @@ class Edits:
 def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
-    Raises UnknownKind, UnknownFactor, NotInMap, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
+    Raises UnknownKind, UnknownFactor, NotInMap, NamedTwice, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
     NotFinite, OutOfBounds, BadQuaternion, Apart, TooConnected, Underconstrained, BadOrder.
     """
     edits = unchanged(graph)
@@ -173,8 +175,9 @@ def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarra
 def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
     rows = _factors(graph, edits, change)
     weight = _numbers("weigh", "weight", change.weight, rows.size)
-    if (bad := np.flatnonzero(~(np.isfinite(weight) & (weight > 0.0)))).size:
-        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]))
+    least, most = _WEIGHTS
+    if (bad := np.flatnonzero(~((weight >= least) & (weight <= most)))).size:
+        raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]), f"from {least:g} to {most:g}")
     np.multiply.at(edits.weight, rows, weight)
     _check_weighed(graph, edits, rows)
     touched[rows] = True
@@ -191,7 +194,8 @@ def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
         bad = np.flatnonzero(~((least <= edits.weight[of]) & (edits.weight[of] <= most)))
         if bad.size:
             seen = float(edits.weight[of[bad[0]]])
-            raise errors.BadWeight(_id(graph, of, bad), seen, float(least[bad[0]]), float(most[bad[0]]))
+            wanted = f"{least[bad[0]]:g} to {most[bad[0]]:g}, which keeps its information in bounds"
+            raise errors.BadWeight(_id(graph, of, bad), seen, wanted)
 
 
 def _fix(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
@@ -267,6 +271,8 @@ def _factors(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
     missing = np.flatnonzero([row < 0 or not edits.kept[row] for row in rows.tolist()])
     if missing.size:
         raise errors.UnknownFactor(int(ids[missing[0]]), graph.next_id)
+    if (twice := _twice(ids)) is not None:
+        raise errors.NamedTwice(change.change, f"factor {twice}", factor=twice)
     return rows
 
 
@@ -277,7 +283,15 @@ def _variables(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
     missing = np.flatnonzero([v < 0 or not edits.stays[v] for v in found.tolist()])
     if missing.size:
         raise errors.NotInMap(int(keys[missing[0]]), change.change)
+    if (twice := _twice(keys)) is not None:
+        raise errors.NamedTwice(change.change, errors.printed(twice), key=twice)
     return found
+
+
+def _twice(named: I64) -> int | None:
+    """One of those that are named more than once."""
+    different, counts = np.unique(named, return_counts=True)
+    return int(different[counts > 1][0]) if different.size < named.size else None
 
 
 def _numbers(change: str, name: str, given: F64 | None, count: int) -> F64:

@@ -3,6 +3,7 @@
     SolverError
     ├── UnknownMode            unknown_mode            a mode of solving that does not exist
     ├── BadOption              bad_option              a setting out of its range
+    ├── TooLarge               too_large               more than is searched through in one piece
     ├── NoBackend              no_backend              a backend whose package is not installed
     ├── UnknownKind            unknown_kind            a kind of variable or factor that does not exist
     ├── BadShape               bad_shape               arrays whose sizes or types do not fit their kind or each other
@@ -26,14 +27,14 @@
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
     ├── TooConnected           too_connected           variables to be marginalised with too large a border
     ├── BadOrder               bad_order               changes in an order that has no meaning
-    ├── BadWeight              bad_weight              a weight that is not positive
+    ├── NamedTwice             named_twice             a change that names a factor or a variable twice
+    ├── BadWeight              bad_weight              a weight out of its range
     ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
     └── Underconstrained       underconstrained        a variable that the factors leave free to move
 
 `code`, `message` and `detail` (plain types) are what a service needs to pass any of them on.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -74,7 +75,16 @@ class BadOption(SolverError):
     code = "bad_option"
 
     def __init__(self, name: str, seen: str, wanted: str) -> None:
-        super().__init__(f"option {name}: seen {seen}, wanted {wanted}", name=name, seen=seen, wanted=wanted)
+        super().__init__(f"option {name}: seen {seen}, wanted {wanted}", where=name, seen=seen, wanted=wanted)
+
+
+class TooLarge(SolverError):
+    code = "too_large"
+
+    def __init__(self, what: str, size: int, limit: int, unit: str) -> None:
+        super().__init__(
+            f"{what} has {size} {unit}, the limit is {limit}; ask for less at a time", size=size, limit=limit
+        )
 
 
 class NoBackend(SolverError):
@@ -115,14 +125,18 @@ class UnknownVariable(SolverError):
     code = "unknown_variable"
 
     def __init__(self, key: int, factor: str) -> None:
-        super().__init__(f"{factor}: there is no variable {printed(key)}; add it in this batch or before", key=key)
+        super().__init__(
+            f"{factor}: there is no variable {printed(key)}; add it in this batch or before", key=key, keys=[key]
+        )
 
 
 class KindMismatch(SolverError):
     code = "kind_mismatch"
 
     def __init__(self, key: int, factor: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{factor}: {printed(key)} is a {seen}, wanted a {wanted} there", key=key, seen=seen)
+        super().__init__(
+            f"{factor}: {printed(key)} is a {seen}, wanted a {wanted} there", key=key, seen=seen, wanted=wanted
+        )
 
 
 class SelfLoop(SolverError):
@@ -136,7 +150,12 @@ class NotFinite(SolverError):
     code = "not_finite"
 
     def __init__(self, where: str) -> None:
-        super().__init__(f"{where} holds or leads to a NaN or an infinity; wanted finite numbers", where=where)
+        super().__init__(
+            f"{where} holds or leads to a NaN or an infinity; wanted finite numbers",
+            where=where,
+            seen="a NaN or an infinity",
+            wanted="finite numbers",
+        )
 
 
 class OutOfBounds(SolverError):
@@ -175,6 +194,8 @@ class BadQuaternion(SolverError):
         super().__init__(
             f"{where}: the quaternion has length {norm:.6g}, wanted 1 to within 1e-3, in the order qx qy qz qw",
             where=where,
+            seen=f"{norm:.6g}",
+            wanted="length 1 to within 1e-3",
         )
 
 
@@ -182,21 +203,31 @@ class BadRange(SolverError):
     code = "bad_range"
 
     def __init__(self, where: str, seen: float) -> None:
-        super().__init__(f"{where}: the range is {seen:g}, wanted more than 0, metres", where=where)
+        super().__init__(
+            f"{where}: the range is {seen:g}, wanted more than 0, metres",
+            where=where,
+            seen=f"{seen:g}",
+            wanted="more than 0, metres",
+        )
 
 
 class BadDirection(SolverError):
     code = "bad_direction"
 
     def __init__(self, where: str) -> None:
-        super().__init__(f"{where}: a direction has length 0, wanted a vector of any other length", where=where)
+        super().__init__(
+            f"{where}: a direction has length 0, wanted a vector of any other length",
+            where=where,
+            seen="length 0",
+            wanted="a vector of any other length",
+        )
 
 
 class BadLens(SolverError):
     code = "bad_lens"
 
     def __init__(self, where: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{where}: of its lens seen {seen}, wanted {wanted}", where=where)
+        super().__init__(f"{where}: of its lens seen {seen}, wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
 class BadSight(SolverError):
@@ -214,7 +245,7 @@ class BadLoss(SolverError):
     code = "bad_loss"
 
     def __init__(self, where: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{where}: seen {seen}, wanted {wanted}", where=where)
+        super().__init__(f"{where}: seen {seen}, wanted {wanted}", where=where, seen=seen, wanted=wanted)
 
 
 class NotPositiveDefinite(SolverError):
@@ -225,6 +256,8 @@ class NotPositiveDefinite(SolverError):
             f"{where}: the information matrix has the eigenvalue {smallest:.3g}, wanted all positive; it is the upper "
             "triangle, row by row, of the inverse of the measurement's covariance",
             where=where,
+            seen=f"the eigenvalue {smallest:.3g}",
+            wanted="all positive",
         )
 
 
@@ -258,7 +291,9 @@ class NotInMap(SolverError):
 
     def __init__(self, key: int, change: str) -> None:
         super().__init__(
-            f"{change}: there is no variable {printed(key)}, or not any more; ask/estimate has those there are", key=key
+            f"{change}: there is no variable {printed(key)}, or not any more; ask/estimate has those there are",
+            key=key,
+            keys=[key],
         )
 
 
@@ -296,14 +331,23 @@ class BadOrder(SolverError):
         super().__init__(f"{change}: wanted it {wanted}; send it as an insert of its own", change=change)
 
 
+class NamedTwice(SolverError):
+    code = "named_twice"
+
+    def __init__(self, change: str, named: str, **which: int) -> None:
+        super().__init__(f"{change} names {named} twice; name it once", change=change, **which)
+
+
 class BadWeight(SolverError):
     code = "bad_weight"
 
-    def __init__(self, factor: int, seen: float, least: float = 0.0, most: float = math.inf) -> None:
-        wanted = f"{least:g} to {most:g}, which keeps its information in bounds" if least else "a finite number above 0"
+    def __init__(self, factor: int, seen: float, wanted: str) -> None:
         super().__init__(
             f"weight of factor {factor}: seen {seen:g}, wanted {wanted}; to count it for nothing, remove it",
             factor=factor,
+            where=f"weight of factor {factor}",
+            seen=f"{seen:g}",
+            wanted=wanted,
         )
 
 

@@ -196,6 +196,16 @@ class Graph(Arenas):
         rows = fac[(fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)]
         return [self.describe(row) for row in rows]
 
+    def count_factors(self, variable: int) -> int:
+        """How many factors are on one variable."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        return int(np.count_nonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)))
+
+    def columns_bytes(self) -> tuple[int, int]:
+        """Bytes of all variables, and of all factors, as columns: keys, and values or measurement and information."""
+        variables, factors, values, payload, *_ = self.counts.tolist()
+        return 8 * (variables + values), 8 * (2 * factors + payload)
+
     def describe(self, row: I64) -> str:
         """One row of `fac`, for a person."""
         kind: FactorKind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]

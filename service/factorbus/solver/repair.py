@@ -38,6 +38,7 @@ _GROWTH, _ROUNDS = 1.4, 100
 # A weight of nothing keeps the pattern of Λ, and its pivots: a hundred millionth of a factor holds nothing.
 _LEAST = 1e-8
 _BINARY = 1e-2
+_SURE = (1e-12, 1.0 - 1e-12)  # where quantiles of χ² are numbers that can be computed with
 _NONE = np.empty(0, np.int64)
 
 
@@ -64,8 +65,8 @@ def repair(graph: Graph, factors: I64 | None = None, probability: float = 0.99) 
 
     probability: with which a right measurement is within c².  Raises UnknownFactor, BadOption.
     """
-    if not 0.0 < probability < 1.0:
-        raise errors.BadOption("probability", f"{probability:g}", "above 0 and below 1")
+    if not _SURE[0] <= probability <= _SURE[1]:
+        raise errors.BadOption("probability", f"{probability:g}", f"from {_SURE[0]:g} to 1 - {_SURE[0]:g}")
     rows = find_loops(graph) if factors is None else _rows(graph, factors)
     problem = _Problem(graph, rows, probability)
     before = problem.cost(graph.values)

@@ -247,6 +247,10 @@ class Solver:
         """Bytes in use for the graph and for what solves it."""
         return self._graph.memory_bytes() + (self._tree.tree if self._tree else self._system).memory_bytes()
 
+    def columns_bytes(self) -> tuple[int, int]:
+        """Bytes of all variables, and of all factors, as columns."""
+        return self._graph.columns_bytes()
+
     def graph(self, variables: int | None = None, factors: int | None = None) -> tuple[list[Group], list[FactorGroup]]:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids;
         but those that are one factor in pieces behind the others, in their order.

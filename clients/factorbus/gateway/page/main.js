@@ -81,7 +81,8 @@ async function explain(key) {
     const head = element("tr", null, ...["factor", "of", "χ²", "misfit", "known from it"].map((name) => element("th", name)));
     const rows = found.factors.map((f) => element("tr", null,
       element("td", f.kind), element("td", f.keys.join(" ")),
-      element("td", f.chi2.toPrecision(3)), element("td", f.misfit.toFixed(2)),
+      element("td", f.loss ? `${f.rho.toPrecision(3)} of ${f.chi2.toPrecision(3)}, ${f.loss}` : f.chi2.toPrecision(3)),
+      element("td", f.misfit.toFixed(2)),
       element("td", f.without === null ? "all" : `${Math.round(100 * f.known)} %`)));
     panel.replaceChildren(
       element("h2", found.key),

@@ -1,5 +1,6 @@
 """Which landmark each of a robot's sightings is of: compatible one by one, and all together.  MATH §10.4."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import admitted, judge_candidates, linearised
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.kernels.compatible import search
-from factorbus.solver.errors import BadOption, KindMismatch, printed
+from factorbus.solver.errors import KindMismatch, TooLarge, printed
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.groups import FactorGroup
 from factorbus.solver.kernels import layout as at
@@ -38,11 +39,14 @@ class Association:
 
 
 def associate(
-    blocks: Blocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float
-) -> Association:
+    blocks: Blocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float,
+    weigh: Callable[[I64, int], None] = lambda *_: None,
+) -> Association:  # fmt: skip
     """Sightings (rows of `measured` and `information`, as of a factor of `kind`) from variable `pose`.
 
-    landmarks: variables to choose from.  Raises KindMismatch, BadOption, and what `admit` raises for bad rows.
+    landmarks: variables to choose from.  weigh: is told, before it is computed, between which variables the joint
+    covariance will be, and how many numbers are measured; it may raise.
+    Raises KindMismatch, TooLarge, and what `admit` raises for bad rows.
     """
     graph, n, L = blocks.factored.graph, len(measured), landmarks.size
     _check(blocks, kind, pose, landmarks)
@@ -56,9 +60,8 @@ def associate(
     order = np.lexsort((distance[sightings, columns], sightings))
     sightings, columns = sightings[order], columns[order]
     if sightings.size > _MOST_PAIRS:
-        raise BadOption(
-            "landmarks", f"{sightings.size} compatible pairs", f"at most {_MOST_PAIRS}: fewer landmarks or sightings"
-        )
+        raise TooLarge("the question", int(sightings.size), _MOST_PAIRS, "compatible pairs of sighting and landmark")
+    weigh(np.unique(np.append(landmarks[columns], pose)), dim * sightings.size)
     chosen = sightings * L + columns
     pairs = FactorGroup(kind, every.keys[chosen], every.measured[chosen], every.information[chosen])
     best, joint, complete = _search(blocks, pairs, dim, n, sightings, columns, L, probability)

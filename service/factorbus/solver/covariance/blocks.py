@@ -10,6 +10,7 @@ from factorbus.solver.covariance.factored import DIMS, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.whole import whole_blocks
+from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
 
 # For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
@@ -60,24 +61,33 @@ class Blocks:
 
     def joint(self, variables: I64) -> F64:
         """(d, d): of several variables together, in their order; a variable may come twice."""
+        return self.between(variables, variables)
+
+    def path_scalars(self, variables: I64) -> int:
+        """Rows of R between `variables` and the roots: what `joint` of them goes through."""
+        f, seen, rows = self.factored, set[int](), 0
+        for v in variables[f.scalar[variables] >= 0].tolist():
+            c = int(f.node[v, tl.N_CLIQUE])
+            while c >= 0 and c not in seen:
+                seen.add(c)
+                rows += int(f.clique[c, tl.C_PIVOTS])
+                c = int(f.clique[c, tl.C_PARENT])
+        return rows
+
+    def between(self, rows: I64, columns: I64) -> F64:
+        """(d, e): between variables and variables, each in their order; one may come twice."""
         f = self.factored
-        different, which = np.unique(variables, return_inverse=True)
+        different = np.unique(np.concatenate([rows, columns]))
         free = different[f.scalar[different] >= 0]
         inner = np.zeros((int(f.dims[free].sum()),) * 2)
         joint_block(free, f.graph.var, DIMS, f.node, f.clique, f.lists, f.numbers, inner)
         # Where the scalars of `variables` are in `inner`; the last row and column of zeros serve the fixed ones.
         starts = np.full(different.size, -1)
         starts[f.scalar[different] >= 0] = np.cumsum(f.dims[free]) - f.dims[free]
-        places = np.concatenate(
-            [
-                start + np.arange(dim) if start >= 0 else np.full(dim, -1)
-                for start, dim in zip(starts[which].tolist(), f.dims[variables].tolist(), strict=True)
-            ]
-            or [np.empty(0, np.int64)]
-        )
         padded = np.zeros((len(inner) + 1,) * 2)
         padded[:-1, :-1] = inner
-        return padded[np.ix_(places, places)]
+        down, right = (_places(starts[np.searchsorted(different, ends)], f.dims[ends]) for ends in (rows, columns))
+        return padded[np.ix_(down, right)]
 
     def pairs(self, first: I64, second: I64) -> F64:
         """(k, width, width): between first[k] (rows) and second[k] (columns), each in the upper left corner."""
@@ -107,6 +117,13 @@ class Blocks:
             d, e = int(self.factored.dims[i]), int(self.factored.dims[j])
             out[k, :d, :e] = self.joint(np.array([i, j]))[:d, d:]
         return out
+
+
+def _places(starts: I64, dims: I64) -> I64:
+    """All scalars of variables whose first ones are at `starts`; −1 where that is."""
+    first = np.repeat(starts, dims)
+    within = np.arange(first.size) - np.repeat(np.cumsum(dims) - dims, dims)
+    return np.where(first < 0, -1, first + within)
 
 
 def _changes(ends: I64) -> int:

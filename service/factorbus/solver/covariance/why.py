@@ -14,6 +14,7 @@ from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64
+from factorbus.solver.kernels.chi2 import sum_chi2
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 _NOTHING = 1e-9
@@ -24,12 +25,12 @@ _STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)
 class FactorAccount:
     """One factor at the estimate.
 
-    loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one; residual and all that follows are times √w
-    asleep: why a sight has no pixel, and so no weight; else ""
-    residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: rᵀ Ω r
+    residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
+    loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one   rho: ρ(s), what it counts in χ²; s without a loss
+    asleep: why a sight has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
+    influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
+    without: by how much χ² would fall without it (10.8); None: nothing else measures what it does
     of a piece of negative weight (`joints`) Ω = −L Lᵀ: χ² and influence are not above 0, and there is no `without`
-    influence: tr(Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
-    without: rᵀ (Ω⁻¹ − H Σ Hᵀ)⁻¹ r, by how much χ² would fall without it; None: nothing else measures what it does
     """
 
     factor: int
@@ -43,6 +44,7 @@ class FactorAccount:
     without: float | None
     loss: str
     weight: float
+    rho: float
     asleep: str
 
     def as_dict(self) -> dict[str, Any]:
@@ -141,31 +143,42 @@ def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, fl
 
 
 def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccount:
+    """linear, T: with r and H times √w, as the solver has them."""
     graph = blocks.factored.graph
     row, factor = graph.fac[place], int(graph.ids_of(np.array([place]))[0])
     kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
     d = kind.dim
-    r, W, T = linear.r[0, :d].copy(), linear.W[0, :d, :d], T[:d, :d]
+    softened, W, T = linear.r[0, :d], linear.W[0, :d, :d], T[:d, :d]
     keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
+    r, s = _plain(graph, place, d)
+    rho, asleep = _chi2(graph, place), sights.why_asleep(graph, place)
     sign = -1.0 if W[0, 0] < 0.0 else 1.0
     L = np.linalg.cholesky(sign * W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
-    left = np.linalg.eigvalsh(np.eye(d) - L.T @ T @ L)
-    weighted = L.T @ r
+    M, pull = L.T @ T @ L, L.T @ softened
     without = None
-    if sign > 0.0 and left[0] > _NOTHING:
-        without = float(weighted @ np.linalg.solve(np.eye(d) - L.T @ T @ L, weighted))
+    if sign > 0.0 and np.linalg.eigvalsh(np.eye(d) - M)[0] > _NOTHING:
+        without = rho + float(pull @ np.linalg.solve(np.eye(d) - M, M @ pull))
     return FactorAccount(
-        factor, kind.name, keys, r, weighted, sign * float(weighted @ weighted), d, float(np.trace(W @ T)), without,
-        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), _weight(graph, place, linear),
-        sights.why_asleep(graph, place),
+        factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,
+        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), 0.0 if asleep else _weight(r, softened), rho,
+        asleep,
     )  # fmt: skip
 
 
-def _weight(graph: Graph, row: int, linear: Linear) -> float:
-    """w, from r with and without the loss."""
+def _plain(graph: Graph, row: int, dim: int) -> tuple[F64, float]:
+    """(r, rᵀ Ω r) of the factor in `row`, whatever its loss."""
     plain = copy.copy(graph)
     plain.fac = graph.fac[: row + 1].copy()
     plain.fac[row, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
-    r = linearised(plain, row, row + 1).r[0]
-    return float(linear.r[0] @ linear.r[0]) / float(r @ r) if r.any() else 1.0
+    return linearised(plain, row, row + 1).r[0, :dim].copy(), _chi2(plain, row)
+
+
+def _chi2(graph: Graph, row: int) -> float:
+    return float(sum_chi2(row, row + 1, graph.var, graph.fac, graph.values, graph.payload))
+
+
+def _weight(r: F64, softened: F64) -> float:
+    """w, of r times √w and r."""
+    largest = int(np.abs(r).argmax())
+    return float((softened[largest] / r[largest]) ** 2) if r[largest] else 1.0

@@ -1,0 +1,33 @@
+"""A step's account of work, as it is told in the answer to an insert and in a delta.  Explained in the contract, §4."""
+
+import math
+from typing import Any
+
+# What each documented field is where a service does not tell it: nothing counted, nothing known.
+_TEXTS = ("mode", "strategy", "because")
+_COUNTS = (
+    "iterations", "new_variables", "new_factors", "changed", "relinearised", "eliminated", "nnz_r", "flops", "asleep",
+    "points", "removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables",
+    "placed_variables", "added_factors",
+)  # fmt: skip
+_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms")
+
+
+class Report(dict[str, Any]):
+    """A map that is open: fields of later services are in it, and asking for a documented one never fails.
+
+    One that is not told is "", 0, NaN, False or an empty map, by its type; `in` and `get` say whether it was.
+    """
+
+    def __missing__(self, name: str) -> Any:
+        if name in _TEXTS:
+            return ""
+        if name in _COUNTS:
+            return 0
+        if name in _NUMBERS:
+            return math.nan
+        if name in ("converged", "converging"):
+            return False
+        if name == "phases_ms":
+            return {}
+        raise KeyError(name)

@@ -1,0 +1,90 @@
+"""What a factor with a loss is told to be worth, against the map solved again without it.  MATH (10.8)"""
+
+import numpy as np
+import pytest
+
+from factorbus.proto.messages import Batch, Change, Factors, Variables
+from factorbus.proto.symbols import symbol
+from factorbus.solver import Solver
+from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.why import FactorAccount, why_factor
+
+# ρ of an outlier ten standard deviations off, k = 1, and what the map falls by without it (the others hold 1e4 times as
+# firmly): the case of a front end whose client was written from the page alone.
+OUTLIER = {"huber": 19.0, "cauchy": 4.61, "geman-mcclure": 0.990, "tukey": 0.333, "dcs": 2.96}
+UNIT = np.array([[1.0, 0.0, 1.0]])
+
+
+def held_and_pulled(loss: str, apart: float, hold: float) -> Solver:
+    """A point that four factors hold where it is and one, with the loss, pulls at."""
+    key = np.array([[symbol("l", 1)]])
+    solver = Solver()
+    solver.stage(
+        Batch(
+            (Variables("point2", key[0], np.zeros((1, 2))),),
+            (
+                Factors("prior_point2", np.repeat(key, 4, axis=0), np.zeros((4, 2)), np.repeat(hold * UNIT, 4, axis=0)),
+                Factors("prior_point2", key, np.array([[apart, 0.0]]), UNIT, loss, np.ones(1)),
+            ),
+        )
+    )
+    solver.step(settle=True)
+    return solver
+
+
+def fall(solver: Solver, factor: int) -> float:
+    """By how much χ² falls where the map is solved again without the factor."""
+    without, *_ = solver.with_changes([Change("remove_factors", np.array([factor]))], Batch(), True)
+    return solver.chi2() - without.chi2()
+
+
+def account_of(solver: Solver, factor: int) -> FactorAccount:
+    return why_factor(Blocks(solver.factored()), factor)
+
+
+@pytest.mark.parametrize("loss", OUTLIER)
+def test_an_outlier_tells_its_residual_and_what_it_counts_apart(loss: str) -> None:
+    solver = held_and_pulled(loss, 10.0, 2500.0)
+    account = account_of(solver, 4)
+    s = float(account.residual @ account.residual)
+    assert account.residual == pytest.approx([-10.0, 0.0], abs=1e-2)
+    assert account.weighted == pytest.approx(account.residual)
+    assert account.chi2 == pytest.approx(s) == pytest.approx(100.0, rel=1e-3)
+    assert account.rho == pytest.approx(OUTLIER[loss], rel=2e-3)
+    assert account.without == pytest.approx(fall(solver, 4), rel=1e-6)
+    assert account.without == pytest.approx(OUTLIER[loss], rel=2e-3)
+    assert 0.0 <= account.weight < 0.11
+
+
+@pytest.mark.parametrize("loss", ["", *OUTLIER])
+@pytest.mark.parametrize("apart", [0.3, 2.0, 4.0])
+def test_without_is_what_solving_again_gains(loss: str, apart: float) -> None:
+    """Also where the others give way: they hold about as firmly as it pulls."""
+    solver = held_and_pulled(loss, apart, 0.5) if loss else held_and_pulled("huber", apart, 0.5)
+    if not loss:
+        solver, *_ = solver.with_changes([Change("loss", np.array([4]))], Batch(), True)
+    account = account_of(solver, 4)
+    assert account.loss == loss
+    assert account.without == pytest.approx(fall(solver, 4), rel=1e-7, abs=1e-12)
+    if not loss:
+        assert (account.weight, account.rho) == (1.0, account.chi2)
+
+
+@pytest.mark.parametrize("loss", OUTLIER)
+def test_a_false_loop_of_a_drive(loss: str) -> None:
+    """Poses round a square, and a loop closure 1 m off: nonlinear, so to first order."""
+    keys, T = np.array([symbol("x", i) for i in range(9)]), np.array([1.0, 0.0, np.pi / 4])
+    edges = Factors("between_se2", np.column_stack([keys[:-1], keys[1:]]), np.tile(T, (8, 1)), _information(8, 1e4))
+    loop = Factors("between_se2", keys[None, [8, 0]], np.array([[1.0, 0.0, 0.0]]), _information(1, 25.0))
+    start = Variables("se2", keys[:1], np.zeros((1, 3)), fixed=True)
+    solver = Solver()
+    solver.stage(Batch((start, Variables("se2", keys[1:])), (edges, loop._replace(loss=loss, scale=np.ones(1)))))
+    solver.step(settle=True)
+    account = account_of(solver, 8)
+    assert account.chi2 > 20.0
+    assert account.without == pytest.approx(fall(solver, 8), rel=0.01, abs=1e-3)
+    assert solver.chi2() == pytest.approx(account.rho + sum(account_of(solver, f).rho for f in range(8)))
+
+
+def _information(rows: int, weight: float) -> np.ndarray:
+    return np.tile(weight * np.eye(3)[np.triu_indices(3)], (rows, 1))
