@@ -54,6 +54,7 @@ class Holding:
         self._account: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._held = (0, 0)  # variables and factors that were accepted
+        self._converged = True
         self._broken = ""
 
     def snapshot(self, questions: Sequence[Question]) -> Snapshot:
@@ -83,6 +84,11 @@ class Holding:
         """Σ rᵀ Ω r at the estimate."""
         return float(self._solver.chi2())
 
+    @property
+    def converged(self) -> bool:
+        """Whether the last step had; of an empty map, it has."""
+        return self._converged
+
     def enter(self, epoch: int) -> None:
         """From now on answers and deltas name this epoch."""
         self._epoch = epoch
@@ -91,7 +97,8 @@ class Holding:
         """All that later folds depend on, a copy.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
-        return {"solver": self._solver.dump(), "revision": self._revision, "held": list(self._held)}
+        state = {"revision": self._revision, "held": list(self._held), "converged": self._converged}
+        return {"solver": self._solver.dump()} | state
 
     def _copied(self, room: int) -> Copied:
         """All of it, if another folder and what lies between them fit into so many bytes."""
@@ -101,11 +108,12 @@ class Holding:
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
         self._solver, self._revision, self._broken = self._make(), 0, ""
-        self._held = 0, 0
+        self._held, self._converged = (0, 0), True
         if state is not None:
             self._solver.load(state["solver"])
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
+            self._converged = bool(state["converged"])
 
     def content(self) -> dict[str, Any]:
         """What another one `beside` this one begins with, a copy.  Raises Broken."""
@@ -120,6 +128,7 @@ class Holding:
         """
         made = type(self)(self._make, self._epoch, self._limits, self._options)
         made._account = made._solver.order_anew(content["graph"]).as_dict()
+        made._converged = _has_converged(made._account)
         made._revision, made._held = int(content["revision"]), tuple(content["held"])
         return made
 
@@ -166,9 +175,11 @@ class Holding:
         return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
 
     def _next(self, account: dict[str, Any]) -> None:
-        """The solver has made a step."""
+        """The solver has made a step: its `account` says, too, whether more are to follow."""
         self._revision += 1
         self._account, self._uncertain = account, None
+        self._converged = _has_converged(account)
+        account["converging"] = not self._converged
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""
@@ -202,3 +213,7 @@ class Holding:
         if not any(self._held):
             return None
         return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
+
+
+def _has_converged(account: Mapping[str, Any]) -> bool:
+    return bool(account.get("converged", True))
