@@ -76,7 +76,8 @@ def command(
                 view.show(lookout.look())
         view.show(lookout.last_look(joined.timeout_s))
         view.close()
-    note(f"watched {map_name} up to revision {joined.estimate.revision}")
+    converging = ", which had not converged" if joined.estimate.converged is False else ""
+    note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 
 def _open(view: Any, save: Path | None, serving: bool, web_port: int, data_port: int) -> str:

@@ -177,4 +177,5 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         revision=fields.integer(where, content, "revision"),
         variables=fields.integer(where, content, "variables"),
         factors=fields.integer(where, content, "factors"),
+        converging=fields.flag(where, content, "converging"),
     )

@@ -29,7 +29,7 @@ from factorbus.proto.problems import Problem, Refused, TooLarge, Unavailable
 
 @dataclass(frozen=True, slots=True)
 class MapRow:
-    """A map as the service lists it."""
+    """A map as the service lists it.  converging: it has not converged, and takes further steps by itself."""
 
     name: str
     mode: str
@@ -37,6 +37,7 @@ class MapRow:
     revision: int
     variables: int
     factors: int
+    converging: bool = False
 
 
 class Map:
@@ -198,6 +199,17 @@ class Map:
             if not ticket.seen:
                 raise refusal
         self._catch_up(timeout_s)
+
+    def wait_converged(self, timeout_s: float | None = None) -> None:
+        """Wait until everything sent is answered and the map, left alone since, has converged; the mirror has it then.
+
+        Nothing is sent for it: a map goes on converging by itself when nobody inserts.  `settle` demands it, as a step.
+        Raises NotConverged when time is up, or at once where the map gave up; as `flush` does; Unavailable for a map
+        opened with mirror=False.
+        """
+        end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+        self.flush(max(end - time.monotonic(), 0.0))
+        self.estimate.wait_converged(max(end - time.monotonic(), 0.0))
 
     def rejoin(self) -> int:
         """Join the map as it is now, creating it if need be, and return its epoch; numbering starts again.

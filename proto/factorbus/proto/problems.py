@@ -176,6 +176,17 @@ class Unavailable(Problem):
         super().__init__(f"{what} did not answer within {waited_s:g} s; {hint}", waited_s=waited_s)
 
 
+class NotConverged(Problem):
+    code = "not_converged"
+
+    def __init__(self, name: str, revision: int, waited_s: float, gave_up: str) -> None:
+        seen = f"map {name!r} has not converged at revision {revision}"
+        wanted = f"after {waited_s:g} s; it goes on by itself: wait longer, or look at ask/stats"
+        if gave_up:
+            wanted = f"and goes on no more by itself: {gave_up}; `settle` it, or ask `repair` what is wrong in it"
+        super().__init__(f"{seen} {wanted}", revision=revision, waited_s=waited_s, gave_up=gave_up)
+
+
 class Internal(Problem):
     code = "internal"
 

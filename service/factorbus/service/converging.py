@@ -21,7 +21,7 @@ _USELESS, _STILL = 20, 3  # so many in a row
 
 
 class Converging:
-    """Whether a map has converged, and what is done about it."""
+    """Whether a map has converged at the revision that is told, and what is done about it."""
 
     def __init__(self) -> None:
         self.converged = True
@@ -53,9 +53,8 @@ class Converging:
         self._goes_on = further
         self._under_way = "further" if further else "inserts"
 
-    def ended(self, converged: bool, began: float, now: float) -> None:
-        """The solver is free again, and where it is it has `converged`, or not."""
-        self.converged = converged
+    def ended(self, began: float, now: float) -> None:
+        """The solver is free again."""
         if self._under_way == "further":
             self._spent_s += now - began
             self._rests_until = now + (now - began) if self._spent_s > FULL_SPEED_S else now
@@ -71,21 +70,21 @@ class Converging:
         """What was not told did not happen."""
         self._untold = False
 
-    def moved_on(self, chi2: float) -> None:
+    def moved_on(self, converged: bool, chi2: float) -> None:
         """A step of another sort is told."""
-        self.gave_up, self.steps, self._spent_s = "", 0, 0.0
+        self.converged, self.gave_up, self.steps, self._spent_s = converged, "", 0, 0.0
         self._least, self._useless, self._still = chi2, 0, 0
 
     def went_on(self, stepped: Stepped) -> None:
         """A further step is told: was it of use?"""
-        self._untold = False
+        self._untold, self.converged = False, stepped.converged
         self.steps += 1
         useful = stepped.chi2 < (1.0 - _SHARE) * self._least - _NOTHING
         if useful:
             self._least = stepped.chi2
         self._useless = 0 if useful else self._useless + 1
         self._still = self._still + 1 if not stepped.changed else 0
-        self.gave_up = self._why_give_up(stepped)
+        self.gave_up = "" if stepped.converged else self._why_give_up(stepped)
 
     def _why_give_up(self, stepped: Stepped) -> str:
         if stepped.rebuilt:

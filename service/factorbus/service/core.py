@@ -154,7 +154,7 @@ class MapCore:
         seconds = alone.now - insert.now
         self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
         self._moved_on(alone.revision, size)
-        self._converging.moved_on(alone.chi2)
+        self._converging.moved_on(alone.converged, alone.chi2)
         self._moved_at = alone.revision
         self._free(alone, 1)
         return self._go_on(others, alone.now)
@@ -192,8 +192,8 @@ class MapCore:
         """The map was here before: what its clients have sent, and how it is."""
         for name, following, answered in senders:
             self._admission.restore(name, following, answered, self._created)
-        self.revision, self.variables, self.factors, self._account.chi2, self._converging.converged = restored
-        self._converging.moved_on(restored.chi2)
+        self.revision, self.variables, self.factors, self._account.chi2, converged = restored
+        self._converging.moved_on(converged, restored.chi2)
         self._moved_at = restored.revision
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
@@ -204,7 +204,7 @@ class MapCore:
         if stepped.further:
             self._converging.went_on(stepped)
         else:
-            self._converging.moved_on(stepped.chi2)
+            self._converging.moved_on(stepped.converged, stepped.chi2)
             self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
 
@@ -230,7 +230,7 @@ class MapCore:
     def _free(self, folded: Folded | Alone, taken: int) -> None:
         self._running = None
         self._ended = folded.now
-        self._converging.ended(folded.converged, self._started, folded.now)
+        self._converging.ended(self._started, folded.now)
         seconds = self._ended - self._started
         self._admission.took(taken, seconds)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)

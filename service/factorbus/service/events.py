@@ -82,10 +82,10 @@ class Judged(NamedTuple):
 class Stepped(NamedTuple):
     """The solver made a step; the delta tells of it.
 
-    changed: how many variables; damping: what the next step would begin with.  further: without an insert, because the
-    step before had not converged.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.
-    reordered: another solver took its place, which was made of what there was after this fold, in a fresh order, and
-    has been given all since.
+    converged: if not, further steps are to follow.  changed: how many variables; damping: what the next step would
+    begin with.  further: without an insert, because the step before had not converged.  rebuilt: it brought back what
+    had been accepted, in a new solver, after a fault.  reordered: another solver took its place, which was made of what
+    there was after this fold, in a fresh order, and has been given all since.
     """
 
     revision: int
@@ -95,6 +95,7 @@ class Stepped(NamedTuple):
     solver_ms: float
     rebuilt: bool = False
     reordered: int | None = None
+    converged: bool = True
     changed: int = 0
     damping: float = 0.0
     further: bool = False
@@ -103,14 +104,13 @@ class Stepped(NamedTuple):
 class Folded(NamedTuple):
     """The solver is done with a Run; how large the map is now, and what its thread has used.
 
-    converged: where the solver is now, its last step had.  failed: a further step could not be made.
+    failed: a further step could not be made.
     """
 
     variables: int
     factors: int
     solver_cpu_s: float
     now: float
-    converged: bool = True
     failed: bool = False
 
 

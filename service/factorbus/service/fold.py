@@ -86,8 +86,9 @@ class Folder(Holding):
         came = self.fold_run(inserts, further)
         if isinstance(came, Alone):
             judged = Judged((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
-            stepped = Stepped(came.revision, came.delta, came.strategy, came.chi2, came.solver_ms)
-            return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now, came.converged)
+            told = came.strategy, came.chi2, came.solver_ms
+            stepped = Stepped(came.revision, came.delta, *told, converged=came.converged)
+            return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now)
         events: list[Judged | Stepped] = []
         folded = self._folded(time.thread_time())
         for event in came:
@@ -228,7 +229,7 @@ class Folder(Holding):
     def _folded(self, cpu_s: float) -> Folded:
         solver = self._solver
         self._cpu_s += time.thread_time() - cpu_s
-        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic(), self._converged)
+        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
 
     def _together(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""

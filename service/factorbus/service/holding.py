@@ -148,7 +148,7 @@ class Holding:
         self._next(account)
         delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
         told = account["strategy"], account["chi2"], account["solver_ms"]
-        return Stepped(self._revision, delta, *told, reordered=after)
+        return Stepped(self._revision, delta, *told, reordered=after, converged=self._converged)
 
     @property
     def nonzeros(self) -> int:
@@ -172,7 +172,8 @@ class Holding:
         changed = self._solver.changed()
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
         delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
-        return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
+        told = account["strategy"], account["chi2"], account["solver_ms"]
+        return Stepped(self._revision, delta, *told, converged=self._converged)
 
     def _next(self, account: dict[str, Any]) -> None:
         """The solver has made a step: its `account` says, too, whether more are to follow."""

@@ -229,7 +229,7 @@ class Host:
                 tell([Answer(answered, events.answer), Publish("delta", events.delta)])
             self._tidy(run.inserts, ())
             with self._lock:
-                effects = self.core.alone(events._replace(converged=self._folder.converged), answered)
+                effects = self.core.alone(events, answered)
             if effects:
                 self._perform(effects)
         except Exception:
@@ -247,7 +247,7 @@ class Host:
             if isinstance(event, Folded):
                 self._tidy(inserts, came)
                 with self._lock:
-                    effects += self.core.folded(event._replace(converged=self._folder.converged))
+                    effects += self.core.folded(event)
                 self._perform(effects)
                 return
             came.append(event)
@@ -280,7 +280,7 @@ class Host:
             started = time.perf_counter()
             keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
         with self._lock:
-            effects = self.core.folded(folded._replace(converged=self._folder.converged))
+            effects = self.core.folded(folded)
         self._perform(effects)
 
     def _tidy(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped]) -> None:
