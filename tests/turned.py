@@ -10,11 +10,17 @@ from factorbus.solver import Options, Solver
 
 def drive(poses: int, degrees: float) -> Iterator[Batch]:
     """A circle of so many poses, one a step, which ends `degrees` too far round."""
-    turn = (2 * math.pi + math.radians(degrees)) / (poses - 1)
-    yield Draft().se2("x0", (0, 0, 0), fixed=True).batch()
+    yield _first(Draft()).batch()
     for n in range(1, poses):
-        draft = Draft().se2(f"x{n}")
-        yield draft.between_se2(f"x{n - 1}", f"x{n}", (1, 0, turn), sigmas=(0.05, 0.05, 0.03)).batch()
+        yield _next(Draft(), n, poses, degrees).batch()
+
+
+def in_one(poses: int, degrees: float) -> Batch:
+    """The same as one batch."""
+    draft = _first(Draft())
+    for n in range(1, poses):
+        _next(draft, n, poses, degrees)
+    return draft.batch()
 
 
 def closing(poses: int) -> Batch:
@@ -28,4 +34,16 @@ def optimum(poses: int, degrees: float) -> float:
     solver = Solver(Options(mode="all-batch"))
     for batch in (*drive(poses, degrees), closing(poses)):
         solver.stage(batch)
-    return solver.step(settle=True).chi2
+    while not (report := solver.step(settle=True)).converged:
+        pass
+    return report.chi2
+
+
+def _first(draft: Draft) -> Draft:
+    return draft.se2("x0", (0, 0, 0), fixed=True)
+
+
+def _next(draft: Draft, n: int, poses: int, degrees: float) -> Draft:
+    turn = (2 * math.pi + math.radians(degrees)) / (poses - 1)
+    draft.se2(f"x{n}")
+    return draft.between_se2(f"x{n - 1}", f"x{n}", (1, 0, turn), sigmas=(0.05, 0.05, 0.03))

@@ -13,8 +13,8 @@ import math
 from factorbus.service.events import Stepped
 
 QUIET_S = 0.1  # without a step of another sort, before the first further one
-FULL_SPEED_S = 2.0  # of further steps in a row; then the solver rests after each for as long as that took
-MOST = 1000  # in a row
+FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
+MOST, MOST_S = 10_000, 300.0  # so many in a row, and so much of a core for them
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
 _SHARE, _NOTHING = 1e-7, 1e-12
 _USELESS, _STILL = 20, 3  # so many in a row
@@ -53,11 +53,11 @@ class Converging:
         self._goes_on = further
         self._under_way = "further" if further else "inserts"
 
-    def ended(self, began: float, now: float) -> None:
-        """The solver is free again."""
+    def ended(self, worked_s: float, now: float) -> None:
+        """The solver is free again.  worked_s: what it used of a core."""
         if self._under_way == "further":
-            self._spent_s += now - began
-            self._rests_until = now + (now - began) if self._spent_s > FULL_SPEED_S else now
+            self._spent_s += worked_s
+            self._rests_until = now + worked_s if self._spent_s > FULL_SPEED_S else now
         elif self._under_way:
             self._busy_at = now
         self._under_way = ""
@@ -94,4 +94,6 @@ class Converging:
             return f"{self._still} further steps in a row changed nothing"
         if self._useless >= _USELESS:
             return f"{self._useless} further steps in a row did not lower χ²"
-        return f"{self.steps} further steps in a row were not enough" if self.steps >= MOST else ""
+        if self.steps >= MOST or self._spent_s >= MOST_S:
+            return f"{self.steps} further steps in a row, {self._spent_s:.0f} s of a core, were not enough"
+        return ""

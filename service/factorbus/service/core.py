@@ -230,7 +230,7 @@ class MapCore:
     def _free(self, folded: Folded | Alone, taken: int) -> None:
         self._running = None
         self._ended = folded.now
-        self._converging.ended(self._started, folded.now)
+        self._converging.ended(folded.solver_cpu_s - self._solver_cpu_s, folded.now)
         seconds = self._ended - self._started
         self._admission.took(taken, seconds)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
