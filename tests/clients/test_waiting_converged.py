@@ -164,3 +164,23 @@ def test_with_asyncio_the_same(service: Service, tmp_path: Path) -> None:
             assert joined.estimate.revision == 2
 
     asyncio.run(drive())
+
+
+def test_a_word_of_an_older_revision_does_not_count(service: Service, kitchen: Map) -> None:
+    """The stats were on their way when the delta came."""
+    service.report = {"converged": False}
+    kitchen.insert(point(1))
+    service.says = {"revision": 0, "converged": True}
+    with pytest.raises(NotConverged):
+        kitchen.wait_converged(0.5)
+    assert service.asked.count("stats") > 0
+
+
+def test_of_a_revision_without_a_report_nothing_is_known(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": True}
+    kitchen.insert(point(1))
+    assert kitchen.estimate.converged is True
+    service.mute = True
+    service.step({1: (1.0, 2.0)})  # its delta is lost, and the whole estimate asked for
+    kitchen.estimate.wait_for(2, 50)
+    assert kitchen.estimate.converged is None

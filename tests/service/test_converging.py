@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from factorbus.proto.messages import Batch, Insert
@@ -11,7 +12,20 @@ from factorbus.service import converging
 from factorbus.service.admin import MovedOn
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore, Restored
-from factorbus.service.events import Arrived, Asked, Drained, Effect, Folded, Judged, Outcome, Publish, Run, Stepped
+from factorbus.service.events import (
+    Alone,
+    Arrived,
+    Asked,
+    Drained,
+    Effect,
+    Folded,
+    Judged,
+    Located,
+    Outcome,
+    Publish,
+    Run,
+    Stepped,
+)
 
 LATER = converging.QUIET_S
 
@@ -118,6 +132,22 @@ def test_it_goes_on_only_when_no_insert_came_for_a_moment(driven: Driven) -> Non
     driven.insert(converged=False)
     assert not goes_on(driven.tick(LATER * 0.9)), "quiet since the last insert"
     assert goes_on(driven.tick(LATER * 0.2))
+
+
+def test_after_one_that_is_done_at_once_quiet_is_waited_for_too(driven: Driven) -> None:
+    """The short way: on the thread that brings the insert."""
+    driven.insert(converged=False)
+    effects = driven.done(the_run(driven.tick()), converged=False)
+    driven.done(the_run(effects), converged=True)
+    driven.now += 1.0
+    insert = driven.arrived()._replace(content=Located(b"", np.zeros((0, 0), np.int64), False))
+    run = the_run(driven.core.insert(insert))
+    assert run.short
+    alone = Alone(insert, b"ok", b"", 0, 4, "tree", 9.0, 1.0, 3, 4, 0.0, driven.now, converged=False)
+    assert not goes_on(driven.core.alone(alone, insert.askers[0]))
+    assert driven.says() == CONVERGING
+    assert not goes_on(driven.tick(LATER / 2))
+    assert goes_on(driven.tick(LATER / 2 + 1e-6))
 
 
 def test_who_inserts_waits_for_no_more_than_one_step_and_comes_first(driven: Driven) -> None:
