@@ -23,7 +23,8 @@ from factorbus.service.fold import GOES_ON
 from factorbus.service.library import make_folder
 from factorbus.service.recovery import verify
 
-MODES = ["all-batch", "inc-l"]
+# With so many further steps, and more, for the map that is LONG.
+MODES = {"all-batch": 20, "inc-l": 20}
 # The first finishes in a few steps, the second in hundreds of short ones.
 SHORT, LONG = (200, 90.0), (1000, 90.0)
 
@@ -82,7 +83,7 @@ def test_a_map_left_alone_comes_to_its_optimum(endpoint: str, mode: str) -> None
         assert joined.estimate.revision == revision == deltas.all[-1].revision
         stats = joined.stats()
         assert (stats["converged"], stats["converging"], stats["gave_up"]) == (True, False, "")
-        assert stats["further_steps"] == len(deltas.further()) > 20
+        assert stats["further_steps"] == len(deltas.further()) >= MODES[mode]
         assert joined.chi2().chi2 == pytest.approx(optimum(*LONG), rel=1e-6)
 
 
