@@ -17,7 +17,18 @@ from factorbus.service.metrics import families
 DEPLOY = Path(__file__).parent.parent / "deploy"
 BIN = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 NAME = re.compile(r"factorbus_[a-z0-9_]+")
-_NUMBERS = ["variables", "factors", "revision", "chi2", "clients", "waiting", "parked", "in_solver"]
+_NUMBERS = [
+    "variables",
+    "factors",
+    "revision",
+    "chi2",
+    "converged",
+    "converging",
+    "clients",
+    "waiting",
+    "parked",
+    "in_solver",
+]
 
 
 def known() -> set[str]:

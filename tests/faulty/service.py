@@ -35,6 +35,8 @@ class Service:
         self.asked: list[str] = []
         self.mute = False
         self.ask_fault = ""
+        self.report: dict[str, Any] = {}  # of every step
+        self.says: dict[str, Any] = {}  # of the map, besides its row
         self.held: list[zenoh.Query] = []
         self._inbox: SimpleQueue[zenoh.Query | None] = SimpleQueue()
         self._session = zenoh.open(_peer(folder))
@@ -58,7 +60,7 @@ class Service:
         self.values |= {key: np.array(value, float) for key, value in values.items()}
         self.revision += 1
         if not self.mute:
-            delta = Delta(self.epoch, self.revision, self.revision - 1, self._columns(list(values)))
+            delta = Delta(self.epoch, self.revision, self.revision - 1, self._columns(list(values)), self.report)
             self._session.put(
                 keys.delta_key(MAP), codec.encode_delta(delta), congestion_control=zenoh.CongestionControl.BLOCK
             )
@@ -136,7 +138,7 @@ class Service:
 
     def _row(self) -> dict[str, Any]:
         row = {"name": MAP, "mode": "auto", "epoch": self.epoch, "revision": self.revision}
-        return row | {"variables": len(self.values), "factors": 0}
+        return row | {"variables": len(self.values), "factors": 0} | self.says
 
     def _columns(self, chosen: list[int]) -> tuple[Variables, ...]:
         if not chosen:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
+from turned import closing, in_one
 
 from factorbus.cli.exits import FAILED, OK
 from factorbus.cli.main import main
@@ -191,6 +192,26 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
             assert page.locator("#panel tr").count() == factors + 1
             page.screenshot(path=tmp_path / "page.png")  # for whoever wants to look
             assert failures == []
+
+
+@needs_browser
+def test_the_page_says_while_a_map_is_converging(endpoint: str, gateway: str) -> None:
+    poses = 1000
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("turned", "all-batch") as joined:
+        joined.insert(in_one(poses, 90.0))
+        with page_of(f"{gateway}/#turned") as page:
+            page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
+            said = "document.getElementById('state').textContent"
+            page.evaluate(
+                f"window.seen = []; new MutationObserver(() => window.seen.push({said}))"
+                ".observe(document.getElementById('state'), {childList: true})"
+            )
+            joined.insert(closing(poses))
+            joined.wait_converged()
+            page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
+            *before, last = page.evaluate("window.seen")
+            assert any(text.endswith(" · converging") for text in before)
+            assert "converging" not in last
 
 
 @needs_browser

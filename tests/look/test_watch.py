@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
+from turned import closing, in_one
 
 from factorbus.cli.exits import OK
 from factorbus.client import connect
@@ -64,6 +65,26 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
     places = np.concatenate([last.columns["se2"][1][:, :2], last.columns["point2"][1]])
     assert np.linalg.norm(middles[:, None] - places, axis=2).min(axis=1).max() < 1e-3, "around what they are of"
     assert reports[-1]["because"] in found["/log"][200]["TextLog:text"][0]
+
+
+def test_the_log_says_while_a_map_is_converging(endpoint: str, spawn: Callable[..., Process], tmp_path: Path) -> None:
+    path, poses = tmp_path / "turned.rrd", 1000
+    with connect(endpoint, client="robot", timeout_s=60) as bus, bus.map("turning", "all-batch") as joined:
+        joined.insert(in_one(poses, 90.0))
+        watcher = spawn("-m", "factorbus.cli", "watch", "turning", "--connect", endpoint, "--save", str(path))
+        watcher.ready()
+        closed = joined.insert(closing(poses)).revision
+        joined.wait_converged()
+        last = joined.estimate.revision
+        watcher.signal(signal.SIGINT)
+        assert watcher.wait() == OK
+    said = {revision: row["TextLog:text"][0] for revision, row in rows(path)["/log"].items()}
+    converging = [
+        revision for revision, text in said.items() if text.endswith("; converging: it has not converged yet")
+    ]
+    assert converging == list(range(closed, last))
+    assert said[last].startswith("all-batch: the map goes on converging")
+    assert f"watched turning up to revision {last}\n" in watcher.errors()
 
 
 @needs_browser

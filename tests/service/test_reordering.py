@@ -3,11 +3,13 @@
 import queue
 import threading
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from factorbus.journal.store import create
 from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Change, Delta, Factors, Insert, Variables
@@ -19,7 +21,9 @@ from factorbus.service.events import Arrived, Effect, Judged, Outcome, Publish, 
 from factorbus.service.fold import Folder
 from factorbus.service.host import Host
 from factorbus.service.questions import Question
+from factorbus.service.recovery import verify
 from factorbus.service.reordering import Reordering
+from factorbus.service.writing import written
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 
@@ -40,18 +44,22 @@ class Driven:
         self.beside = Reordering(self.folder, grown, lambda: room, "m")
         self.replaced: list[Stepped] = []
         self.outcomes: list[Outcome] = []
+        self.journal: list[tuple[Sequence[Arrived], Sequence[Judged | Stepped]]] = []
         self.folds = 0
 
     def insert(self, content: Batch | tuple[Change, ...]) -> None:
         batch, changes = (content, ()) if isinstance(content, Batch) else (Batch(), content)
         self.fold([arrived(Insert(len(self.outcomes) + 1, batch, changes=changes))])
 
-    def fold(self, inserts: Sequence[Arrived]) -> None:
-        events, _ = self.folder.fold_whole(inserts)
+    def fold(self, inserts: Sequence[Arrived], further: bool = False) -> None:
+        events, _ = self.folder.fold_whole(inserts, further)
+        self.journal.append((inserts, events))
         self.outcomes += [o for event in events if isinstance(event, Judged) for o in event.outcomes]
-        self.folds += 1
+        self.folds += bool(inserts or events)
         if (stepped := self.beside.after(inserts, events, self.folds)) is not None:
             self.replaced.append(stepped)
+            self.journal.append(((), [stepped]))
+            self.folds += 1
 
     def wait(self) -> None:
         """Until the other solver is made."""
@@ -148,6 +156,35 @@ def test_it_takes_the_place_with_what_came_meanwhile(leave: threading.Event) -> 
         isinstance(o.answer, bytes) for o in plain.outcomes
     ]
     assert driven.folder.chi2() == pytest.approx(plain.folder.chi2(), rel=1e-3)
+
+
+def test_further_steps_are_followed_and_made_again(leave: threading.Event, tmp_path: Path) -> None:
+    """Steps without an insert, between the copy and the place taken: the journal leads to the same bits."""
+    driven = Driven(ALWAYS)
+    batches = [step.batch for step in manhattan(300, 1)]
+    n = 0
+    while not driven.replaced:
+        driven.insert(batches[n])
+        driven.fold((), further=n % 3 == 0)
+        if n == 120:
+            assert driven.beside.busy
+            leave.set()
+            driven.wait()
+        n += 1
+    for batch in batches[n : n + 20]:
+        driven.insert(batch)
+        driven.fold((), further=True)
+    store = create(tmp_path / "m", "m", "tree", {}, EPOCH, "none")
+    for inserts, events in driven.journal:
+        if inserts or events:
+            last = store.last()
+            store.append([written(last.fold + 1, inserts, events, last)])
+    copied, took = min(store.reordered().items())
+    assert any(fold.further and fold.number < took for fold in store.folds(copied))
+    again = Folder(lambda: Solver(Options()), EPOCH, Limits())
+    assert all(same for _, same in verify(store, again))
+    assert (again.revision, again.chi2()) == (driven.folder.revision, driven.folder.chi2())
+    store.close()
 
 
 def test_where_loops_come_in_no_order_r_is_smaller_for_it() -> None:

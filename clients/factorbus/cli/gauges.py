@@ -58,6 +58,10 @@ class Gauges:
                 "steps_per_s": steps / seconds,
                 "inserts_per_s": taken / seconds,
                 "step_ms": (stats["solver_ms"] - before["solver_ms"]) / steps if steps else None,
+                "converged": stats["converged"],
+                "converging": stats["converging"],
+                "further_steps": stats["further_steps"],
+                "gave_up": stats["gave_up"],
                 "refused": stats["inserts"]["refused"],
                 "busy": stats["inserts"]["busy"],
             }

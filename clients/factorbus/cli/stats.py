@@ -58,13 +58,20 @@ def _map(row: Mapping[str, Any]) -> str:
     inserts = row["inserts"]
     lines = [
         f"{row['variables']} variables, {row['factors']} factors, revision {row['revision']}, {row['mode']}",
-        f"χ² {row['chi2']:.6g}; {_steps(row['strategies'])}",
+        f"χ² {row['chi2']:.6g}, {_convergence(row)}; {_steps(row['strategies'])}",
         f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
         f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; {row['clients']} clients",
         *(f"{name}: {value}" for name, value in row.get("journal", {}).items()),
     ]
     return "\n".join(lines)
+
+
+def _convergence(row: Mapping[str, Any]) -> str:
+    if row["converged"]:
+        return "converged"
+    so_far = f"after {row['further_steps']} further steps"
+    return f"converging, {so_far}" if row["converging"] else f"not converged {so_far}: gave up, as {row['gave_up']}"
 
 
 def _steps(strategies: Mapping[str, int]) -> str:

@@ -80,7 +80,8 @@ def command(
                 view.show(lookout.last_look(joined.timeout_s))
         finally:
             view.close()
-    note(f"watched {map_name} up to revision {joined.estimate.revision}")
+    converging = ", which had not converged" if joined.estimate.converged is False else ""
+    note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 
 def _open(view: Any, save: Path | None, host: str | None, web_port: int, data_port: int) -> str:

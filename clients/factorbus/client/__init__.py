@@ -17,7 +17,7 @@ from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision,
 from factorbus.client.mirror import Mirror, Snapshot
 from factorbus.client.ticket import NoAnswerYet, Ticket
 from factorbus.proto.camera import BadCamera, Camera
-from factorbus.proto.problems import Problem, Refused, Unavailable
+from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 
 __all__ = [
     "AbsoluteFactors",
@@ -38,6 +38,7 @@ __all__ = [
     "Mirror",
     "NoAnchor",
     "NoAnswerYet",
+    "NotConverged",
     "Problem",
     "Refused",
     "Snapshot",

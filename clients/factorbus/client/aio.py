@@ -259,6 +259,13 @@ class Map:
         """Until the mirror is at `revision` or later and not stale.  Raises Unavailable."""
         await asyncio.to_thread(self.estimate.wait_for, revision, timeout_s)
 
+    async def wait_converged(self, timeout_s: float | None = None) -> None:
+        """Until the map, left alone, has converged, as `factorbus.client.Map.wait_converged`.
+
+        Raises NotConverged, and as `flush` does.
+        """
+        await asyncio.to_thread(self._map.wait_converged, timeout_s)
+
     async def deltas(self) -> AsyncIterator[Delta]:
         """Every change of the estimate from now on, without end.
 

@@ -210,4 +210,5 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         state=fields.text(where, content, "state", default="open"),
         problem=fields.text(where, content, "problem", default=""),
         protocol=fields.mapping(where, content, "protocol"),
+        converging=fields.flag(where, content, "converging"),
     )

@@ -28,6 +28,7 @@ class Following:
         self.epoch = 0
         self.revision = 0
         self.live = False
+        self.converged: bool | None = None  # at this revision; None: nobody has said
         self._tables: dict[str, Table] = {}
         self._aside: deque[Delta] = deque(maxlen=_KEPT_ASIDE)
 
@@ -38,7 +39,7 @@ class Following:
         if self.live and delta.epoch == self.epoch and delta.previous == 0 and self.revision:
             # The whole estimate: features have become points, so what was under their keys is no more.
             self._tables = tables_of(Estimate(delta.epoch, delta.revision, delta.variables))
-            self.revision = delta.revision
+            self._be_at(delta)
             return [delta]
         if self.live and delta.epoch == self.epoch and delta.previous == self.revision:
             self._apply(delta)
@@ -57,6 +58,8 @@ class Following:
         aside = list(self._aside)
         self._aside.clear()
         news = [Delta(estimate.epoch, estimate.revision, 0, estimate.variables)]
+        if (estimate.epoch, estimate.revision) != (self.epoch, self.revision):
+            self.converged = None
         self.epoch, self.revision, self._tables, self.live = estimate.epoch, estimate.revision, tables, True
         for delta in aside:
             if delta.epoch == self.epoch:
@@ -89,7 +92,11 @@ class Following:
 
     def _apply(self, delta: Delta) -> None:
         _put(self._tables, delta.variables)
-        self.revision = delta.revision
+        self._be_at(delta)
+
+    def _be_at(self, delta: Delta) -> None:
+        told = delta.report.get("converged")
+        self.revision, self.converged = delta.revision, told if isinstance(told, bool) else None
 
 
 def tables_of(estimate: Estimate) -> dict[str, Table]:

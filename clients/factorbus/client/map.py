@@ -37,7 +37,7 @@ class MapRow:
     state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
     (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
-    list of maps.
+    list of maps.  converging: it has not converged, and takes further steps by itself.
     """
 
     name: str
@@ -49,6 +49,7 @@ class MapRow:
     state: str = "open"
     problem: str = ""
     protocol: Mapping[str, Any] = field(default_factory=dict)
+    converging: bool = False
 
 
 class Map:
@@ -210,6 +211,17 @@ class Map:
             if not ticket.seen:
                 raise refusal
         self._catch_up(timeout_s)
+
+    def wait_converged(self, timeout_s: float | None = None) -> None:
+        """Wait until everything sent is answered and the map, left alone since, has converged; the mirror has it then.
+
+        Nothing is sent for it: a map goes on converging by itself when nobody inserts.  `settle` demands it, as a step.
+        Raises NotConverged when time is up, or at once where the map gave up; as `flush` does; Unavailable for a map
+        opened with mirror=False.
+        """
+        end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+        self.flush(max(end - time.monotonic(), 0.0))
+        self.estimate.wait_converged(max(end - time.monotonic(), 0.0))
 
     def rejoin(self) -> int:
         """Join the map as it is now, creating it if need be, and return its epoch; numbering starts again.

@@ -4,7 +4,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_ask
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
-from factorbus.proto.problems import BadSymbol, Unavailable
+from factorbus.proto.problems import BadSymbol, NotConverged, Unavailable
 from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -65,6 +65,7 @@ class Mirror:
         self._confirmed_at = time.monotonic()
         self._asking, self._probing, self._silences = False, False, 0
         self._ask_at = 0.0
+        self._gave_up = ""  # why the map does not go on converging
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
 
@@ -107,6 +108,11 @@ class Mirror:
         return not self._following.live or self._following.revision < self._expected
 
     @property
+    def converged(self) -> bool | None:
+        """Whether the map had converged at `revision`; None: not known, until the next step or for a second."""
+        return self._following.converged
+
+    @property
     def age_s(self) -> float:
         """Seconds since the service last confirmed these values: by a delta, or by answering that nothing changed."""
         return time.monotonic() - self._confirmed_at
@@ -130,13 +136,24 @@ class Mirror:
         self._try_wait(lambda: self._there(revision), timeout_s)
         if self._there(revision):
             return
-        if self._closing:
-            raise Unavailable(f"map {self._map!r}", 0.0, "it was closed here; open it again")
+        self._check_open()
         state = "stale" if self.stale else "up to date"
         hint = (
             f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
         )
         raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
+
+    def wait_converged(self, timeout_s: float | None = None) -> None:
+        """Until the values are the latest and the map has converged at them.
+
+        Raises NotConverged when time is up, and at once where the map gave up; Unavailable, at once, on a closed map.
+        """
+        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        self._try_wait(lambda: self._is_latest and (self.converged or bool(self._gave_up)), timeout_s)
+        if self._is_latest and self.converged:
+            return
+        self._check_open()
+        raise NotConverged(self._map, self.revision, timeout_s, self._gave_up)
 
     def catch_up(self, timeout_s: float) -> None:
         """Wait until every revision known to exist is here, or nobody is there to send it, or time is up."""
@@ -187,6 +204,14 @@ class Mirror:
 
     def _there(self, revision: int) -> bool:
         return self._following.live and self._following.revision >= revision
+
+    @property
+    def _is_latest(self) -> bool:
+        return self._there(self._expected)
+
+    def _check_open(self) -> None:
+        if self._closing:
+            raise Unavailable(f"map {self._map!r}", 0.0, "it was closed here; open it again")
 
     def _forget(self, callback: Callable[[Delta], None]) -> None:
         with self._lock:
@@ -240,7 +265,7 @@ class Mirror:
 
     def _apply_delta(self, delta: Delta) -> None:
         with self._lock:
-            news = self._following.delta(delta)
+            news, self._gave_up = self._following.delta(delta), ""
             self._confirm()
         self._tell(news)
 
@@ -287,7 +312,14 @@ class Mirror:
                 self._following.lost()
             self._expected = max(self._expected, revision)
             if not self.stale:
+                if revision == self.revision:
+                    self._take_convergence(told)
                 self._confirm()
+
+    def _take_convergence(self, told: Mapping[str, Any]) -> None:
+        converged, gave_up = told.get("converged"), told.get("gave_up")
+        self._following.converged = converged if isinstance(converged, bool) else None
+        self._gave_up = gave_up if isinstance(gave_up, str) else ""
 
     def _take_owner(self, token: str, alive: bool) -> None:
         if alive:

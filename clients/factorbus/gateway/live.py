@@ -30,7 +30,8 @@ async def follow(socket: WebSocket, mirror: Mirror) -> None:
     leaving = asyncio.ensure_future(_leaves(socket))
     try:
         snapshot = mirror.snapshot()
-        await _send(socket, {"type": "estimate", **estimate(snapshot)})
+        report = {"converging": True} if mirror.converged is False else {}
+        await _send(socket, {"type": "estimate", **estimate(snapshot), "report": report})
         at = (snapshot.epoch, snapshot.revision)
         while not leaving.done():
             waiting = asyncio.ensure_future(news.wait())

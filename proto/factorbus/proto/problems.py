@@ -244,6 +244,17 @@ class BetterOptimum(Problem):
         return cls(chi2, batch, start) if chi2 > (1.0 + cls.SHARE) * batch + cls.FLOOR else None
 
 
+class NotConverged(Problem):
+    code = "not_converged"
+
+    def __init__(self, name: str, revision: int, waited_s: float, gave_up: str) -> None:
+        seen = f"map {name!r} has not converged at revision {revision}"
+        wanted = f"after {waited_s:g} s; it goes on by itself: wait longer, or look at ask/stats"
+        if gave_up:
+            wanted = f"and goes on no more by itself: {gave_up}; `settle` it, or ask `repair` what is wrong in it"
+        super().__init__(f"{seen} {wanted}", revision=revision, waited_s=waited_s, gave_up=gave_up)
+
+
 class Internal(Problem):
     code = "internal"
 

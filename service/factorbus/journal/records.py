@@ -33,7 +33,8 @@ class Fold(NamedTuple):
 
     number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
     ever changed, up to here   reordered: another solver took its place, made in a fresh order of what there was after
-    this fold, and given all since; with no inserts of its own.  None: not so
+    this fold, and given all since; with no inserts of its own.  None: not so   further: a step without an
+    insert, since the one before had not converged
     """
 
     number: int
@@ -42,6 +43,7 @@ class Fold(NamedTuple):
     chain: bytes
     entries: tuple[Entry, ...]
     reordered: int | None = None
+    further: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
 -- rebuilt: 0, 1, or the negative of a fold: the solver was replaced by one that was ordered anew after that one
+-- 2: nothing of that, but a step without an insert
 CREATE TABLE fold (
     number INTEGER PRIMARY KEY, revision INTEGER NOT NULL, rebuilt INTEGER NOT NULL, chain BLOB NOT NULL
 );
@@ -43,6 +44,7 @@ CREATE TABLE entry (
 CREATE INDEX entry_of_client ON entry (client);
 CREATE TABLE snapshot (fold INTEGER PRIMARY KEY, fingerprint TEXT NOT NULL, bytes INTEGER NOT NULL);
 """
+_REBUILT, _FURTHER = 1, 2
 _ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
 
 
@@ -113,7 +115,8 @@ class Store:
                     row = entries.fetchone()
                 if row is not None and row[0] < number:
                     raise JournalDamaged(self.path, f"an insert of fold {row[0]} is out of order")
-                yield Fold(number, revision, rebuilt > 0, digest, tuple(taken), -rebuilt if rebuilt < 0 else None)
+                reordered = -rebuilt if rebuilt < 0 else None
+                yield Fold(number, revision, rebuilt == _REBUILT, digest, tuple(taken), reordered, rebuilt == _FURTHER)
             if row is not None:
                 raise JournalDamaged(self.path, f"an insert belongs to fold {row[0]}, which is missing")
 
@@ -348,7 +351,9 @@ def what_reading_failed_with(path: Path, error: sqlite3.Error) -> JournalDamaged
 
 def _replaced(fold: Fold) -> int:
     """As the table has it."""
-    return int(fold.rebuilt) if fold.reordered is None else -fold.reordered
+    if fold.reordered is not None:
+        return -fold.reordered
+    return _FURTHER if fold.further else _REBUILT * fold.rebuilt
 
 
 def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:

@@ -2,7 +2,8 @@
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
     Asked ───▶ reads ──────────────┴▶ Run ─▶ Folded ────┼─▶ Publish           delta of every step
-                                    (solver thread)     └─▶ Run               what came in meanwhile
+                                    (solver thread)     └─▶ Run               what came in meanwhile; nothing did, and
+                                                                              it had not converged: a further step
 
 At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
 """
@@ -20,6 +21,7 @@ from factorbus.service.account import Account, Done
 from factorbus.service.admin import MovedOn
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
+from factorbus.service.converging import Converging
 from factorbus.service.events import (
     Alone,
     Arrived,
@@ -54,6 +56,7 @@ class Restored(NamedTuple):
     variables: int
     factors: int
     chi2: float
+    converged: bool = True
 
 
 class MapCore:
@@ -75,6 +78,8 @@ class MapCore:
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
         self._account = Account()
+        self._converging = Converging()
+        self._moved_at = 0  # the revision of the last step that was not a further one
 
     def row(self) -> dict[str, Any]:
         """What admin/maps says of this map."""
@@ -86,6 +91,8 @@ class MapCore:
             "variables": self.variables,
             "factors": self.factors,
             "state": "blocked" if self._admission.blocked else "open",
+            "converged": self._converging.converged,
+            "converging": self._converging.converging,
         }
 
     def created(self) -> list[Effect]:
@@ -154,6 +161,8 @@ class MapCore:
         seconds = alone.now - insert.now
         self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
         self._moved_on(alone.revision, size)
+        self._converging.moved_on(alone.converged, alone.chi2)
+        self._moved_at = alone.revision
         self._free(alone, 1)
         return self._go_on(others, alone.now)
 
@@ -175,6 +184,7 @@ class MapCore:
         self._admission.block(problem)
         effects = self._count_refused(self._admission.take_back(problem, given=True))
         self._unjudged = self._unjudged_bytes = 0
+        self._converging.undone()
         self._must_reload = True
         return self._go_on([*effects, self._event("blocked")], now)
 
@@ -189,13 +199,20 @@ class MapCore:
         """The map was here before: what its clients have sent, and how it is."""
         for name, following, answered in senders:
             self._admission.restore(name, following, answered, self._created)
-        self.revision, self.variables, self.factors, self._account.chi2 = restored
+        self.revision, self.variables, self.factors, self._account.chi2, converged = restored
+        self._converging.moved_on(converged, restored.chi2)
+        self._moved_at = restored.revision
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
         size = len(stepped.delta)
         self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
         self._moved_on(stepped.revision, size)
+        if stepped.further:
+            self._converging.went_on(stepped)
+        else:
+            self._converging.moved_on(stepped.converged, stepped.chi2)
+            self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
 
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
@@ -212,12 +229,15 @@ class MapCore:
         taken = self._running.inserts if self._running else ()
         for insert in taken:
             self._account.took(folded.now - insert.now)
+        if folded.failed:
+            self._converging.failed()
         self._free(folded, len(taken))
         return self._go_on([], folded.now)
 
     def _free(self, folded: Folded | Alone, taken: int) -> None:
         self._running = None
         self._ended = folded.now
+        self._converging.ended(folded.solver_cpu_s - self._solver_cpu_s, folded.now)
         seconds = self._ended - self._started
         self._admission.took(taken, seconds)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
@@ -237,7 +257,8 @@ class MapCore:
     def tick(self, now: float) -> list[Effect]:
         """Time went by."""
         self._account.count()
-        return self._admission.expire(now)
+        self._converging.look(now)
+        return self._go_on(self._admission.expire(now), now)
 
     def tidy(self, now: float) -> list[Effect]:
         """Something waits for the end of a Run: where there is none, one with nothing in it, if it can be kept."""
@@ -250,9 +271,12 @@ class MapCore:
         return self._go_on([*self._admission.close(), self._event("stopping")], now)
 
     def check_at(self, revision: int) -> None:
-        """Is the map at `revision`, with nothing under way that would bring it further?  Raises MovedOn."""
+        """Is the map at `revision`, but for further steps, and with nothing under way that would change what it has?
+
+        Raises MovedOn.
+        """
         waiting = self._unjudged + self._admission.ready + self._admission.parked
-        if self.revision != revision or waiting:
+        if not self._moved_at <= revision <= self.revision or waiting:
             raise MovedOn(self.name, self.revision, revision, waiting)
 
     def drop(self, now: float, why: Problem | None = None) -> list[Effect]:
@@ -272,6 +296,8 @@ class MapCore:
             "in_solver": len(self._running.inserts) if self._running else 0,
             "clients": self._admission.next_sequences,
             "steps": self.revision,
+            "further_steps": self._converging.steps,
+            "gave_up": self._converging.gave_up,
             "solver_cpu_s": self._solver_cpu_s,
             **self._account.stats(),
         }
@@ -293,9 +319,13 @@ class MapCore:
             return effects
         limits = self._limits
         room = self._has_room()
-        if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room):
+        further = self._may_go_on(now)
+        if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room) or further:
             reads, inserts = tuple(self._reads), self._admission.take(limits.fold) if room else ()
-            self._running = Run(reads, inserts, self._is_short(reads, inserts, now), self._must_reload)
+            short = self._is_short(reads, inserts, now)
+            self._running = Run(reads, inserts, short, self._must_reload, further)
+            if inserts or further:
+                self._converging.began(further)
             self._reads.clear()
             self._must_reload = self._must_tidy = False
             self._unjudged += len(inserts)
@@ -306,6 +336,12 @@ class MapCore:
             self._drained = True
             effects.append(Drained())
         return effects
+
+    def _may_go_on(self, now: float) -> bool:
+        """May the solver take a further step?  Inserts come first, and nothing is left to be told or written."""
+        waits = self._admission.ready or self._unjudged or self._must_reload
+        stopped = self._admission.blocked or self._closing is not None
+        return not waits and not stopped and self._converging.is_due(now)
 
     def _has_room(self) -> bool:
         """May the solver have more, or has the journal to write first?"""
@@ -320,6 +356,7 @@ class MapCore:
         if not self._admission.take_alone(arrived):
             return None
         self._started = arrived.now
+        self._converging.began(False)
         self._unjudged += 1
         self._unjudged_bytes += arrived.size
         self._running = run = Run((), (arrived,), True)

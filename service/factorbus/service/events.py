@@ -82,8 +82,10 @@ class Judged(NamedTuple):
 class Stepped(NamedTuple):
     """The solver made a step; the delta tells of it.
 
-    rebuilt: it brought back what had been accepted, in a new solver, after a fault.  reordered: another solver took its
-    place, which was made of what there was after this fold, in a fresh order, and has been given all since.
+    converged: if not, further steps are to follow.  changed: how many variables; damping: what the next step would
+    begin with.  further: without an insert, because the step before had not converged.  rebuilt: it brought back what
+    had been accepted, in a new solver, after a fault.  reordered: another solver took its place, which was made of what
+    there was after this fold, in a fresh order, and has been given all since.
     """
 
     revision: int
@@ -93,15 +95,23 @@ class Stepped(NamedTuple):
     solver_ms: float
     rebuilt: bool = False
     reordered: int | None = None
+    converged: bool = True
+    changed: int = 0
+    damping: float = 0.0
+    further: bool = False
 
 
 class Folded(NamedTuple):
-    """The solver is done with a Run; how large the map is now, and what its thread has used."""
+    """The solver is done with a Run; how large the map is now, and what its thread has used.
+
+    failed: a further step could not be made.
+    """
 
     variables: int
     factors: int
     solver_cpu_s: float
     now: float
+    failed: bool = False
 
 
 class Alone(NamedTuple):
@@ -119,6 +129,7 @@ class Alone(NamedTuple):
     factors: int
     solver_cpu_s: float
     now: float
+    converged: bool = True
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------
@@ -173,13 +184,14 @@ class Run(NamedTuple):
     """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
 
     short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
-    the journal has.
+    the journal has.  further: there are no inserts, and one step is to go on from the last one.
     """
 
     reads: tuple[Read, ...]
     inserts: tuple[Arrived, ...]
     short: bool = False
     reload: bool = False
+    further: bool = False
 
 
 @dataclass(frozen=True, slots=True)

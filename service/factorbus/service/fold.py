@@ -9,6 +9,8 @@
 An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
 the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
 
+Where a step had not converged and nothing waits, a further step goes on from it, with nothing staged.
+
 Where the solver itself fails it is replaced (see `holding`), and the insert that brought the fault about is refused as
 internal.
 """
@@ -37,6 +39,8 @@ from factorbus.solver.errors import Diverged, SolverError
 # The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
 _ALONE_BYTES = 48 << 10
 
+GOES_ON = "the map goes on converging, without an insert"
+
 log = logging.getLogger(__name__)
 
 
@@ -64,25 +68,28 @@ class Folder(Holding):
         self._pack = codec.report_encoder()
         self._doubt: Exception | None = None  # a fault of the solver that is still to be dealt with
 
-    def fold_again(self, inserts: Sequence[Arrived], rebuilt: bool) -> Iterator[Judged | Stepped]:
+    def fold_again(
+        self, inserts: Sequence[Arrived], rebuilt: bool = False, further: bool = False
+    ) -> Iterator[Judged | Stepped]:
         """Fold in what was folded in together before: no limit that has been set since refuses it.
 
-        rebuilt: the solver was replaced meanwhile.
+        rebuilt: the solver was replaced meanwhile.  further: there was nothing, it was a further step.
         """
         limits, self._limits = self._limits, replace(self._limits, variables=1 << 62, factors=1 << 62)
         try:
-            yield from self.fold_whole(inserts)[0] if inserts else ()
+            yield from self.fold_whole(inserts, further)[0] if inserts or further else ()
             if rebuilt:
                 yield from self._replace_solver("replayed")
         finally:
             self._limits = limits
 
-    def fold_whole(self, inserts: Sequence[Arrived]) -> tuple[list[Judged | Stepped], Folded]:
+    def fold_whole(self, inserts: Sequence[Arrived], further: bool = False) -> tuple[list[Judged | Stepped], Folded]:
         """All that comes of a fold, at its end.  Of the same inserts in the same groups always the same, to the bit."""
-        came = self.fold_alone(inserts[0]) if len(inserts) == 1 else self.fold(inserts)
+        came = self.fold_run(inserts, further)
         if isinstance(came, Alone):
             judged = Judged((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
-            stepped = Stepped(came.revision, came.delta, came.strategy, came.chi2, came.solver_ms)
+            told = came.strategy, came.chi2, came.solver_ms
+            stepped = Stepped(came.revision, came.delta, *told, converged=came.converged)
             return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now)
         events: list[Judged | Stepped] = []
         folded = self._folded(time.thread_time())
@@ -92,6 +99,35 @@ class Folder(Holding):
             else:
                 events.append(event)
         return events, folded
+
+    def fold_run(self, inserts: Sequence[Arrived], further: bool) -> Alone | Iterator[Judged | Stepped | Folded]:
+        """All that a Run asks for: `inserts`, or a `further` step where there are none."""
+        if further:
+            return self.go_on()
+        return self.fold_alone(inserts[0]) if len(inserts) == 1 else self.fold(inserts)
+
+    def go_on(self) -> Iterator[Stepped | Folded]:
+        """One step without an insert: Stepped, unless the solver refuses it and is as it was; Folded."""
+        cpu_s, started, revision = time.thread_time(), time.perf_counter(), self._revision
+        stepped: list[Stepped] = []
+        try:
+            if not self._broken:
+                stepped = [self._further_step(started)]
+        except SolverError as problem:
+            log.warning("a further step, without an insert, is refused: %s", problem)
+        except Exception:
+            self._revision = revision
+            stepped = [each._replace(further=True) for each in self._replace_solver(self._fault())]
+        yield from stepped
+        yield self._folded(cpu_s)._replace(failed=not stepped)
+
+    def _further_step(self, started: float) -> Stepped:
+        report = self._solver.step()
+        account = report.as_dict()
+        account["because"] = f"{GOES_ON}: {report.because}"
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(account)
+        return self._told(account)._replace(changed=report.changed, damping=report.damping, further=True)
 
     def fold(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
@@ -171,6 +207,7 @@ class Folder(Holding):
                 return self._diverged_alone(insert, report)
             account = report.as_dict()
             account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
+            account["converging"] = not report.converged
             answer, delta = write_messages(
                 insert.sequence, self._epoch, self._revision + 1, first_factor, self._pack(account), changed,
                 graph.var, graph.keys, graph.values, WORDS, LETTERS, self._out,
@@ -187,7 +224,7 @@ class Folder(Holding):
         out = self._out_bytes
         return Alone(
             insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
-            report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(),
+            report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(), self._converged,
         )  # fmt: skip
 
     def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:
@@ -355,7 +392,7 @@ class Folder(Holding):
         self._solver = solver
         account = report.as_dict() | {"points": int(keys.size)}
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._revision += 1
+        self._next(account)
         yield self._told(account, previous=0)
 
 

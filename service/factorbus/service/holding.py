@@ -56,6 +56,7 @@ class Holding:
         self._account: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._held = (0, 0)  # variables and factors that were accepted
+        self._converged = True
         self._broken = ""
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
         self._room = Room()
@@ -93,6 +94,11 @@ class Holding:
         """Σ rᵀ Ω r at the estimate."""
         return float(self._solver.chi2())
 
+    @property
+    def converged(self) -> bool:
+        """Whether the last step had; of an empty map, it has."""
+        return self._converged
+
     def enter(self, epoch: int) -> None:
         """From now on answers and deltas name this epoch."""
         self._epoch = epoch
@@ -101,7 +107,8 @@ class Holding:
         """All that later folds depend on, a copy.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
-        return {"solver": self._solver.dump(), "revision": self._revision, "held": list(self._held)}
+        state = {"revision": self._revision, "held": list(self._held), "converged": self._converged}
+        return {"solver": self._solver.dump()} | state
 
     def _copied(self, room: int) -> Copied:
         """All of it, if another folder and what lies between them fit into so many bytes."""
@@ -111,12 +118,13 @@ class Holding:
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
         self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
-        self._held = 0, 0
+        self._held, self._converged = (0, 0), True
         if state is not None:
             self._solver.load(state["solver"])
             self._wary = not is_usual(self._solver)
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
+            self._converged = bool(state["converged"])
 
     def content(self) -> dict[str, Any]:
         """What another one `beside` this one begins with, a copy.  Raises Broken."""
@@ -133,6 +141,7 @@ class Holding:
         report = made._solver.order_anew(content["graph"])
         check_step(made._solver, report)
         made._account = report.as_dict()
+        made._converged = _has_converged(made._account)
         made._revision, made._held = int(content["revision"]), tuple(content["held"])
         return made
 
@@ -152,7 +161,7 @@ class Holding:
         self._next(account)
         delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
         told = account["strategy"], account["chi2"], account["solver_ms"]
-        return Stepped(self._revision, delta, *told, reordered=after)
+        return Stepped(self._revision, delta, *told, reordered=after, converged=self._converged)
 
     @property
     def nonzeros(self) -> int:
@@ -176,12 +185,15 @@ class Holding:
         changed = self._solver.changed()
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
         delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
-        return Stepped(self._revision, delta, account["strategy"], account["chi2"], account["solver_ms"])
+        told = account["strategy"], account["chi2"], account["solver_ms"]
+        return Stepped(self._revision, delta, *told, converged=self._converged)
 
     def _next(self, account: dict[str, Any]) -> None:
-        """The solver has made a step."""
+        """The solver has made a step: its `account` says, too, whether more are to follow."""
         self._revision += 1
         self._account, self._uncertain = account, None
+        self._converged = _has_converged(account)
+        account["converging"] = not self._converged
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""
@@ -237,3 +249,7 @@ class Holding:
         if not any(self._held):
             return None
         return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
+
+
+def _has_converged(account: Mapping[str, Any]) -> bool:
+    return bool(account.get("converged", True))

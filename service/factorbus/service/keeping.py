@@ -141,7 +141,7 @@ class Keeper:
         return problem
 
     def hand(self, inserts: Sequence[Arrived], events: Events) -> None:
-        """Write down that `inserts` were folded, and what came of it; of none, that another solver took the place."""
+        """Write down that `inserts` were folded, and what came of it; of none, a further step, or another solver."""
         if inserts or events:
             self._number += 1
             self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3

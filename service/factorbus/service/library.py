@@ -44,7 +44,7 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
 
 def restored(folder: Folder) -> Restored:
     """How the map in `folder` is."""
-    return Restored(folder.revision, *folder.size, folder.chi2() if folder.revision else 0.0)
+    return Restored(folder.revision, *folder.size, folder.chi2() if folder.revision else 0.0, folder.converged)
 
 
 def log_owner(owner: str) -> None:

@@ -4,7 +4,7 @@ Folded again in the same groups by the same solver, the inserts give the same re
 proves it.  A snapshot counts only for the solver that wrote it (`fingerprint`): another one begins at the beginning.
 
 A solver that was ordered anew beside the steps (`reordering.py`) is made again where it was, given the folds that it
-was given, and takes the place where it did.
+was given, and takes the place where it did.  A further step, of a map that had not converged, is made again, too.
 """
 
 import logging
@@ -95,7 +95,7 @@ class _History:
     def _fold(self, fold: Fold, present: bytes) -> bytes:
         inserts = [_arrived(entry) for entry in fold.entries if entry.outcome != UNTRIED]
         outcomes: dict[tuple[str, int], int] = {}
-        for event in self._folder.fold_again(inserts, fold.rebuilt):
+        for event in self._folder.fold_again(inserts, fold.rebuilt, fold.further):
             if isinstance(event, Judged):
                 for outcome in event.outcomes:
                     done = ACCEPTED if isinstance(outcome.answer, bytes) else REFUSED
@@ -111,7 +111,7 @@ class _History:
                     self._store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
                 )
         if self._beside is not None:
-            for _ in self._beside.fold_again(inserts, rebuilt=False):
+            for _ in self._beside.fold_again(inserts, further=fold.further):
                 pass
         return present
 

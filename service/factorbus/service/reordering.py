@@ -32,10 +32,11 @@ _COPIES = 3
 
 
 class _Noted(NamedTuple):
-    """A fold: what the solver tried of it, and variables and factors after it."""
+    """A fold: what the solver tried of it, and variables and factors after it.  further: a step without an insert."""
 
     inserts: Sequence[Arrived]
     size: tuple[int, int]
+    further: bool
 
 
 class Reordering:
@@ -70,8 +71,9 @@ class Reordering:
             if self._is_due():
                 self._beside = _Beside(self._folder, fold, self._grown, self._name)
             return None
-        if inserts:
-            beside.note(_tried(inserts, events))
+        further = any(isinstance(event, Stepped) and event.further for event in events)
+        if inserts or further:
+            beside.note(_tried(inserts, events), further)
         stays, taken = beside.go_on()
         if not stays:
             self._beside = None
@@ -106,9 +108,9 @@ class _Beside:
         """Whether the other solver is still being made."""
         return self._thread.is_alive()
 
-    def note(self, inserts: Sequence[Arrived]) -> None:
-        """These were folded in."""
-        self._noted.append(_Noted(inserts, self._folder.size))
+    def note(self, inserts: Sequence[Arrived], further: bool) -> None:
+        """These were folded in, or there were none and it was a further step."""
+        self._noted.append(_Noted(inserts, self._folder.size, further))
 
     def go_on(self) -> tuple[bool, Stepped | None]:
         """(whether it goes on, the step by which it took the place)."""
@@ -141,7 +143,7 @@ class _Beside:
 
     def _follow(self, other: Folder, noted: _Noted) -> bool:
         """Give `other` a fold; gives whether it is then as the map was, and by no way that a restart would not go."""
-        events = list(other.fold_again(noted.inserts, rebuilt=False))
+        events = list(other.fold_again(noted.inserts, further=noted.further))
         agrees = other.size == noted.size and not any(isinstance(e, Stepped) and e.rebuilt for e in events)
         if not agrees:
             log.info("map %s is not ordered anew: the other solver refused something else, or failed", self._name)

@@ -13,7 +13,7 @@ from factorbus.solver.errors import SolverError
 
 def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last) -> Fold:
     """What is written down of a Run."""
-    present, revision, rebuilt, reordered = last.chain, last.revision, False, None
+    present, revision, rebuilt, reordered, further = last.chain, last.revision, False, None, False
     outcomes: dict[int, tuple[Outcome, Judged]] = {}
     for event in events:
         if isinstance(event, Judged):
@@ -22,8 +22,9 @@ def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | S
         else:
             present, revision = chain.follow(present, event.delta), event.revision
             rebuilt, reordered = rebuilt or event.rebuilt, event.reordered
+            further = event.further and not event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
-    return Fold(number, revision, rebuilt, present, entries, reordered)
+    return Fold(number, revision, rebuilt, present, entries, reordered, further)
 
 
 def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:

@@ -27,10 +27,11 @@ async function ask(path) {
 }
 
 function changed() {
-  const { chi2, step_ms: ms, strategy } = map.report;
+  const { chi2, step_ms: ms, strategy, converging } = map.report;
   const words = [`revision ${map.revision}`, `${map.variables.size} variables`];
   if (chi2 !== undefined) words.push(`χ² ${chi2.toPrecision(6)}`);
   if (ms !== undefined) words.push(`step ${ms.toFixed(2)} ms ${strategy ?? ""}`);
+  if (converging) words.push("converging");
   of("state").textContent = map.state === "live" ? words.join(" · ") : map.state;
   refresh();
   if (drawing) return;

@@ -1,0 +1,66 @@
+"""What `factorbus top` and `factorbus stats` say of maps that have converged, have not, or gave up."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faulty.service import MAP, Service, endpoint_in
+
+from factorbus.cli.exits import OK
+from factorbus.cli.main import main
+
+_HISTOGRAM = {"bounds_s": [1.0], "counts": [0, 0], "sum_s": 0.0}
+_ROW = {
+    "chi2": 12.5, "steps": 7, "inserts": {"accepted": 4, "refused": 0, "busy": 0}, "solver_ms": 1.0, "waiting": 0,
+    "parked": 0, "clients": {}, "strategies": {"tree": 7}, "refusals": {}, "step_s": _HISTOGRAM,
+    "insert_s": _HISTOGRAM,
+}  # fmt: skip
+_SERVICE = {
+    "service": "s1", "version": "0", "workers": [], "alive": True, "ready": True, "stuck": [], "uptime_s": 5.0,
+    "memory": {"resident_bytes": 1 << 20, "limit_bytes": 2 << 20},
+}  # fmt: skip
+_REASON = "3 further steps in a row changed nothing"
+CONVERGED = {"converged": True, "converging": False, "further_steps": 0, "gave_up": ""}
+CONVERGING = {"converged": False, "converging": True, "further_steps": 3, "gave_up": ""}
+GAVE_UP = {"converged": False, "converging": False, "further_steps": 3, "gave_up": _REASON}
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    running = Service(tmp_path)
+    yield running
+    running.close()
+
+
+def said(service: Service, folder: Path, how: dict[str, Any], capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    service.says = _SERVICE | _ROW | how
+    service.says["maps"] = [service._row() | {"clients": 0}]
+    assert main([*command, "--connect", endpoint_in(folder)]) == OK
+    return " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("how", "wanted"), [(CONVERGED, "12.5 0 0"), (CONVERGING, "12.5 converging"), (GAVE_UP, "12.5 gave up")]
+)
+def test_top(service: Service, tmp_path: Path, how: dict[str, Any], wanted: str, capsys: Any) -> None:
+    assert wanted in said(service, tmp_path, how, capsys, "top", "--once", "--every", "0.1")
+
+
+def test_top_as_a_document(service: Service, tmp_path: Path, capsys: Any) -> None:
+    (row,) = json.loads(said(service, tmp_path, GAVE_UP, capsys, "top", "--json", "--every", "0.1"))["maps"]
+    assert row["name"] == MAP
+    assert row.items() >= GAVE_UP.items()
+
+
+@pytest.mark.parametrize(
+    ("how", "wanted"),
+    [
+        (CONVERGED, "χ² 12.5, converged; 7 tree"),
+        (CONVERGING, "χ² 12.5, converging, after 3 further steps; 7 tree"),
+        (GAVE_UP, f"χ² 12.5, not converged after 3 further steps: gave up, as {_REASON}; 7 tree"),
+    ],
+)
+def test_stats(service: Service, tmp_path: Path, how: dict[str, Any], wanted: str, capsys: Any) -> None:
+    assert wanted in said(service, tmp_path, how, capsys, "stats")

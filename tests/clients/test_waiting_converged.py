@@ -1,0 +1,186 @@
+"""A client that waits for a map to converge, against a service that does what it is told, over real zenoh."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from faulty.service import MAP, Service, endpoint_in
+
+from factorbus.client import Draft, Map, NotConverged, Refused, Unavailable, aio, connect
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    running = Service(tmp_path)
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def kitchen(service: Service, tmp_path: Path) -> Iterator[Map]:
+    with connect(endpoint_in(tmp_path), client="robot1") as bus, bus.map(MAP) as joined:
+        yield joined
+
+
+def point(n: int) -> Draft:
+    return Draft().point2(f"l{n}", (n, 0))
+
+
+def in_background(call: Callable[[], None]) -> tuple[threading.Thread, list[BaseException | None]]:
+    """`call` on a thread of its own, and what came of it."""
+    came: list[BaseException | None] = []
+
+    def run() -> None:
+        try:
+            call()
+            came.append(None)
+        except BaseException as problem:
+            came.append(problem)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, came
+
+
+def test_it_returns_with_the_delta_that_says_so(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": False}
+    service.says = {"converged": False, "converging": True}
+    kitchen.insert(point(1))
+    assert kitchen.estimate.converged is False
+    thread, came = in_background(lambda: kitchen.wait_converged(50))
+    for _ in range(20):
+        service.step({1: (1.0, 2.0)})
+    assert thread.is_alive()
+    service.says = {"converged": True, "converging": False}
+    service.report = {"converged": True}
+    service.step({1: (1.0, 3.0)})
+    thread.join(50)
+    assert came == [None]
+    assert kitchen.estimate.converged is True
+    assert kitchen.estimate.revision == service.revision == 22
+    kitchen.wait_converged(0.0)
+
+
+def test_when_time_is_up_it_says_where_the_map_is(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": False}
+    service.says = {"converged": False, "converging": True}
+    kitchen.insert(point(1))
+    with pytest.raises(NotConverged, match=r"not converged at revision 1 after .* wait longer") as problem:
+        kitchen.wait_converged(0.3)
+    assert (problem.value.code, problem.value.detail["revision"]) == ("not_converged", 1)
+
+
+def test_a_map_that_gave_up_is_not_waited_for(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": False}
+    service.says = {"converged": False, "converging": False, "gave_up": "3 further steps in a row changed nothing"}
+    kitchen.insert(point(1))
+    with pytest.raises(NotConverged, match="goes on no more by itself: 3 further steps") as problem:
+        kitchen.wait_converged(50)
+    assert problem.value.detail["gave_up"] == service.says["gave_up"]
+    service.says, service.report = {"converged": True}, {"converged": True}
+    kitchen.insert(point(2))
+    kitchen.wait_converged(50)
+
+
+@pytest.mark.parametrize("converged", [True, False])
+def test_who_joins_later_is_told_by_the_stats(service: Service, tmp_path: Path, converged: bool) -> None:
+    """Only deltas carry a report; whoever began with the whole estimate has seen none."""
+    service.step({1: (1.0, 2.0)})
+    service.says = {"converged": converged, "gave_up": "" if converged else "it is told to"}
+    with connect(endpoint_in(tmp_path), client="late") as bus, bus.map(MAP) as joined:
+        assert joined.estimate.converged is None
+        if converged:
+            joined.wait_converged(50)
+        else:
+            with pytest.raises(NotConverged):
+                joined.wait_converged(50)
+        assert joined.estimate.converged is converged
+
+
+def test_what_the_stats_say_of_another_revision_does_not_count(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": False}
+    kitchen.insert(point(1))
+    service.says = {"converged": True}
+    service.mute = True
+    service.step({1: (1.0, 2.0)})  # its delta is lost
+    kitchen.wait_converged(50)
+    assert kitchen.estimate.revision == 2
+
+
+def test_what_was_sent_is_waited_for_first(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": True}
+    kitchen.insert(point(1))
+    service.faults.append("hold")
+    kitchen.send(point(2))
+    with pytest.raises(Unavailable, match="1 inserts are unanswered"):
+        kitchen.wait_converged(0.2)
+    kitchen.wait_converged(50)
+    assert kitchen.estimate.revision == 2
+    refused = kitchen.send(Draft().point2("l3", (float("nan"), 0)))
+    with pytest.raises(Refused):
+        kitchen.wait_converged(50)
+    assert refused.done()
+
+
+def test_a_closed_map_ends_the_wait(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": False}
+    service.says = {"converged": False, "converging": True}
+    kitchen.insert(point(1))
+    thread, came = in_background(lambda: kitchen.estimate.wait_converged(50))
+    kitchen.close()
+    thread.join(50)
+    assert isinstance(came[0], Unavailable)
+
+
+def test_without_a_mirror_there_is_nothing_to_wait_at(service: Service, tmp_path: Path) -> None:
+    with connect(endpoint_in(tmp_path), client="robot1") as bus, bus.map(MAP, mirror=False) as joined:
+        joined.insert(point(1))
+        with pytest.raises(Unavailable, match="mirror=True"):
+            joined.wait_converged(50)
+
+
+def test_the_row_says_that_it_is_converging(service: Service, kitchen: Map, tmp_path: Path) -> None:
+    with connect(endpoint_in(tmp_path), client="robot1") as bus:
+        assert [row.converging for row in bus.maps()] == [False], "a service that does not say"
+        service.says = {"converging": True}
+        assert [row.converging for row in bus.maps()] == [True]
+
+
+def test_with_asyncio_the_same(service: Service, tmp_path: Path) -> None:
+    async def drive() -> None:
+        async with aio.connect(endpoint_in(tmp_path), client="robot1") as bus, bus.map(MAP) as joined:
+            service.report, service.says = {"converged": False}, {"converged": False, "converging": True}
+            await joined.insert(point(1))
+            with pytest.raises(NotConverged):
+                await joined.wait_converged(0.2)
+            waiting = asyncio.create_task(joined.wait_converged(50))
+            service.report, service.says = {"converged": True}, {"converged": True}
+            service.step({1: (1.0, 2.0)})
+            await waiting
+            assert joined.estimate.revision == 2
+
+    asyncio.run(drive())
+
+
+def test_a_word_of_an_older_revision_does_not_count(service: Service, kitchen: Map) -> None:
+    """The stats were on their way when the delta came."""
+    service.report = {"converged": False}
+    kitchen.insert(point(1))
+    service.says = {"revision": 0, "converged": True}
+    with pytest.raises(NotConverged):
+        kitchen.wait_converged(0.5)
+    assert service.asked.count("stats") > 0
+
+
+def test_of_a_revision_without_a_report_nothing_is_known(service: Service, kitchen: Map) -> None:
+    service.report = {"converged": True}
+    kitchen.insert(point(1))
+    assert kitchen.estimate.converged is True
+    service.mute = True
+    service.step({1: (1.0, 2.0)})  # its delta is lost, and the whole estimate asked for
+    kitchen.estimate.wait_for(2, 50)
+    assert kitchen.estimate.converged is None

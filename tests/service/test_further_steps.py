@@ -1,0 +1,335 @@
+"""A map that is left alone before it has converged: further steps of a real solver, told, kept and made again."""
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from turned import closing, drive, optimum
+
+from factorbus.journal.problems import JournalDiffers
+from factorbus.journal.snapshots import read_snapshot, write_snapshot
+from factorbus.journal.store import Store, create, open_store
+from factorbus.proto import codec
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Batch, Delta, Insert
+from factorbus.service.arrival import read_insert
+from factorbus.service.config import Limits
+from factorbus.service.converging import QUIET_S
+from factorbus.service.core import MapCore
+from factorbus.service.events import Answer, Arrived, Drained, Effect, Folded, Publish, Stepped
+from factorbus.service.fold import GOES_ON, Folder
+from factorbus.service.host import Host
+from factorbus.service.questions import Question
+from factorbus.service.recovery import recover, verify
+from factorbus.service.writing import written
+from factorbus.solver import Options, Solver, fingerprint
+from factorbus.solver.errors import NotFinite
+
+EPOCH, PATIENCE_S = 7, 120.0
+POSES, DEGREES = 100, 120.0
+# Few tries in each step, so that there are many steps.
+FEW = {"max_iterations": 2}
+MODES = ["inc-l", "all-batch"]
+
+
+def folder_in(mode: str, **options: Any) -> Folder:
+    settings = Options(**{"mode": mode, **FEW, **options})
+    return Folder(lambda: Solver(settings), EPOCH, Limits(), settings.as_dict())
+
+
+def arrived(sequence: int, batch: Batch) -> Arrived:
+    made = read_insert(None, "a", codec.encode_insert(Insert(sequence, batch)), REQUEST_LIMITS, time.monotonic())
+    assert isinstance(made, Arrived)
+    return made._replace(askers=[f"asker {sequence}"])
+
+
+def inserts() -> list[Arrived]:
+    return [arrived(n + 1, batch) for n, batch in enumerate((*drive(POSES, DEGREES), closing(POSES)))]
+
+
+class Written:
+    """A folder, and the journal of what it did."""
+
+    def __init__(self, path: Path, mode: str) -> None:
+        self.folder = folder_in(mode)
+        self.store: Store = create(path, path.name, mode, self.folder.options(), EPOCH, "none")
+
+    def fold(self, *taken: Arrived, further: bool = False) -> list[Stepped]:
+        events, folded = self.folder.fold_whole(taken, further)
+        assert not folded.failed
+        last = self.store.last()
+        self.store.append([written(last.fold + 1, taken, events, last)])
+        return [event for event in events if isinstance(event, Stepped)]
+
+    def converge(self) -> list[Stepped]:
+        steps: list[Stepped] = []
+        while not self.folder.converged:
+            steps += self.fold(further=True)
+            assert len(steps) < 2000
+        return steps
+
+
+def values(folder: Folder) -> dict[int, bytes]:
+    taken = folder.snapshot([Question("estimate")])
+    return {int(key): row.tobytes() for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
+
+
+def told(deltas: list[Delta]) -> dict[int, bytes]:
+    """What a mirror has that was given all of these."""
+    have: dict[int, bytes] = {}
+    for delta in deltas:
+        have |= {int(k): row.tobytes() for g in delta.variables for k, row in zip(g.keys, g.values, strict=True)}
+    return have
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_further_steps_lead_to_the_optimum_and_tell_what_they_change(tmp_path: Path, mode: str) -> None:
+    map_, came = Written(tmp_path / "m", mode), inserts()
+    deltas = [codec.decode_delta(step.delta) for one in came for step in map_.fold(one)]
+    assert not map_.folder.converged
+    assert (deltas[-1].report["converged"], deltas[-1].report["converging"]) == (False, True)
+    before = len(deltas)
+    further = map_.converge()
+    deltas += [codec.decode_delta(step.delta) for step in further]
+    assert len(further) > 2
+    assert all(step.further for step in further)
+    for delta in deltas[before:]:
+        assert (delta.epoch, delta.previous, delta.revision) == (EPOCH, delta.revision - 1, deltas.index(delta) + 1)
+        report = delta.report
+        assert (report["new_variables"], report["new_factors"]) == (0, 0)
+        assert report["because"].startswith(GOES_ON)
+        assert report["converging"] is not report["converged"]
+        assert report["changed"] == sum(len(group.keys) for group in delta.variables)
+    assert [delta.report["converged"] for delta in deltas[before:]] == [False] * (len(further) - 1) + [True]
+    assert told(deltas) == values(map_.folder)
+    assert map_.folder.chi2() == pytest.approx(optimum(POSES, DEGREES), rel=1e-4 if mode == "inc-l" else 1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode: str) -> None:
+    """Further steps between inserts, too: how many there were is in the journal."""
+    map_, came = Written(tmp_path / "m", mode), inserts()
+    for one in came:
+        map_.fold(one)
+    for _ in range(3):
+        map_.fold(further=True)
+    map_.fold(arrived(len(came) + 1, closing(POSES)))
+    state, at = map_.folder.dump(), map_.store.last()
+    for _ in range(2):
+        map_.fold(further=True)
+    assert not map_.folder.converged
+    again = folder_in(mode)
+    recovered = recover(map_.store, again, fingerprint())
+    assert (recovered.same, recovered.last) == (True, map_.store.last())
+    assert (values(again), again.revision, again.converged) == (values(map_.folder), map_.folder.revision, False)
+    assert [fold.number for fold in map_.store.folds() if fold.further] == [len(came) + n for n in (1, 2, 3, 5, 6)]
+    write_snapshot(tmp_path / "s", state)
+    late = folder_in(mode)
+    late.load(read_snapshot(tmp_path / "s"))
+    assert (late.revision, late.converged) == (at.revision, False)
+    map_.converge()
+    for other, made in ((again, 2), (late, 0)):
+        while not other.converged:
+            other.fold_whole((), further=True)
+            made += 1
+        assert values(other) == values(map_.folder), "what goes on from there goes the same way"
+        assert other.revision == map_.folder.revision == at.revision + made
+    assert all(same for _, same in verify(map_.store, folder_in(mode)))
+
+
+@pytest.mark.parametrize(
+    "damage", ["UPDATE fold SET rebuilt = 0 WHERE rebuilt = 2", "DELETE FROM entry WHERE fold = 3"]
+)
+def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Path, damage: str) -> None:
+    map_ = Written(tmp_path / "m", "inc-l")
+    for one in inserts():
+        map_.fold(one)
+    map_.fold(further=True)
+    map_.store._db.execute(damage)
+    map_.store.close()
+    store = open_store(tmp_path / "m")
+    with pytest.raises(JournalDiffers, match="led to revision"):
+        recover(store, folder_in("inc-l"), fingerprint())
+    store.close()
+
+
+def unconverged(mode: str = "all-batch") -> Folder:
+    folder = folder_in(mode)
+    for one in inserts():
+        folder.fold_whole([one])
+    assert not folder.converged
+    return folder
+
+
+def test_a_further_step_that_is_refused_leaves_all_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = unconverged()
+    before, revision = values(folder), folder.revision
+
+    def refuse(solver: Solver, settle: bool = False) -> Any:
+        raise NotFinite("χ²")
+
+    monkeypatch.setattr(Solver, "step", refuse)
+    events, folded = folder.fold_whole((), further=True)
+    assert (events, folded.failed, folder.revision, values(folder)) == ([], True, revision, before)
+
+
+def failing(*_: Any) -> Any:
+    raise ZeroDivisionError
+
+
+def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    map_ = Written(tmp_path / "m", "all-batch")
+    for one in inserts():
+        map_.fold(one)
+    revision, broken = map_.folder.revision, map_.folder.solver
+    monkeypatch.setattr(broken, "step", failing)
+    (stepped,) = map_.fold(further=True)
+    assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
+    assert map_.folder.solver is not broken
+    assert len(told([codec.decode_delta(stepped.delta)])) == POSES
+    again = folder_in("all-batch")
+    assert recover(map_.store, again, fingerprint()).same
+    assert values(again) == values(map_.folder)
+    assert again.revision == map_.folder.revision == revision + 1
+
+
+def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = unconverged()
+    revision, broken = folder.revision, folder.solver
+    monkeypatch.setattr(broken, "changed", failing)
+    (stepped,) = [event for event in folder.fold_whole((), further=True)[0] if isinstance(event, Stepped)]
+    assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
+    assert folder.solver is not broken
+    assert told([codec.decode_delta(stepped.delta)]) == values(folder)
+
+
+# ---- with threads ---------------------------------------------------------------------------------------------------
+
+
+class Waiting(Solver):
+    """A solver whose further steps say when they begin, and wait for leave."""
+
+    def __init__(self) -> None:
+        super().__init__(Options(mode="all-batch", **FEW))
+        self.begun, self.leave = threading.Semaphore(0), threading.Semaphore(0)
+
+    def step(self, settle: bool = False) -> Any:
+        if self.factor_count == POSES and not settle and self._done.graph == self._graph.mark():
+            self.begun.release()
+            assert self.leave.acquire(timeout=PATIENCE_S)
+        return super().step(settle)
+
+
+class Told:
+    """What a host had done."""
+
+    def __init__(self) -> None:
+        self.effects: list[Effect] = []
+        self._more = threading.Condition()
+
+    def take(self, effects: list[Effect]) -> None:
+        with self._more:
+            self.effects += effects
+            self._more.notify_all()
+
+    def take_both(self, asker: Any, answer: bytes, delta: bytes) -> None:
+        self.take([Answer(asker, answer), Publish("delta", delta)])
+
+    def wait_for(self, happened: Any) -> None:
+        with self._more:
+            assert self._more.wait_for(happened, PATIENCE_S)
+
+    def answered(self) -> int:
+        return sum(isinstance(effect, Answer) for effect in self.effects)
+
+    def further(self) -> list[int]:
+        """Where deltas of further steps are among all answers and deltas."""
+        sent = [e for e in self.effects if isinstance(e, Answer) or (isinstance(e, Publish) and e.channel == "delta")]
+        reports = [codec.decode_delta(e.message).report if isinstance(e, Publish) else {} for e in sent]
+        return [n for n, report in enumerate(reports) if str(report.get("because")).startswith(GOES_ON)]
+
+
+class Hosted:
+    """A host of a map that has not converged."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.told = Told()
+        self.core = MapCore("m", "all-batch", EPOCH, Limits(fold=1), 0.0)
+        self.host = Host(
+            self.core, Folder(lambda: solver, EPOCH, Limits()), self.told.take, self.told.take,
+            lambda reads, taken: None, threading.Lock(), self.told.take_both,
+        )  # fmt: skip
+        self.came = inserts()
+        for one in self.came:
+            self.host.insert(one)
+        self.told.wait_for(lambda: self.told.answered() == len(self.came))
+
+    def tick_until(self, happened: Any) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not happened():
+            self.host.tick()
+            assert time.monotonic() < end
+
+    def end(self) -> None:
+        self.host.stop()
+        self.told.wait_for(lambda: any(isinstance(effect, Drained) for effect in self.told.effects))
+        self.host.end()
+
+
+@pytest.fixture
+def waiting() -> Iterator[tuple[Hosted, Waiting]]:
+    solver = Waiting()
+    hosted = Hosted(solver)
+    yield hosted, solver
+    solver.leave.release(10_000)
+    hosted.end()
+
+
+def test_an_insert_waits_for_the_further_step_under_way_and_no_other(waiting: tuple[Hosted, Waiting]) -> None:
+    hosted, solver = waiting
+    hosted.tick_until(lambda: solver.begun.acquire(blocking=False))
+    answered = hosted.told.answered()
+    hosted.host.insert(arrived(len(hosted.came) + 1, closing(POSES)))
+    solver.leave.release()
+    hosted.told.wait_for(lambda: hosted.told.answered() == answered + 1)
+    assert len(hosted.told.further()) == 1
+    assert not solver.begun.acquire(blocking=False), "no second one had begun"
+
+
+def test_a_map_whose_steps_are_of_no_use_does_not_spin() -> None:
+    steps: list[float] = []
+
+    class Stuck(Solver):
+        def step(self, settle: bool = False) -> Any:
+            report = super().step(settle)
+            if report.new_factors or report.new_variables:
+                return report._replace(converged=self.factor_count < POSES)
+            steps.append(time.monotonic())
+            self._changed = self._changed[:0]
+            return report._replace(converged=False, changed=0, damping=0.0)
+
+    hosted = Hosted(Stuck(Options(mode="all-batch")))
+    try:
+        hosted.tick_until(lambda: hosted.core.stats(0.0)["gave_up"])
+        end = time.monotonic() + 20 * QUIET_S
+        hosted.tick_until(lambda: time.monotonic() > end)
+        assert len(steps) == 3
+        assert "3 further steps in a row changed nothing" in hosted.core.stats(0.0)["gave_up"]
+        assert not hosted.core.row()["converging"]
+    finally:
+        hosted.end()
+
+
+def test_a_map_that_comes_to_an_end_by_itself_is_what_it_says(waiting: tuple[Hosted, Waiting]) -> None:
+    hosted, solver = waiting
+    solver.leave.release(10_000)
+    hosted.tick_until(lambda: hosted.core.row()["converged"])
+    assert not any(isinstance(e, Folded) for e in hosted.told.effects)
+    assert hosted.core.stats(0.0)["chi2"] == pytest.approx(optimum(POSES, DEGREES), rel=1e-6)
+    assert np.isclose(solver.chi2(), hosted.core.stats(0.0)["chi2"], rtol=1e-12)

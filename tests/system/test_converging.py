@@ -1,0 +1,216 @@
+"""A map that is left alone before it has converged finishes by itself: real processes, killed, forked, asked."""
+
+import asyncio
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from journalled import Services, rows
+from processes import PATIENCE_S
+from turned import closing, in_one, optimum
+
+from factorbus.client import Map, aio, connect
+from factorbus.journal.records import Fold
+from factorbus.journal.store import open_store
+from factorbus.proto.messages import Delta
+from factorbus.service.config import Limits
+from factorbus.service.fold import GOES_ON
+from factorbus.service.library import make_folder
+from factorbus.service.recovery import verify
+
+# With so many further steps, and more, for the map that is LONG.
+MODES = {"all-batch": 20, "inc-l": 20}
+# The first finishes in a few steps, the second in hundreds of short ones.
+SHORT, LONG = (200, 90.0), (1000, 90.0)
+
+
+class Deltas:
+    """What is published of a map from now on."""
+
+    def __init__(self, joined: Map) -> None:
+        self.all: list[Delta] = []
+        self._more = threading.Condition()
+        joined.estimate.on_delta(self._take)
+
+    def _take(self, delta: Delta) -> None:
+        with self._more:
+            self.all.append(delta)
+            self._more.notify_all()
+
+    def wait_for_further(self, count: int) -> None:
+        with self._more:
+            assert self._more.wait_for(lambda: len(self.further()) >= count, PATIENCE_S)
+
+    def further(self) -> list[Delta]:
+        return [delta for delta in self.all if str(delta.report.get("because")).startswith(GOES_ON)]
+
+
+def turn(joined: Map, size: tuple[int, float]) -> Deltas:
+    """The drive, and then the loop; what comes from that on."""
+    poses, _ = size
+    joined.insert(in_one(*size))
+    joined.wait_converged(PATIENCE_S)
+    deltas = Deltas(joined)
+    joined.insert(closing(poses))
+    return deltas
+
+
+def state(joined: Map) -> tuple[int, dict[int, bytes]]:
+    estimate = joined.ask_estimate()
+    return estimate.revision, rows(estimate.variables)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_map_left_alone_comes_to_its_optimum(endpoint: str, mode: str) -> None:
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map(f"left-{mode}", mode) as joined:
+        deltas, begun = turn(joined, LONG), time.monotonic()
+        joined.wait_converged(PATIENCE_S)
+        print(f"{mode}: converged {time.monotonic() - begun:.2f} s after the insert, {len(deltas.all)} steps")
+        assert [delta.report["converged"] for delta in deltas.all] == [False] * (len(deltas.all) - 1) + [True]
+        assert [delta.previous for delta in deltas.all] == [delta.revision - 1 for delta in deltas.all]
+        assert deltas.further() == deltas.all[1:]
+        for delta in deltas.further():
+            assert (delta.report["new_variables"], delta.report["new_factors"]) == (0, 0)
+            assert delta.report["converging"] is not delta.report["converged"]
+        revision, values = state(joined)
+        keys, mirrored = joined.estimate.columns("se2")
+        assert {int(k): row.tobytes() for k, row in zip(keys, mirrored, strict=True)} == values
+        assert joined.estimate.revision == revision == deltas.all[-1].revision
+        stats = joined.stats()
+        assert (stats["converged"], stats["converging"], stats["gave_up"]) == (True, False, "")
+        assert stats["further_steps"] == len(deltas.further()) >= MODES[mode]
+        assert joined.chi2().chi2 == pytest.approx(optimum(*LONG), rel=1e-6)
+
+
+def test_while_it_goes_on_it_says_so_and_answers_of_its_latest_revision(endpoint: str) -> None:
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map("asked", "all-batch") as joined:
+        deltas = turn(joined, LONG)
+        deltas.wait_for_further(1)
+        seen, asked = joined.stats(), 0
+        assert (seen["converged"], seen["converging"]) == (False, True)
+        assert [row.converging for row in bus.maps() if row.name == "asked"] == [True]
+        answers = []
+        while not joined.estimate.converged:
+            known = joined.estimate.revision
+            answers.append((known, joined.chi2(), joined.doubt.last()))
+            asked += 1
+        assert asked > 3
+        joined.wait_converged(PATIENCE_S)
+        chi2 = {delta.revision: delta.report["chi2"] for delta in deltas.all}
+        for known, found, last in answers:
+            assert known <= found.revision <= last.revision
+            assert found.chi2 == pytest.approx(chi2[found.revision], rel=1e-9)
+        assert [row.converging for row in bus.maps() if row.name == "asked"] == [False]
+
+
+def test_an_insert_that_comes_in_between_goes_first(endpoint: str) -> None:
+    """Whoever inserts waits for the one step under way; after it, the map is left alone again."""
+    with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map("between", "all-batch") as joined:
+        deltas = turn(joined, LONG)
+        deltas.wait_for_further(3)
+        before = joined.stats()["revision"]
+        accepted = joined.insert(closing(900))
+        assert accepted.report["new_factors"] == 1
+        between = [d for d in deltas.further() if before + 1 < d.revision < accepted.revision]
+        print(f"{len(between)} further steps from before it was sent until it was taken in")
+        assert not joined.estimate.converged
+        joined.wait_converged(PATIENCE_S)
+        last = deltas.all[-1]
+        assert last.revision > accepted.revision
+        assert last.report["converged"]
+
+
+@pytest.mark.parametrize(("mode", "durability"), [("all-batch", "commit"), ("inc-l", "commit"), ("inc-l", "none")])
+def test_killed_while_it_goes_on_it_comes_to_the_same_bits(
+    services: Callable[..., Services], tmp_path: Path, mode: str, durability: str
+) -> None:
+    """Against one that was never stopped. With durability none it is stopped in order: a crash may take steps back."""
+    end = signal.SIGKILL if durability == "commit" else signal.SIGTERM
+    settings = ("snapshot_s=0.2", f'durability="{durability}"')
+    ends: list[tuple[int, dict[int, bytes]]] = []
+    written: list[int] = []  # further steps, whenever it was stopped
+    for name in ("whole", "stopped"):
+        running = services(tmp_path / name, *settings)
+        with (
+            connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
+            bus.map("m2", mode) as joined,
+        ):
+            deltas = turn(joined, LONG)
+            if name == "stopped":
+                deltas.wait_for_further(1)
+                for _ in range(3):
+                    running.end(end)
+                    written.append(further_in(tmp_path / name / "m2"))
+                    running.start()  # and stopped once more as soon as it is there
+                assert joined.stats()["epoch"] == joined.epoch, "the same map, at the same place"
+            joined.wait_converged(PATIENCE_S)
+            ends.append(state(joined))
+        running.end(signal.SIGTERM)
+    assert ends[0] == ends[1]
+    folds = again(tmp_path / "stopped" / "m2")
+    assert all(same for _, same in folds), "from the first insert on, too"
+    total = sum(fold.further for fold, _ in folds)
+    assert total == ends[0][0] - 2
+    assert 0 < written[0] <= written[1] <= written[2]
+    assert written[0] < total, "it was stopped in the middle"
+
+
+def further_in(journal: Path) -> int:
+    store = open_store(journal, read_only=True)
+    try:
+        return sum(fold.further for fold in store.folds())
+    finally:
+        store.close()
+
+
+def again(journal: Path) -> list[tuple[Fold, bool]]:
+    """All that is in a journal, folded again; each with whether it had the same bits."""
+    store = open_store(journal, read_only=True)
+    try:
+        header = store.header()
+        return list(verify(store, make_folder(header.mode, header.options, header.epoch, Limits())))
+    finally:
+        store.close()
+
+
+def test_a_fork_goes_on_by_itself_to_the_same_bits(services: Callable[..., Services], tmp_path: Path) -> None:
+    running = services(tmp_path / "journal")
+    with (
+        connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
+        bus.map("m2", "all-batch") as joined,
+    ):
+        deltas = turn(joined, LONG)
+        deltas.wait_for_further(5)
+        row = bus.fork("m2", "fork")
+        assert row.converging
+        joined.wait_converged(PATIENCE_S)
+        with bus.map("fork", create=False) as fork:
+            fork.wait_converged(PATIENCE_S)
+            assert state(fork) == state(joined)
+        running.end(signal.SIGKILL)
+        running.start()
+        with bus.map("fork", create=False) as fork:
+            assert state(fork) == state(joined)
+            fork.wait_converged(PATIENCE_S)
+            assert [each.converging for each in bus.maps()] == [False] * 3
+
+
+def test_with_asyncio_it_is_waited_for_too(endpoint: str) -> None:
+    async def drive() -> Any:
+        async with (
+            aio.connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus,
+            bus.map("awaited", "all-batch") as joined,
+        ):
+            await joined.insert(in_one(*SHORT))
+            await joined.insert(closing(SHORT[0]))
+            await joined.wait_converged(PATIENCE_S)
+            return await joined.chi2(), joined.estimate.converged
+
+    found, converged = asyncio.run(drive())
+    assert converged
+    assert np.isclose(found.chi2, optimum(*SHORT), rtol=1e-6)
