@@ -79,7 +79,7 @@ def _exchange(session: zenoh.Session) -> dict[str, bytes]:
     told["delta"], told["delta_more"] = deltas[:2]
     for name in (PIECES, MAP):
         _ask(session, keys.admin_key("drop"), codec.encode_map({"map": name}))
-    return {name: msgpack.packb(_same(msgpack.unpackb(data))) for name, data in told.items()}
+    return {name: bytes(msgpack.packb(_same(msgpack.unpackb(data))) or b"") for name, data in told.items()}
 
 
 def _batch() -> Batch:
