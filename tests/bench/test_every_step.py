@@ -126,13 +126,13 @@ def test_the_optimum_of_a_full_settle_is_met_and_all_targets_with_it() -> None:
 
 
 def test_a_sloppy_solver_misses_the_targets() -> None:
-    """Nothing is relinearised, and nothing is looked at: as honest as that is, it says `converged`."""
+    """Nothing is relinearized while it drives, and it says `converged`; left alone it finishes all the same."""
     found = row("manhattan", 300, Options(**dict.fromkeys(SLOPPY, 1e9)), seed=2)
     assert found["max"] > 1.01
     assert found["worst_converged"] > 1.001
-    assert found["idle_ratio"] > 1 + 1e-6
+    assert found["idle_ratio"] <= 1 + 1e-6
     told = [each.verdict for each in judge([found])]
-    assert told.count(MISSED) >= 4
+    assert told.count(MISSED) >= 3
 
 
 def test_a_step_that_says_it_has_not_converged_counts_as_such_and_not_as_untrue() -> None:

@@ -45,7 +45,7 @@ def test_a_number_out_of_its_range_is_refused_by_name(name: str) -> None:
     ):
         with pytest.raises(BadOption, match=f"option {name}: seen") as refused:
             Options(**{name: wrong})
-        assert refused.value.detail["name"] == name
+        assert refused.value.detail["where"] == name
         assert refused.value.detail["wanted"] == str(allowed)
 
 

@@ -216,7 +216,14 @@ def test_bad_batches_are_refused_whole(name: str, mode: str) -> None:
 def test_every_code_is_in_the_table() -> None:
     codes = {error.code for error in errors.SolverError.__subclasses__()}
     elsewhere = {"unknown_mode", "bad_option", "no_backend", "unknown_factor", "diverged"}
-    elsewhere |= {"in_use", "bad_weight", "too_connected", "bad_order", "bad_direction"}  # changes, other kinds
+    elsewhere |= {
+        "in_use",
+        "bad_weight",
+        "too_connected",
+        "bad_order",
+        "bad_direction",
+        "named_twice",
+    }  # changes, other kinds
     assert codes - elsewhere == {code for code, _ in REFUSED.values()}
 
 

@@ -20,6 +20,7 @@
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
     │   └── NobodyListens    unavailable          there is nothing at that address
+    ├── NotConverged         not_converged        a map was waited for in vain (client side)
     ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── OtherProtocol        other_protocol       only services of another major version are there (client side)
     ├── NotSupported         not_supported        the service is older than what it is asked for (client side)
