@@ -5,8 +5,8 @@
                                                   └───────── an insert ──────────────┴──▶ gave up
 
 It gives up, until something else changes the map, where further steps are of no use, and where there were too many.
-A map that has converged, but that a step would still bring nearer to its optimum by what χ² shows, goes on as well, when
-it has been left alone for longer.
+A map that has converged, but that a step would still bring nearer to its optimum by what χ² shows, goes on as well
+when it has been left alone for longer.
 Reasons and figures: docs/decisions/further-steps.md.
 """
 
