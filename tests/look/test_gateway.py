@@ -14,7 +14,7 @@ from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
 from turned import closing, in_one
 
-from factorbus.cli.exits import FAILED, OK
+from factorbus.cli.exits import OK, USAGE
 from factorbus.cli.main import main
 from factorbus.client import Draft, connect
 from factorbus.proto.symbols import format_symbol
@@ -110,7 +110,7 @@ def test_problems_have_their_codes(endpoint: str, gateway: str) -> None:
     assert refusal(f"{root}/not%20a%20name/estimate")[1] in ("bad_name", "unknown_map")
     assert refusal(f"{root}/small/variables/x9") == (404, "unknown_variable")
     assert refusal(f"{root}/small/variables/12x") == (400, "bad_symbol")
-    assert refusal(f"{root}/small/export?format=png") == (400, "unknown_question")
+    assert refusal(f"{root}/small/export?format=png") == (400, "bad_option")
     assert refusal(f"{root}/small/estimate", Host="evil.example")[0] == 400
 
 
@@ -248,7 +248,7 @@ def test_it_stops_with_browsers_connected_and_says_when_a_port_is_taken(
         port = str(free_port())
         process = spawn("-m", "factorbus.cli", "gateway", "--connect", endpoint, "--port", port)
         (address,) = process.ready()
-        assert main(["gateway", "--connect", endpoint, "--port", port]) == FAILED
+        assert main(["gateway", "--connect", endpoint, "--port", port]) == USAGE
         assert "[port_taken]" in capsys.readouterr().err
         with dial(f"{address.replace('http', 'ws')}/api/maps/left/live") as socket:
             socket.recv(timeout=30)

@@ -16,7 +16,7 @@ from factorbus.gateway.documents import Document
 from factorbus.gateway.explain import explain
 from factorbus.proto.asking import Why
 from factorbus.proto.problems import BadSymbol
-from factorbus.proto.symbols import MAX_INDEX, parse_symbol
+from factorbus.proto.symbols import MAX_KEY, parse_symbol
 
 pytest.importorskip("starlette")
 
@@ -129,7 +129,7 @@ def test_fuzzed_requests_get_documented_answers_and_leave_no_traceback(
     assert seen[404] > 10
 
 
-@pytest.mark.parametrize("text", ["9" * 5000, "x" + "9" * 5000, str(MAX_INDEX + 1), "x" + "9" * 18])
+@pytest.mark.parametrize("text", ["9" * 5000, "x" + "9" * 5000, str(MAX_KEY + 1), "x" + "9" * 18])
 def test_numbers_too_long_to_read_are_no_keys(text: str) -> None:
     with pytest.raises(BadSymbol) as raised:
         parse_symbol(text)
@@ -151,6 +151,9 @@ def test_a_piece_of_negative_weight_is_explained() -> None:
         "dims": 3,
         "influence": 0.0,
         "without": None,
+        "loss": "",
+        "weight": 1.0,
+        "rho": -4.0,
     }
     account = {"key": 7, "kind": "se2", "value": [0.0] * 3, "fixed": False, "sigmas": [1.0] * 3, "conditioning": 1.0,
                "factors": [factor], "pivot": 1.0, "linearised_step": 1, "changed_step": 1, "seen_step": 1}  # fmt: skip

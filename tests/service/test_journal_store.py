@@ -18,7 +18,7 @@ from factorbus.journal.bundle import export_map, import_map
 from factorbus.journal.digest import sealed
 from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, NoJournal
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, MapThere, NoJournal
 from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, Fold
 from factorbus.journal.snapshots import file_of, read_snapshot, remove_strangers, write_snapshot
 from factorbus.journal.store import FORM, NAME, Saved, Store, create, open_store
@@ -268,7 +268,7 @@ def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     assert list(again.folds()) == list(store.folds())
     assert (again.header().map, again.header().epoch) == ("n", 77)
     assert read_snapshot(file_of(tmp_path / "other" / "n", 3))["state"].tolist() == [0, 1, 2, 3, 4]
-    with pytest.raises(JournalFailed, match="there is a map of that name"):
+    with pytest.raises(MapThere, match="there is a map 'n'"):
         import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     (tmp_path / "broken").write_bytes((tmp_path / "m.fbmap").read_bytes()[:5000])
     with pytest.raises(JournalDamaged):

@@ -65,7 +65,7 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
     before, told = together.compiled_seconds(), []
     together.warm(told.append)
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
-    assert {tuple(command[:3]) for command in asked} == {(sys.executable, "-m", "factorbus.service.warm")}
+    assert {tuple(command[:4]) for command in asked} == {(sys.executable, "-P", "-m", "factorbus.service.warm")}
     assert together.compiled_seconds() > before, "who waits for them says so"
 
 

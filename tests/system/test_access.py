@@ -172,7 +172,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     ),
     "see who keeps hall": (lambda me: me.sees("map/hall/live/service/*"), ("robot2", "ops")),
     "see workers": (lambda me: me.sees("worker/*/live/*"), ("ops",)),
-    "see who makes features": (lambda me: me.sees("features/*/live"), ("robot1", "robot2", "ops")),
+    "see who makes features": (lambda me: me.sees("features/*/live"), ("robot1", "robot2", "wall", "ops")),
     **{
         f"be seen in kitchen as {who}": (
             lambda me, who=who: me.seen(f"map/kitchen/live/client/{who}-{me.name}"), (who,)

@@ -183,7 +183,7 @@ def test_protection_has_three_parts_and_all_are_wanted(tmp_path: Path) -> None:
 
 def test_when_told_so_it_tries() -> None:
     ran = serve("--listen", "tcp/192.0.2.1:0", "--insecure")  # an address that no machine has
-    assert (ran.returncode, "cannot open tcp/192.0.2.1:0" in ran.stderr) == (2, True)
+    assert (ran.returncode, "cannot listen at tcp/192.0.2.1:0" in ran.stderr) == (2, True)
 
 
 def test_the_ready_configurations_are_what_the_command_makes(tmp_path: Path) -> None:

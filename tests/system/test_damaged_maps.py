@@ -12,7 +12,7 @@ import pytest
 from journalled import Services, drafts
 
 from factorbus.cli.service_checks import services as look_at
-from factorbus.client import Refused, connect
+from factorbus.client import Problem, Refused, connect
 from factorbus.client.bus import Bus
 from factorbus.journal.store import NAME
 from factorbus.proto import codec, keys
@@ -40,9 +40,9 @@ def fill(bus: Bus, name: str, count: int = 5) -> None:
 
 
 def code_of(call: Callable[[], object]) -> tuple[str, str]:
-    with pytest.raises(Refused) as refused:
+    with pytest.raises(Problem) as refused:
         call()
-    return refused.value.code, refused.value.message
+    return refused.value.code, str(refused.value)
 
 
 def test_a_damaged_map_can_be_seen_and_given_up(services: Callable[..., Services], tmp_path: Path) -> None:

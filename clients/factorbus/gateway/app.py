@@ -41,7 +41,8 @@ from factorbus.viz.closures import closures_of
 
 _PAGE = Path(__file__).parent / "page"
 _STATUS = {
-    "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400, "bad_name": 400, "bad_symbol": 400,
+    "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400,
+    "bad_name": 400, "bad_symbol": 400, "bad_option": 400,
     "unavailable": 503, "shutting_down": 503,
 }  # fmt: skip
 _OPTIMUM_S = 60.0

@@ -20,10 +20,10 @@ from factorbus.solver.kernels.simd import LANES, TILE_ROWS, at, put, solve_rows
 # chain of 30,000 poses held at one end only and eliminated from there, poor but real, is 1e-11·Λₖₖ.
 PIVOT_TOLERANCE = 1e-13
 # Where it is known that everything is held, a pivot below this share of Λₖₖ is rounding, and is raised to it.
-LEAST_PIVOT = 1e-14
+LEAST_PIVOT = 1e-12
 # The same of the largest Λₖₖ of all: its rounding, and that of its gradient, go on to what is eliminated later, and
 # what is known of anything by less is lost in them.  A map that only a prior of σ 1e5 rad holds would turn by 0.1 rad.
-ROUNDING = 2.0**-40
+ROUNDING = 2.0**-46
 RAISED = -2  # what `factor_front` gives where it raised a pivot
 
 
