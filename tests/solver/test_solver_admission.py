@@ -223,6 +223,7 @@ def test_every_code_is_in_the_table() -> None:
         "bad_order",
         "bad_direction",
         "named_twice",
+        "too_large",
     }  # changes, other kinds
     assert codes - elsewhere == {code for code, _ in REFUSED.values()}
 
