@@ -49,7 +49,10 @@ class TreeSteps:
         self._graph, self._options = graph, options
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
-        self._first_new, self._batched, self._held, self._at_end = 0, False, False, True
+        self._first_new, self._batched, self._held = 0, False, False
+        # What the optimum cannot be below, from when no pivot had been raised or Levenberg-Marquardt had ended: factors
+        # only add to it.
+        self._least_chi2 = 0.0
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
@@ -85,7 +88,7 @@ class TreeSteps:
         worse = not account[tl.A_CHI2] <= (1.0 + self._options.trust) * account[tl.A_BEFORE] + LEAST_CHI2
         settle &= bool(self._graph.counts[at.COLUMNS])
         continues = self._graph.mark() == self._mark
-        goes_on = continues and tree.raised and not self._at_end
+        goes_on = continues and tree.raised and not self._is_within(FINISHED, account[tl.A_CHI2])
         if settle or worse or tree.rises or goes_on:
             tree.exchange()
             before = self._graph.values.copy()
@@ -96,7 +99,10 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and account[tl.A_BEFORE] - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
                 course.converged = True
-        self._at_end = course.converged if course else not tree.raised or (continues and self._at_end)
+        if course and course.converged:
+            self._least_chi2 = float(tree.account[tl.A_CHI2])
+        elif not tree.raised and not self._held:
+            self._least_chi2 = max(float(tree.account[tl.A_CHI2] - tree.account[tl.A_ERROR]), 0.0)
         if not math.isfinite(tree.account[tl.A_CHI2]):
             self._begin_anew(before)
             raise errors.NotFinite("χ² of the estimate after the step")
@@ -115,8 +121,12 @@ class TreeSteps:
         share = max(chi2, 0.0) + LEAST_CHI2
         scalars = int(self._graph.counts[at.SCALARS])
         if self._held or self._tree.raised:
-            return not self._at_end
+            return not self._is_within(FINISHED, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
+
+    def _is_within(self, share: float, chi2: float) -> bool:
+        """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
+        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._least_chi2 + LEAST_CHI2)
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
@@ -204,7 +214,10 @@ class TreeSteps:
         compiled_ms = 1e3 * (compiled - started)
         chi2, error = self._tree.account[tl.A_CHI2], self._tree.account[tl.A_ERROR]
         chi2 = chi2.item() if chi2 > 0.0 else 0.0  # pieces of a form sum to zero but for rounding
-        converged = course.converged if course else bool(error <= self._options.converged_share * (chi2 + LEAST_CHI2))
+        share = self._options.converged_share
+        converged = course.converged if course else bool(error <= share * (chi2 + LEAST_CHI2))
+        if self._tree.raised and not course:
+            converged &= self._is_within(share, chi2)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
