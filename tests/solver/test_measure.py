@@ -39,21 +39,20 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
 
 
 def found(solver: Solver, tree: Tree, moved: np.ndarray, bent: float, variables: int) -> tuple:
-    """The largest error, Σ error² by variable, who waits, ascending, how each is marked, and χ² by factor."""
+    """The largest error, Σ error² by factor, who waits, ascending, how each is marked, and χ² by factor."""
     graph, state, node, account = solver._graph, tree.state.copy(), tree.node.copy(), tree.account.copy()
-    turns, pending, listed, stiff = tree.turns.copy(), tree.pending.copy(), np.zeros_like(tree.moved), tree.stiff.copy()
+    pending, listed, stiff = tree.pending.copy(), np.zeros_like(tree.moved), tree.stiff.copy()
     node[:, tl.N_FLAGS] = node[:, tl.N_LISTED] = 0
     node[moved, tl.N_LISTED], listed[: moved.size] = MODEL, moved
-    turns[:, [tl.U_STRAIN, tl.U_BOUND]] = 0.0
-    stiff[:, tl.B_CHI2] = 0.0
+    stiff[:, [tl.B_CHI2, tl.B_ERROR, tl.B_COUNTED]] = 0.0
     state[[tl.S_MOVED, tl.S_PENDING]] = moved.size, 0
     account[[tl.A_CHI2, tl.A_ERROR, tl.A_COUNTED]] = 0.0
     state[tl.S_VARIABLES] = variables
     most = evaluate_moved(
         bent, graph.var, graph.fac, graph.payload, node, tree.link, stiff, tree.lin[0], tree.scalars, graph.values,
-        turns, pending, listed, state, account,
+        tree.turns, pending, listed, state, account,
     )  # fmt: skip
     assert account[tl.A_CHI2] == pytest.approx(stiff[:, tl.B_CHI2].sum())
-    assert account[tl.A_ERROR] == pytest.approx(turns[:, tl.U_BOUND].sum())
+    assert account[tl.A_ERROR] == pytest.approx(stiff[:, tl.B_ERROR].sum())
     waiting = np.sort(pending[: state[tl.S_PENDING]])
-    return most, turns[: node.shape[0], tl.U_STRAIN], waiting, node[:, tl.N_FLAGS], stiff[:, tl.B_CHI2]
+    return most, stiff[:, tl.B_COUNTED], waiting, node[:, tl.N_FLAGS], stiff[:, tl.B_CHI2]

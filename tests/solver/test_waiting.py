@@ -48,7 +48,7 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
             relinearised += 1
         waited += waiting(tree).size > 0 and not tree.state[tl.S_DUE]
-        share = tree.turns[waiting(tree), tl.U_STRAIN].sum() / (tree.account[tl.A_MODEL] + 1e-2)
+        share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
         rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
         most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
         scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
@@ -68,7 +68,7 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
     for many in (10, 10**6):
         solver = Solver(Options(many=many, bent_now=np.inf, bent_most=np.inf, converged_share=np.inf))
         for tree, _, _ in drive(solver, (step.batch for step in manhattan(400, 11))):
-            share = tree.turns[waiting(tree), tl.U_STRAIN].sum() / (tree.account[tl.A_MODEL] + 1e-2)
+            share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
             if tree.state[tl.S_DUE]:
                 shares[many == 10].append(share)
     assert len(shares[True]) > 3
@@ -103,8 +103,8 @@ def test_what_is_bent_far_does_not_wait() -> None:
     for tree, before, due in drive(solver, (step.batch for step in manhattan(400, 11))):
         if due:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
-        worst = np.sqrt(tree.turns[waiting(tree), tl.U_STRAIN].max(initial=0.0)) / tree.account[tl.A_UNIT]
-        assert worst <= 4.0 * limit or tree.state[tl.S_DUE]  # of all factors of a variable together
+        worst = np.sqrt(tree.stiff[: tree.state[tl.S_FACTORS], tl.B_COUNTED].max(initial=0.0)) / tree.account[tl.A_UNIT]
+        assert worst <= limit or tree.state[tl.S_DUE]
         found += bool(tree.state[tl.S_DUE])
     assert found > 3
 

@@ -79,8 +79,8 @@ class Options:
     last_pose_last: bool = True
     recent_poses: int = 1
     bent: float = 5e-4
-    bent_soon: float = 1.35e-5
-    bent_now: float = 5e-5
+    bent_soon: float = 1e-4
+    bent_now: float = 1e-4
     many: int = 1500
     bent_most: float = 2.0
     patience: int = 1000

@@ -16,8 +16,8 @@ class StepReport(NamedTuple):
                  "tree", "batch": part of R was made again, or all was solved by Gauss-Newton, in the mode "tree"
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
-    chi2, chi2_before        Σ rᵀ Ω r of all factors after and before solving (the new factors included in both); in the
-                 mode "tree" χ² of the linear problem at its solution, after solving, except after a batch
+    chi2, chi2_before        Σ rᵀ Ω r of all factors at the published estimate; and at the values before the step, the
+                 new factors and the first values of new variables included
     new_variables, new_factors   taken in by this step
     changed      variables whose values differ from before, the new ones included
     relinearised linearisation points that were moved, counted once per iteration
@@ -25,7 +25,8 @@ class StepReport(NamedTuple):
     asleep       sights without a pixel, and so without weight, at the estimate (mode "tree": where it is linearised);
                  `Solver.asleep` tells which and why
     nnz_r, flops of one factorisation; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
-    converged    the next iteration would not have lowered χ² by more than the tolerance
+    converged    a full Gauss-Newton step from the estimate would not lower χ² by more than `Options.converged_share` of
+                 it, in the mode "tree" by a bound; in the others the last iteration did not by more than the tolerance
     phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
                  where that does the work (mode "tree"), else None
     """

@@ -50,9 +50,6 @@ class TreeSteps:
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched, self._held = 0, False, False
-        # What the optimum cannot be below, from when no pivot had been raised or Levenberg-Marquardt had ended: factors
-        # only add to it.
-        self._least_chi2 = 0.0
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
@@ -84,29 +81,11 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         compiled = clock() if clock else 0.0
-        course, account, before, self._held = None, tree.account.tolist(), self._graph.values, False
-        worse = not account[tl.A_CHI2] <= (1.0 + self._options.trust) * account[tl.A_BEFORE] + LEAST_CHI2
-        settle &= bool(self._graph.counts[at.COLUMNS])
-        continues = self._graph.mark() == self._mark
-        goes_on = continues and tree.raised and not self._is_within(FINISHED, account[tl.A_CHI2])
-        if settle or worse or tree.rises or goes_on:
-            tree.exchange()
-            before = self._graph.values.copy()
-            if not worse:
-                tree.exchange()
-            course = self._batch(before, settle)
-            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if tree.rises else _GOES_ON
-            # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
-            if goes_on and account[tl.A_BEFORE] - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
-                course.converged = True
-        if course and course.converged:
-            self._least_chi2 = float(tree.account[tl.A_CHI2])
-        elif not tree.raised and not self._held:
-            self._least_chi2 = max(float(tree.account[tl.A_CHI2] - tree.account[tl.A_ERROR]), 0.0)
-        if not math.isfinite(tree.account[tl.A_CHI2]):
-            self._begin_anew(before)
-            raise errors.NotFinite("χ² of the estimate after the step")
-        return self._account(started, compiled, course, account[tl.A_BEFORE], because)
+        self._held = False
+        if not settle and not tree.state.item(tl.S_AFTER):
+            return self._account(started, compiled, None, because)
+        course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
+        return self._account(started, compiled, course, because)
 
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
@@ -126,7 +105,7 @@ class TreeSteps:
 
     def _is_within(self, share: float, chi2: float) -> bool:
         """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
-        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._least_chi2 + LEAST_CHI2)
+        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._tree.account.item(tl.A_LEAST) + LEAST_CHI2)
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
@@ -148,6 +127,31 @@ class TreeSteps:
         system.begin(suspects, Stopwatch(None))
         system.factorize(0.0)
         return f"{suspects.size} new variables are held only by several factors together"
+
+    def _complete(self, settle: bool, because: str) -> tuple[Course | None, str]:
+        """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
+        tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
+        chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
+        course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
+        goes_on = after & tl.RAISED and self._graph.mark() == self._mark and not self._is_within(FINISHED, chi2)
+        if settle or worse or rises or goes_on:
+            tree.exchange()
+            before = self._graph.values.copy()
+            if not worse:
+                tree.exchange()
+            course = self._batch(before, settle)
+            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON
+            # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
+            if goes_on and chi2_before - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
+                course.converged = True
+            if course and course.converged:
+                tree.account[tl.A_LEAST] = tree.account[tl.A_CHI2]
+            # The tree's own step followed, and what it was before is that of the step.
+            tree.account[tl.A_BEFORE] = chi2_before
+        if not math.isfinite(tree.account[tl.A_CHI2]):
+            self._begin_anew(before)
+            raise errors.NotFinite("χ² of the estimate after the step")
+        return course, because
 
     def _begin_anew(self, before: F64) -> None:
         """The graph as it was before the step, at the values `before`, and a tree made for it that leaves it there."""
@@ -203,20 +207,18 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(
-        self, started: float, compiled: float, course: Course | None, chi2_before: float, because: str
-    ) -> StepReport:
+    def _account(self, started: float, compiled: float, course: Course | None, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
         nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        chi2, error = self._tree.account[tl.A_CHI2], self._tree.account[tl.A_ERROR]
-        chi2 = chi2.item() if chi2 > 0.0 else 0.0  # pieces of a form sum to zero but for rounding
+        _, chi2, _, error, _, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
+        chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
         share = self._options.converged_share
-        converged = course.converged if course else bool(error <= share * (chi2 + LEAST_CHI2))
-        if self._tree.raised and not course:
+        converged = course.converged if course else error <= share * (chi2 + LEAST_CHI2)
+        if not course and self._tree.raised:
             converged &= self._is_within(share, chi2)
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
@@ -226,7 +228,7 @@ class TreeSteps:
             because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
             chi2,
-            chi2_before if chi2_before > 0.0 else 0.0,
+            max(chi2_before, 0.0),
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - before[at.FACTORS],
             self._moved.size if course else changed,

@@ -90,9 +90,9 @@ def slip_of(kind: int, root: float, d: float, shift: float, pull: float) -> floa
 
 
 @inline_kernel
-def slip_between(root: float, d: float, shift: float, residual: float, stiff_turn: float) -> float:
-    """(9.13) of poses; residual: of the translation, at the estimate."""
-    return root * residual * shift / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
+def slip_weight(root: float, d: float, stiff_turn: float) -> float:
+    """√ω / √(d² + ω_θ/ω) of poses: times |r(x)| and |sⱼ − sᵢ| it is (9.13)."""
+    return root / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
 
 
 @inline_kernel

@@ -10,7 +10,7 @@ from factorbus.solver.kernels.linearise import evaluate_apart, multiply
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.kernels.simd import put, six
 from factorbus.solver.kernels.sizes import dim_of, end_dims, information_at, residual_dim
-from factorbus.solver.kernels.tree_bend import lever_of, root_weight
+from factorbus.solver.kernels.tree_bend import lever_of, root_weight, slip_weight
 from factorbus.solver.lenses.layout import GOOD
 
 
@@ -185,4 +185,6 @@ def weigh_factor(
             for a in range(dj):
                 scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
     stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
+    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        stiff[f, tl.B_PULL] = slip_weight(root, distance, stiff[f, tl.B_TURN])
     stiff[f, tl.B_ROUND] = 1.0 if is_round(kind, fac[f, at.F_AT], payload) else 0.0

@@ -16,14 +16,14 @@ The arenas of a tree are, each from the start of a cache line on:
     numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
     hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
     stiff   (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearised, (9.12);
-                             between poses ω_θ, (9.13); whether its Ω is that of a disc and an angle; χ² at the estimate
+                             between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is that of a
+                             disc and an angle; at the estimate χ², error² in full, and as it counts
     lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearised
-    turns   (n, 8) float64   of each variable: the largest d √ω of what it sees; Σ error² of the factors that it is the
-                             first of, as it counts, (9.13); cosine and sine where a plane pose is linearised; Σ error²
-                             in full
+    turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; cosine and sine where a plane pose is
+                             linearised
     pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that moved
                              since their factors were evaluated last
     marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
@@ -31,7 +31,7 @@ The arenas of a tree are, each from the start of a cache line on:
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
     settings (24,) float64   see P_RIPPLE and so on
     state   int64            counters and the heads of free lists
-    account (12,) float64     what a step found
+    account (13,) float64     what a step found
 """
 
 # The arenas of a tree in its table (`places`).
@@ -64,11 +64,12 @@ N_NEAR = 12  # the last elimination that looked whether to bring it near the roo
 N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
 N_WIDTH = 16
 
-# Columns of `stiff`: d, √ω, |Ω r|, ω_θ, 1 for an Ω of a disc and an angle, and χ² at the estimate.
-B_LEVER, B_ROOT, B_PULL, B_TURN, B_ROUND, B_CHI2, B_WIDTH = 0, 1, 2, 3, 4, 5, 8
+# Columns of `stiff`: d, √ω, |Ω r| or what (9.13) is by the shift and |r|, ω_θ, 1 for an Ω of a disc and an angle; χ² at
+# the estimate, error² in full, and as it counts.
+B_LEVER, B_ROOT, B_PULL, B_TURN, B_ROUND, B_CHI2, B_ERROR, B_COUNTED, B_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 8
 
 # Columns of `turns`.
-U_LEVER, U_STRAIN, U_COS, U_SIN, U_BOUND, U_WIDTH = 0, 1, 2, 3, 4, 8
+U_LEVER, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 4
 
 # Columns of `link`.
 L_OWN = 0  # next factor added at the same variable
@@ -171,12 +172,16 @@ S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of f
 S_RISES = 53  # 1: the last round of the step raised χ²
 S_ONCE = 54  # 1: the step under way has one round
 S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
-S_FREE = 56  # heads of free lists: numbers, then lists
+S_AFTER = 56  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
+S_FREE = 57  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
 # What a step comes to.
 DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
+
+# In S_AFTER: the step raised χ², or its last round did, or a pivot was raised.
+WORSE, ROSE, RAISED = 1, 2, 4
 
 # Settings of a step.
 P_RIPPLE = 0  # in units of (9.17): how far a separator moves before its clique is solved again
@@ -222,4 +227,5 @@ A_ADDED_UP = 8  # what A_CHI2 has gained and lost since it was summed
 A_COUNTED = 9  # Σ error² as it counts for what is relinearized
 A_STIFFEST = 10  # the largest sum of the diagonals of Hessians of any scalar,
 A_STIFFEST_BEFORE = 11  # and before the step
-A_SIZE = 12
+A_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
+A_SIZE = 13

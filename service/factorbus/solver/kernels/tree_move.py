@@ -12,7 +12,7 @@ from factorbus.solver.kernels.simd import put
 from factorbus.solver.kernels.sizes import size_of
 
 # In N_LISTED.
-PLACE, MODEL = 1, 2
+STAYED, PLACE, MODEL = 0, 1, 2
 
 
 @inline_kernel
@@ -37,10 +37,10 @@ def move_variable(
 def list_moved(how: int, v: int, node: I64, moved: I64, state: I64) -> None:
     """The factors of variable v are to be evaluated: PLACE, their χ²; MODEL and more, how linear they are as well."""
     listed = node[v, tl.N_LISTED]
-    if listed == 0:
+    if listed == STAYED:
         moved[state[tl.S_MOVED]] = v
         state[tl.S_MOVED] += 1
-    if listed == 0 or (listed == PLACE and how == MODEL):
+    if how > listed:
         node[v, tl.N_LISTED] = how
 
 

@@ -64,7 +64,7 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-6  # a step with nothing new goes on while Σ error² is more than this share of χ²
-PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to variables that do not move
+PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
@@ -106,7 +106,7 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     if state[tl.S_CONTINUES] != 0:
         scaled[tl.P_RIPPLE] = 0.0
-        await_bound(scaled, var, fac, node, link, turns, pending, state, account)
+        await_bound(scaled, var, fac, node, stiff, pending, state, account)
     scaled[tl.P_BENT] *= unit
     scaled[tl.P_MOST] *= unit
     scaled[tl.P_DEAR] = max(state[tl.S_RELINEARISING] / settings[tl.P_DEAR], 1.0)
@@ -155,9 +155,10 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
             break
         if state[tl.S_WAIT] != 0 or not goes_on(pull, scaled, state, account):
             break
-        await_bound(scaled, var, fac, node, link, turns, pending, state, account)
+        await_bound(scaled, var, fac, node, stiff, pending, state, account)
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
+    note_after(settings, state, account)
     if state[tl.S_FLOPS] < LIGHT:
         write_ahead(numbers, state)
     return tl.DONE
@@ -177,6 +178,21 @@ def undo(
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
+
+
+@inline_kernel
+def note_after(settings: F64, state: I64, account: F64) -> None:
+    """What is to be done after the step, and what the optimum is at least."""
+    chi2 = account[tl.A_CHI2]
+    state[tl.S_AFTER] = 0
+    if not chi2 <= (1.0 + settings[tl.P_TRUST]) * account[tl.A_BEFORE] + LEAST_CHI2:
+        state[tl.S_AFTER] += tl.WORSE
+    if state[tl.S_RISES] != 0:
+        state[tl.S_AFTER] += tl.ROSE
+    if state[tl.S_RAISED] != 0:
+        state[tl.S_AFTER] += tl.RAISED
+    if state[tl.S_AFTER] == 0:
+        account[tl.A_LEAST] = max(chi2 - account[tl.A_ERROR], 0.0)
 
 
 @inline_kernel
@@ -205,12 +221,12 @@ def allowed(settings: F64, state: I64, account: F64) -> float:
 
 @inline_kernel
 def await_bound(
-    settings: F64, var: I64, fac: I64, node: I64, link: I64, turns: F64, pending: I64, state: I64, account: F64
-) -> None:  # fmt: skip
+    settings: F64, var: I64, fac: I64, node: I64, stiff: F64, pending: I64, state: I64, account: F64
+) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
     most = allowed(settings, state, account)
     if account[tl.A_ERROR] > most:
-        await_all(PASSED_OVER * most / state[tl.S_VARIABLES], var, fac, node, link, turns, pending, state)
+        await_all(PASSED_OVER * most / state[tl.S_FACTORS], var, fac, node, stiff, pending, state)
         state[tl.S_DUE] = 1
 
 

@@ -31,7 +31,7 @@ def take_in_variables(
         if d >= 0:
             for a in range(dim_of_variable(var, v)):
                 scalars[0, d + a] = scalars[1, d + a] = 0.0
-        turns[v, tl.U_LEVER] = turns[v, tl.U_STRAIN] = turns[v, tl.U_BOUND] = 0.0
+        turns[v, tl.U_LEVER] = 0.0
         node[v, tl.N_NEAR] = -1
         note_turn(v, var, lin, turns)
     state[tl.S_VARIABLES] = v1
@@ -79,6 +79,7 @@ def take_in_factors(
         if j >= 0:
             account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
         stiff[f, tl.B_CHI2], _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
         account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
         list_moved(MODEL, i, node, moved, state)
