@@ -90,7 +90,7 @@ class Options:
     converged_share: float = 1e-3
     trust: float = 1e-4
     rounds: int = 3
-    ripple: float = 0.014
+    ripple: float = 0.02
     recent_steps: int = 2
     heavy: float = 1e5
     near: float = 1.4
