@@ -23,6 +23,7 @@ from factorbus.service.config import BadConfig, Config
 from factorbus.service.events import Asker
 from factorbus.service.exposure import refuse_exposed
 from factorbus.service.job_check import WrongAnswer
+from factorbus.service.key_files import refuse_unsafe_keys
 from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE, zenoh_settings
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,9 @@ _PRIORITY = {
 
 
 def open_bus(config: Config) -> "Bus":
-    """The bus as `config` describes it.  Raises BadConfig; Exposed is one.  Raises PortTaken, CannotListen."""
+    """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises PortTaken,
+    CannotListen.
+    """
     os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)  # read by Zenoh when the first session of a process is opened
     try:
         settings = zenoh.Config.from_file(config.zenoh) if config.zenoh else zenoh.Config()
@@ -47,8 +50,14 @@ def open_bus(config: Config) -> "Bus":
         # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
         raise BadConfig(f"Zenoh does not take this configuration ({where}): {discreet.reason(error)}") from None
-    if not config.insecure and config.mode != "client":
-        refuse_exposed(config.listen, lambda path: json.loads(settings.get_json(path)))
+
+    def setting(path: str) -> Any:
+        return json.loads(settings.get_json(path))
+
+    if not config.insecure:
+        refuse_unsafe_keys(setting)
+        if config.mode != "client":
+            refuse_exposed(config.listen, setting)
     try:
         return Bus(zenoh.open(settings))
     except zenoh.ZError as error:
