@@ -51,7 +51,7 @@ def test_version() -> None:
         ["ask", "why", "yard", "x1"], ["stats"], ["maps"], ["top", "--once"], ["drop", "yard"],
         ["save", "yard", "a.g2o"],
         ["watch", "yard", "--save", "a.rrd"], ["record", "yard", "--out", "a.mcap"], ["gateway", "--port", "0"],
-        ["change", "fix", "yard", "x1"], ["plot", "map", "yard"], ["replay", "one.g2o"],
+        ["change", "fix", "yard", "x1"], ["plot", "map", "yard"], ["replay", "one.g2o"], ["ros2", "yard"],
     ],
 )  # fmt: skip
 def test_where_nothing_listens_it_is_said_within_about_a_second(

@@ -95,8 +95,8 @@ def command(
     What is done with covariances, and more: deploy/ros2/README.md.
     """
     require("ros2", "factorbus ros2")
+    from factorbus.cli.bus import open_bus
     from factorbus.cli.stopping import stop_on_signals
-    from factorbus.client import connect
     from factorbus.ros2.bridge import Bridge
     from factorbus.ros2.messages import Messages
     from factorbus.ros2.node import open_node
@@ -107,7 +107,7 @@ def command(
     sys.setswitchinterval(_SWITCH_S)
     with (
         stop_on_signals(until_eof) as stop,
-        connect(endpoint, client="ros2", zenoh=zenoh) as bus,
+        open_bus(endpoint, "ros2", zenoh) as bus,
         bus.map(map_name) as joined,
         open_node(
             ros or endpoint, domain, namespace, node_name, bus.timeout_s, {}, zenoh if ros is None else ""
