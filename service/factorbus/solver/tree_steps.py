@@ -33,7 +33,9 @@ _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
 _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
-_FINISHED_LEFT = 1e-5
+_FINISHED_LEFT = 1e-6
+# By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
+_AT_END = 1e-6
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
@@ -50,6 +52,7 @@ class TreeSteps:
         self._tree = Tree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched, self._held = 0, False, False
+        self._bounded = True  # whether the last step ended within its bound
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
@@ -100,7 +103,7 @@ class TreeSteps:
         share = max(chi2, 0.0) + LEAST_CHI2
         scalars = int(self._graph.counts[at.SCALARS])
         if self._held or self._tree.raised:
-            return not self._is_within(FINISHED, chi2)
+            return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
 
     def _is_within(self, share: float, chi2: float) -> bool:
@@ -133,7 +136,7 @@ class TreeSteps:
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
         chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
         course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
-        goes_on = after & tl.RAISED and self._graph.mark() == self._mark and not self._is_within(FINISHED, chi2)
+        goes_on = after & tl.RAISED and self._graph.mark() == self._mark and not self._is_within(_AT_END, chi2)
         if settle or worse or rises or goes_on:
             tree.exchange()
             before = self._graph.values.copy()
@@ -142,7 +145,7 @@ class TreeSteps:
             course = self._batch(before, settle)
             because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
-            if goes_on and chi2_before - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
+            if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
                 course.converged = True
             if course and course.converged:
                 tree.account[tl.A_LEAST] = tree.account[tl.A_CHI2]
@@ -220,6 +223,10 @@ class TreeSteps:
         converged = course.converged if course else error <= share * (chi2 + LEAST_CHI2)
         if not course and self._tree.raised:
             converged &= self._is_within(share, chi2)
+        bounded = converged
+        if not course and not self._bounded:  # in a long valley a step gains hardly less than the one before
+            converged &= chi2_before - chi2 <= share * (chi2 + LEAST_CHI2)
+        self._bounded = bounded
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (

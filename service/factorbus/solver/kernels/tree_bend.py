@@ -28,7 +28,12 @@ Angles of the plane add up; turns in space do not.  With ψ the turn of j as see
 
     √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
 
-ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  How a sight is
+ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  And the force √Ω r(x)
+turns with i, by half of which the gradient is off on the way:
+
+    ½ φ |√Ω r(x)|                                                                             (9.30)
+
+That counts as a bound only.  How a sight is
 bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
 standard deviations,
 
@@ -127,7 +132,7 @@ def lever_of(kind: int, p: F64, k: int) -> float:
 
 @inline_kernel
 def root_weight(kind: int, w: F64, d: float) -> float:
-    """√ω of (9.4); 0 of a prior, which is as good as linear."""
+    """√ω of (9.4); 0 of a prior: in the plane it is linear, and in space (9.11) is computed."""
     if kind == at.BEARING_RANGE_SE2:
         return math.sqrt(w[1, 1]) + math.sqrt(w[0, 0]) / d
     if kind == at.BETWEEN_SE2 or kind == at.LANDMARK_SE2:

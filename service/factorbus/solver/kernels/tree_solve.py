@@ -29,9 +29,12 @@ def substitute(
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
     were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  A_LEFT gets
-    the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone
+    the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone, nor what was
+    so below a clique that does not move now
     """
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
+    if ripple == 0.0 and account[tl.A_LEFT] > 0.0:
+        far = -1.0
     motion[rg.LEFT] = 0.0
     shares = np.empty(64)
     body = count = 0

@@ -63,7 +63,8 @@ LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
-FINISHED = 1e-6  # a step with nothing new goes on while Σ error² is more than this share of χ²
+FINISHED = 1e-7  # a step with nothing new goes on while Σ error² is more than this share of χ²
+ENOUGH = 0.25  # of `converged_share`
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -214,8 +215,8 @@ def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
 
 @inline_kernel
 def allowed(settings: F64, state: I64, account: F64) -> float:
-    """The Σ error² with which a step ends: half of what its report may call converged; FINISHED with nothing new."""
-    share = FINISHED if state[tl.S_CONTINUES] != 0 else 0.5 * settings[tl.P_CONVERGED]
+    """The Σ error² with which a step ends: ENOUGH of what its report may call converged; FINISHED with nothing new."""
+    share = FINISHED if state[tl.S_CONTINUES] != 0 else ENOUGH * settings[tl.P_CONVERGED]
     return share * (account[tl.A_CHI2] + LEAST_CHI2)
 
 
