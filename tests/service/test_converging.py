@@ -37,9 +37,9 @@ class Driven:
         self.core = MapCore("m", "auto", 5, Limits(), now=0.0)
         self.now, self.cpu_s, self.sequence, self.revision, self.chi2 = 0.0, 0.0, 0, 0, 1e6
 
-    def insert(self, converged: bool) -> None:
+    def insert(self, converged: bool, **of_step: Any) -> None:
         """One is inserted, and its step ends so."""
-        self.done(the_run(self.core.insert(self.arrived())), converged)
+        self.done(the_run(self.core.insert(self.arrived())), converged, **of_step)
 
     def arrived(self) -> Arrived:
         self.sequence += 1
@@ -57,11 +57,12 @@ class Driven:
         self.revision += 1
         self.chi2 = of_step.pop("chi2", self.chi2 / 2)
         effects = self.core.judged(Judged(tuple(Outcome(i, b"ok") for i in run.inserts))) if run.inserts else []
+        unfinished = of_step.pop("unfinished", False)
         of_step = {"changed": 3, **of_step}
         effects += self.core.stepped(
             Stepped(self.revision, b"", "tree", self.chi2, 1.0, converged=converged, further=run.further, **of_step)
         )
-        return effects + self.core.folded(Folded(3, 4, self.cpu_s, self.now))
+        return effects + self.core.folded(Folded(3, 4, self.cpu_s, self.now, unfinished=unfinished))
 
     def says(self) -> tuple[bool, bool, bool]:
         """Converged, converging, and whether it has given up."""
@@ -108,6 +109,28 @@ def test_a_map_that_has_converged_is_left_alone(driven: Driven) -> None:
     assert driven.says() == CONVERGED
     driven.insert(converged=True)
     assert [driven.tick() for _ in range(3)] == [[], [], []]
+    assert driven.says() == CONVERGED
+
+
+def test_one_that_is_not_at_its_optimum_finishes_when_it_is_left_alone_for_longer(driven: Driven) -> None:
+    driven.insert(converged=True, unfinished=True)
+    assert driven.says() == CONVERGED
+    assert driven.tick(0.9 * converging.FINISH_S) == []
+    effects = driven.done(the_run(driven.tick()), converged=True, unfinished=True)
+    effects = driven.done(the_run(effects + driven.tick()), converged=True)
+    assert not goes_on(effects + driven.tick(60.0))
+    assert driven.says() == CONVERGED
+    # One insert after the other: nothing comes in between.
+    for _ in range(5):
+        driven.insert(converged=True, unfinished=True)
+        assert driven.tick(0.5 * converging.FINISH_S) == []
+
+
+def test_one_that_cannot_finish_does_not_try_for_ever(driven: Driven) -> None:
+    driven.insert(converged=True, unfinished=True)
+    driven.now += converging.FINISH_S
+    count = chain(driven, lambda _: {"converged": True, "unfinished": True, "changed": 0})
+    assert 1 <= count <= 5
     assert driven.says() == CONVERGED
 
 

@@ -5,6 +5,8 @@
                                                   └───────── an insert ──────────────┴──▶ gave up
 
 It gives up, until something else changes the map, where further steps are of no use, and where there were too many.
+A map that has converged, but that a step would still bring nearer to its optimum by what χ² shows, goes on as well
+when it has been left alone for longer.
 Reasons and figures: docs/decisions/further-steps.md.
 """
 
@@ -13,6 +15,7 @@ import math
 from factorbus.service.events import Stepped
 
 QUIET_S = 0.1  # without a step of another sort, before the first further one
+FINISH_S = 1.0  # the same, of a map that has converged and is not at its optimum to what χ² shows
 FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
 MOST, MOST_S = 10_000, 300.0  # so many in a row, and so much of a core for them
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
@@ -27,6 +30,8 @@ class Converging:
         self.converged = True
         self.gave_up = ""  # why no further step is made; empty: it is, or need not be
         self.steps = 0  # further ones since the last of another sort
+        self._unfinished = False  # a step would still bring it nearer to its optimum, though it may have converged
+        self._enough = False  # further steps are of no more use, or were too many
         self._untold = False  # a further step is under way, or not told yet
         self._goes_on = False
         self._under_way = ""  # "further", "inserts", or neither
@@ -41,11 +46,16 @@ class Converging:
 
     def is_due(self, now: float) -> bool:
         """Whether the solver, which is free, is to take a further step now."""
-        return self.converging and self._goes_on and not self._untold and now >= self._rests_until
+        wanted = (self.converging or self._unfinished) and not self._enough
+        return wanted and self._goes_on and not self._untold and now >= self._rests_until
 
     def look(self, now: float) -> None:
         """Time went by: was it quiet for long enough?"""
-        self._goes_on = self._goes_on or now - self._busy_at >= QUIET_S
+        self._goes_on = self._goes_on or now - self._busy_at >= (FINISH_S if self.converged else QUIET_S)
+
+    def left(self, unfinished: bool) -> None:
+        """How the solver left the map: whether a step without an insert would still be of use."""
+        self._unfinished = unfinished
 
     def began(self, further: bool) -> None:
         """The solver was given a further step, or inserts."""
@@ -64,7 +74,8 @@ class Converging:
 
     def failed(self) -> None:
         """The further step could not be made: nothing has changed, so the next one could not either."""
-        self._untold, self.gave_up = False, "the solver refused it, see the service's log"
+        self._untold, self._enough = False, True
+        self.gave_up = "" if self.converged else "the solver refused it, see the service's log"
 
     def undone(self) -> None:
         """What was not told did not happen."""
@@ -73,6 +84,7 @@ class Converging:
     def moved_on(self, converged: bool, chi2: float) -> None:
         """A step of another sort is told."""
         self.converged, self.gave_up, self.steps, self._spent_s = converged, "", 0, 0.0
+        self._enough = False
         self._least, self._useless, self._still = chi2, 0, 0
 
     def went_on(self, stepped: Stepped) -> None:
@@ -84,7 +96,8 @@ class Converging:
             self._least = stepped.chi2
         self._useless = 0 if useful else self._useless + 1
         self._still = self._still + 1 if not stepped.changed else 0
-        self.gave_up = "" if stepped.converged else self._why_give_up(stepped)
+        why = self._why_give_up(stepped)
+        self._enough, self.gave_up = bool(why), "" if stepped.converged else why
 
     def _why_give_up(self, stepped: Stepped) -> str:
         if stepped.rebuilt:

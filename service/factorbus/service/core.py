@@ -162,6 +162,7 @@ class MapCore:
         self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
         self._moved_on(alone.revision, size)
         self._converging.moved_on(alone.converged, alone.chi2)
+        self._converging.left(alone.unfinished)
         self._moved_at = alone.revision
         self._free(alone, 1)
         return self._go_on(others, alone.now)
@@ -229,6 +230,7 @@ class MapCore:
         taken = self._running.inserts if self._running else ()
         for insert in taken:
             self._account.took(folded.now - insert.now)
+        self._converging.left(folded.unfinished)
         if folded.failed:
             self._converging.failed()
         self._free(folded, len(taken))

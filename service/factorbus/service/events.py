@@ -104,7 +104,7 @@ class Stepped(NamedTuple):
 class Folded(NamedTuple):
     """The solver is done with a Run; how large the map is now, and what its thread has used.
 
-    failed: a further step could not be made.
+    failed: a further step could not be made.  unfinished: one would still bring the estimate nearer to the optimum.
     """
 
     variables: int
@@ -112,6 +112,7 @@ class Folded(NamedTuple):
     solver_cpu_s: float
     now: float
     failed: bool = False
+    unfinished: bool = False
 
 
 class Alone(NamedTuple):
@@ -130,6 +131,7 @@ class Alone(NamedTuple):
     solver_cpu_s: float
     now: float
     converged: bool = True
+    unfinished: bool = False
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------

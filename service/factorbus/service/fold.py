@@ -225,6 +225,7 @@ class Folder(Holding):
         return Alone(
             insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
             report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(), self._converged,
+            solver.unfinished,
         )  # fmt: skip
 
     def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:
@@ -253,7 +254,8 @@ class Folder(Holding):
     def _folded(self, cpu_s: float) -> Folded:
         solver = self._solver
         self._cpu_s += time.thread_time() - cpu_s
-        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
+        now, unfinished = time.monotonic(), solver.unfinished
+        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, now, unfinished=unfinished)
 
     def _together(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
