@@ -76,7 +76,9 @@ def test_it_returns_with_the_delta_that_says_so(service: Service, kitchen: Map) 
 def test_when_time_is_up_it_says_where_the_map_is(service: Service, kitchen: Map) -> None:
     service.report = service.says = CONVERGING
     kitchen.insert(point(1))
-    with pytest.raises(NotConverged, match=r"not converged to its optimum at revision 1 after .* wait longer") as problem:
+    with pytest.raises(
+        NotConverged, match=r"not converged to its optimum at revision 1 after .* wait longer"
+    ) as problem:
         kitchen.wait_converged(0.3)
     assert (problem.value.code, problem.value.detail["revision"]) == ("not_converged", 1)
 
