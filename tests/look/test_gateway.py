@@ -49,7 +49,7 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
     with connect(endpoint, client="robot") as bus, bus.map("asked") as joined:
         for step in city_trees(poses=80, seed=3):
             joined.insert(step.batch)
-        joined.wait_converged()
+        joined.wait_converged(60)
         snapshot, graph = joined.estimate.snapshot(), joined.graph().batch
         root = f"{gateway}/api/maps/asked"
         assert "asked" in [row["name"] for row in get(f"{gateway}/api/maps")["maps"]]
@@ -208,7 +208,7 @@ def test_the_page_says_while_a_map_is_converging(endpoint: str, gateway: str) ->
                 ".observe(document.getElementById('state'), {childList: true})"
             )
             joined.insert(closing(poses))
-            joined.wait_converged()
+            joined.wait_converged(60)
             page.wait_for_function(f"window.factorbus.revision === {joined.estimate.revision}", timeout=60_000)
             *before, last = page.evaluate("window.seen")
             assert any(text.endswith(" · converging") for text in before)

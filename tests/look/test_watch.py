@@ -49,7 +49,7 @@ def test_the_recording_has_every_step_and_the_map_at_the_end(
         watcher = spawn("-m", "factorbus.cli", "watch", "watched", "--connect", endpoint, "--save", str(path))
         assert watcher.ready() == [str(path)]
         done = [joined.insert(step.batch) for step in steps[50:]]
-        joined.wait_converged()
+        joined.wait_converged(60)
         last = joined.estimate.snapshot()
         watcher.signal(signal.SIGINT)
         assert watcher.wait() == OK
@@ -75,7 +75,7 @@ def test_the_log_says_while_a_map_is_converging(endpoint: str, spawn: Callable[.
         watcher = spawn("-m", "factorbus.cli", "watch", "turning", "--connect", endpoint, "--save", str(path))
         watcher.ready()
         closed = joined.insert(closing(poses)).revision
-        joined.wait_converged()
+        joined.wait_converged(60)
         last = joined.estimate.revision
         watcher.signal(signal.SIGINT)
         assert watcher.wait() == OK
