@@ -28,7 +28,7 @@ def main() -> None:
             stream.allow(int(numbers[0]))
             stream.wait_for(allowed)
             print("answered", allowed, f"{time.monotonic() - begun:.2f}", flush=True)
-        driven.flush(PATIENCE_S)
+        driven.wait_converged(PATIENCE_S)
         assert not stream.fault
         print("done", driven.estimate.revision, digest(driven), flush=True)
 

@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 
 from factorbus.client import Draft
+from factorbus.journal.store import create
 from factorbus.proto.messages import Batch
 from factorbus.solver import Options, Solver
 
@@ -26,6 +28,13 @@ def in_one(poses: int, degrees: float) -> Batch:
 def closing(poses: int) -> Batch:
     """The last pose is where the first one is."""
     return Draft().between_se2(f"x{poses - 1}", "x0", (0, 0, 0), sigmas=(0.1, 0.1, 0.05)).batch()
+
+
+def prepare(journals: Path, name: str, mode: str) -> None:
+    """An empty map in a folder of journals, whose solver may only go downhill: there it takes hundreds of steps."""
+    journals.mkdir(parents=True, exist_ok=True)
+    options = Options(mode=mode, nonmonotone_steps=0).as_dict()
+    create(journals / name, name, mode, options, epoch=7, durability="none").close()
 
 
 def optimum(poses: int, degrees: float) -> float:

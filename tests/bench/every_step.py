@@ -12,7 +12,7 @@ Our solver takes each drive pose by pose, in this process and without a bus.  Af
 whole graph go from its estimate to the optimum: Gauss-Newton, damped where a step would raise χ².  A ratio is
 χ²/χ²_batch; where χ²_batch is below 1, 1 + (χ² - χ²_batch), since it is 0 as long as there is only odometry: an excess
 of 0.001 is a map that is nowhere off by more than 0.032 standard deviations.  At the end the map is left alone: steps
-without anything new, until one says `converged` and moves nothing.  GTSAM's iSAM2 (relinearizeThreshold 0.1,
+without anything new, as those of a service, until nothing is left to do.  GTSAM's iSAM2 (relinearizeThreshold 0.1,
 relinearizeSkip 1) takes the same drive, and is judged in the same way by its own error function.
 
 The full passes are made of our kernels.  At a few steps of every drive (--check) NumPy and SciPy alone look for the

@@ -24,7 +24,9 @@ _SERVICE = {
 _REASON = "3 further steps in a row changed nothing"
 CONVERGED = {"converged": True, "converging": False, "further_steps": 0, "gave_up": ""}
 CONVERGING = {"converged": False, "converging": True, "further_steps": 3, "gave_up": ""}
+POLISHED = {"converged": True, "converging": True, "further_steps": 2, "gave_up": ""}
 GAVE_UP = {"converged": False, "converging": False, "further_steps": 3, "gave_up": _REASON}
+NOT_POLISHED = GAVE_UP | {"converged": True}
 
 
 @pytest.fixture
@@ -42,7 +44,14 @@ def said(service: Service, folder: Path, how: dict[str, Any], capsys: pytest.Cap
 
 
 @pytest.mark.parametrize(
-    ("how", "wanted"), [(CONVERGED, "12.5 0 0"), (CONVERGING, "12.5 converging"), (GAVE_UP, "12.5 gave up")]
+    ("how", "wanted"),
+    [
+        (CONVERGED, "12.5 0 0"),
+        (CONVERGING, "12.5 converging"),
+        (POLISHED, "12.5 converging"),
+        (GAVE_UP, "12.5 gave up"),
+        (NOT_POLISHED, "12.5 gave up"),
+    ],
 )
 def test_top(service: Service, tmp_path: Path, how: dict[str, Any], wanted: str, capsys: Any) -> None:
     assert wanted in said(service, tmp_path, how, capsys, "top", "--once", "--every", "0.1")
@@ -58,7 +67,9 @@ def test_top_as_a_document(service: Service, tmp_path: Path, capsys: Any) -> Non
     ("how", "wanted"),
     [
         (CONVERGED, "χ² 12.5, converged; 7 tree"),
-        (CONVERGING, "χ² 12.5, converging, after 3 further steps; 7 tree"),
+        (CONVERGING, "χ² 12.5, not converged, converging, after 3 further steps; 7 tree"),
+        (POLISHED, "χ² 12.5, converged, converging, after 2 further steps; 7 tree"),
+        (NOT_POLISHED, f"χ² 12.5, converged after 3 further steps: gave up, as {_REASON}; 7 tree"),
         (GAVE_UP, f"χ² 12.5, not converged after 3 further steps: gave up, as {_REASON}; 7 tree"),
     ],
 )

@@ -55,6 +55,7 @@ def test_a_recording_has_every_estimate_and_every_factor(
         assert recorder.ready() == [str(path)]
         for step in steps[40:]:
             joined.insert(step.batch)
+        joined.wait_converged(60)
         last, graph = joined.estimate.snapshot(), joined.graph().batch
         recorder.signal(signal.SIGINT)
         assert recorder.wait() == OK

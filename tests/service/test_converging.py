@@ -27,7 +27,7 @@ from factorbus.service.events import (
     Stepped,
 )
 
-LATER = converging.QUIET_S
+LATER = converging.CONVERGE_IDLE_S
 
 
 class Driven:
@@ -37,9 +37,9 @@ class Driven:
         self.core = MapCore("m", "auto", 5, Limits(), now=0.0)
         self.now, self.cpu_s, self.sequence, self.revision, self.chi2 = 0.0, 0.0, 0, 0, 1e6
 
-    def insert(self, converged: bool) -> None:
+    def insert(self, converged: bool, **of_step: Any) -> None:
         """One is inserted, and its step ends so."""
-        self.done(the_run(self.core.insert(self.arrived())), converged)
+        self.done(the_run(self.core.insert(self.arrived())), converged, **of_step)
 
     def arrived(self) -> Arrived:
         self.sequence += 1
@@ -73,6 +73,7 @@ class Driven:
 
 
 CONVERGED, CONVERGING, GAVE_UP = (True, False, False), (False, True, False), (False, False, True)
+POLISHED = (True, True, False)
 
 
 @pytest.fixture
@@ -109,6 +110,51 @@ def test_a_map_that_has_converged_is_left_alone(driven: Driven) -> None:
     driven.insert(converged=True)
     assert [driven.tick() for _ in range(3)] == [[], [], []]
     assert driven.says() == CONVERGED
+
+
+def test_one_that_is_not_at_its_optimum_is_polished_when_it_is_left_alone_for_longer(driven: Driven) -> None:
+    driven.insert(converged=True, unfinished=True)
+    assert driven.says() == POLISHED
+    assert driven.tick(0.9 * converging.POLISH_IDLE_S) == []
+    effects = driven.done(the_run(driven.tick()), converged=True, unfinished=True)
+    assert driven.says() == POLISHED
+    run = the_run(effects + driven.tick())
+    waiting = driven.arrived()
+    assert driven.core.insert(waiting) == []
+    following = the_run(driven.done(run, converged=True, unfinished=True))
+    assert (following.inserts, following.further) == ((waiting,), False), "an insert comes first"
+    assert not goes_on(driven.done(following, converged=True, unfinished=True))
+    assert driven.tick(0.9 * converging.POLISH_IDLE_S) == [], "and after it the whole time is waited for again"
+    effects = driven.done(the_run(driven.tick()), converged=True)
+    assert not goes_on(effects + driven.tick(60.0)), "nothing at all when it is finished"
+    assert driven.says() == CONVERGED
+    assert driven.core.stats(driven.now)["further_steps"] == 1
+
+
+def test_a_drive_is_not_polished(driven: Driven) -> None:
+    """One insert after the other: nothing comes in between."""
+    for _ in range(5):
+        driven.insert(converged=True, unfinished=True)
+        assert driven.tick(0.9 * converging.POLISH_IDLE_S) == []
+
+
+def test_one_that_converges_by_itself_is_polished_at_once(driven: Driven) -> None:
+    driven.insert(converged=False, unfinished=True)
+    ends = [(False, True), (True, True), (True, False)]
+    effects = driven.tick()
+    for converged, unfinished in ends:
+        effects = driven.done(the_run(effects), converged=converged, unfinished=unfinished)
+    assert not goes_on(effects + driven.tick(60.0))
+
+
+@pytest.mark.parametrize("of_step", [{"changed": 0}, {"chi2": 7.0}])
+def test_one_that_cannot_finish_does_not_try_for_ever(driven: Driven, of_step: dict[str, Any]) -> None:
+    driven.insert(converged=True, unfinished=True)
+    driven.now += converging.POLISH_IDLE_S
+    count = chain(driven, lambda _: {"converged": True, "unfinished": True, **of_step})
+    assert 1 <= count <= 21
+    assert driven.says() == (True, False, True)
+    assert not any(goes_on(driven.tick(60.0)) for _ in range(10))
 
 
 def test_one_that_has_not_goes_on_until_it_has(driven: Driven) -> None:
@@ -218,12 +264,38 @@ def test_slow_ones_that_lower_it_go_on_and_there_is_an_end_to_them_too(
     assert driven.says() == GAVE_UP
 
 
-def test_a_solver_that_fails_or_refuses_is_not_tried_again(driven: Driven) -> None:
+def test_a_solver_that_refuses_is_not_tried_again(driven: Driven) -> None:
     driven.insert(converged=False)
     run = the_run(driven.tick())
-    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now, failed=True)) + driven.tick())
+    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now, refused=True)) + driven.tick())
     assert run.further
     assert driven.says() == GAVE_UP
+    driven.insert(converged=True, unfinished=True)
+    assert driven.says() == POLISHED, "what is new may help"
+    the_run(driven.tick(converging.POLISH_IDLE_S))
+    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now, refused=True)) + driven.tick(60.0))
+    assert driven.says() == (True, False, True)
+
+
+def test_one_that_diverges_is_not_tried_again_though_undoing_it_is_a_step(driven: Driven) -> None:
+    """In whichever order that is told: with durability commit the solver is free before the step is."""
+    for free_first in (False, True):
+        driven.insert(converged=True, unfinished=True)
+        the_run(driven.tick(converging.POLISH_IDLE_S))
+        driven.revision += 1
+        undone = Stepped(driven.revision, b"", "full", 5.0, 1.0, changed=3, further=True, unfinished=True)
+        folded = Folded(3, 4, 0.0, driven.now, refused=True)
+        if free_first:
+            driven.core.folded(folded)
+            driven.core.kept([undone], driven.now)
+        else:
+            driven.core.stepped(undone)
+            driven.core.folded(folded)
+        assert not goes_on(driven.tick(60.0))
+        assert driven.says() == (True, False, True)
+
+
+def test_a_solver_that_was_replaced_is_not_tried_again(driven: Driven) -> None:
     driven.insert(converged=False)
     assert chain(driven, lambda n: {"rebuilt": True}) == 1
     assert driven.says() == GAVE_UP
@@ -263,6 +335,8 @@ def test_a_map_that_comes_back_goes_on(driven: Driven) -> None:
     driven.core.restore((), Restored(7, 3, 4, 9.0, converged=False))
     assert driven.says() == CONVERGING
     assert goes_on(driven.tick())
+    driven.core.restore((), Restored(7, 3, 4, 9.0, unfinished=True))
+    assert driven.says() == POLISHED
     driven.core.restore((), Restored(7, 3, 4, 9.0))
     assert driven.says() == CONVERGED
 

@@ -4,7 +4,8 @@ The judge of χ² is the dense twin, of the optimum the mode "all-batch", which 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver, StepReport
+from factorbus.solver.batch import solve_batch
 from factorbus.solver.tree_steps import TreeSteps
 
 X = symbol("x", 0), symbol("x", 10**6)
@@ -90,16 +92,32 @@ def test_a_loop_that_turns_most_of_the_map(drift_deg: float, optimum: float) -> 
 
 
 def test_a_mode_that_does_not_come_that_far_in_a_step_says_so() -> None:
-    solver, report = ring(90, "inc-l")
+    solver, report = ring(90, "inc-l", nonmonotone_steps=0)
     assert not report.converged
     assert solver.unfinished
     assert report.chi2 == pytest.approx(solver.chi2(), rel=1e-9)
     assert solver.step().chi2 < report.chi2
 
 
-def ring(drift_deg: float, mode: str = "auto", poses: int = 1000) -> tuple[Solver, StepReport]:
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("poses", [200, 1000])
+@pytest.mark.parametrize("drift_deg", [36, 90, 150])
+def test_every_mode_ends_at_the_optimum_of_such_a_loop(drift_deg: float, poses: int, mode: str) -> None:
+    """Damped steps go around a hill there, of which the step over it is the first: in hundreds."""
+    solver, _ = ring(drift_deg, mode, poses)
+    finish(solver, 3)
+    assert solver.chi2() == pytest.approx(ring_optimum(drift_deg, poses), rel=1e-6)
+
+
+@cache
+def ring_optimum(drift_deg: float, poses: int) -> float:
+    """χ² of the batch, from several starts."""
+    return solve_batch(*ring(drift_deg, "all-batch", poses)[0].graph()).chi2
+
+
+def ring(drift_deg: float, mode: str = "auto", poses: int = 1000, **options: int) -> tuple[Solver, StepReport]:
     """Odometry that turns by so much too far on its way round, and the loop that closes it."""
-    solver, turn = Solver(Options(mode=mode)), (2 * math.pi + math.radians(drift_deg)) / (poses - 1)
+    solver, turn = Solver(Options(mode=mode, **options)), (2 * math.pi + math.radians(drift_deg)) / (poses - 1)
     put(solver, Draft().se2("x0", (0, 0, 0), fixed=True))
     for i in range(1, poses):
         edge = Draft().se2(f"x{i}")
@@ -107,12 +125,13 @@ def ring(drift_deg: float, mode: str = "auto", poses: int = 1000) -> tuple[Solve
     return solver, put(solver, Draft().between_se2(f"x{poses - 1}", "x0", (0, 0, 0), sigmas=(0.1, 0.1, 0.05)))
 
 
+@pytest.mark.parametrize("mode", ["auto", "inc-l", "inc-l-b10"])
 @pytest.mark.parametrize("space", [False, True], ids=["plane", "space"])
 @pytest.mark.parametrize("angle_deg", [60, 90, 120, 150, 178, 180])
-def test_two_robots_meet_at_any_angle(space: bool, angle_deg: float) -> None:
-    solver, report = meeting(space, angle_deg)
+def test_two_robots_meet_at_any_angle(space: bool, angle_deg: float, mode: str) -> None:
+    solver, report = meeting(space, angle_deg, mode)
     optimum = settled_apart(solver)
-    assert not report.converged or report.chi2 + FLOOR <= 1.001 * (optimum + FLOOR)
+    assert mode == "inc-l-b10" or not report.converged or report.chi2 + FLOOR <= 1.001 * (optimum + FLOOR)
     finish(solver)
     assert solver.chi2() == pytest.approx(optimum, rel=1e-6, abs=1e-9)
     assert optimum < 1.0
@@ -128,9 +147,9 @@ def test_a_step_that_would_raise_chi2_is_replaced(monkeypatch: pytest.MonkeyPatc
     assert raised.chi2 > raised.chi2_before or raised.chi2 > 1e3 * report.chi2
 
 
-def meeting(space: bool, angle_deg: float, poses: int = 20) -> tuple[Solver, StepReport]:
+def meeting(space: bool, angle_deg: float, mode: str = "auto", poses: int = 20) -> tuple[Solver, StepReport]:
     """Two drives, the second held by a weak prior only, and the first relative pose between both."""
-    rng, solver, kind = np.random.default_rng(0), Solver(), "se3" if space else "se2"
+    rng, solver, kind = np.random.default_rng(0), Solver(Options(mode=mode)), "se3" if space else "se2"
     sigmas = (0.05, 0.05, 0.05, 0.02, 0.02, 0.02) if space else (0.05, 0.05, 0.02)
 
     def pose(x: float, y: float, yaw: float) -> tuple[float, ...]:
@@ -240,20 +259,48 @@ def rig_drive(sigma: float, poses: int = 300) -> Solver:
     return solver
 
 
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("world", ["manhattan", "city_trees", "sphere"])
-def test_a_map_with_nothing_to_do_finishes(world: str) -> None:
-    solver = Solver()
+def test_a_map_with_nothing_to_do_finishes(world: str, mode: str) -> None:
+    solver = Solver(Options(mode=mode))
     for step in WORLDS[world](250, 31):
         solver.stage(step.batch)
         solver.step()
     steps = finish(solver)
     optimum = settled_apart(solver)
-    assert steps <= 5
+    assert steps <= 3
     assert solver.chi2() == pytest.approx(optimum, rel=1e-6)
     before = [group.values.tobytes() for group in solver.estimate()]
     report = solver.step()
-    assert report.converged
+    assert (report.converged, solver.unfinished) == (True, False)
     assert [group.values.tobytes() for group in solver.estimate()] == before or report.chi2 <= report.chi2_before
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_with_losses_too(mode: str) -> None:
+    """Weights follow the residuals more slowly than Gauss-Newton's last steps are long."""
+    solver = Solver(Options(mode=mode))
+    for step in outliers(150, 3):
+        solver.stage(step)
+        solver.step()
+    finish(solver, 5)
+    assert solver.chi2() == pytest.approx(settled_apart(solver), rel=1e-6)
+
+
+def outliers(poses: int, seed: int) -> Iterator[Batch]:
+    """A drive round a square; one in ten of its closures is wrong, and all have Huber's loss."""
+    rng, true = np.random.default_rng(seed), [np.zeros(3)]
+    yield Draft().se2("x0", (0, 0, 0), fixed=True).batch()
+    for i in range(1, poses):
+        u, (x, y, a) = np.array([1.0, 0.0, math.pi / 2 if i % 10 == 0 else 0.0]), true[-1]
+        true.append(np.array([x + math.cos(a), y + math.sin(a), a + u[2]]))
+        draft, noise = Draft().se2(f"x{i}"), rng.normal(size=6)
+        sigmas = (0.05, 0.05, 0.01)
+        draft.between_se2(f"x{i - 1}", f"x{i}", u + noise[:3] * sigmas, sigmas=sigmas)
+        if i >= 40 and i % 4 == 0:
+            z = noise[3:] * sigmas + (np.array([0.5, -0.7, 0.2]) if i % 40 == 0 else 0.0)
+            draft.between_se2(f"x{i - 40}", f"x{i}", z, sigmas=sigmas, loss=("huber", 1.5))
+        yield draft.batch()
 
 
 def test_what_a_step_says_of_a_continued_map() -> None:

@@ -1,5 +1,6 @@
 """The rules that accept, damp and stop, on small problems without a graph."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +18,7 @@ class Curve:
         self.r, self.J, self.x = r, J, np.array(x)
         self.chi2s = [self.chi2(self.x)]
         self.factorised: list[float] = []
+        self.taken_back: list[np.ndarray] = []
 
     def chi2(self, x: np.ndarray) -> float:
         return float(self.r(x) @ self.r(x))
@@ -43,6 +45,13 @@ class Curve:
     def accept(self) -> None:
         self.x = self.there
         self.chi2s.append(self.chi2(self.x))
+
+    def keep(self) -> None:
+        self.kept = self.x
+
+    def go_back(self) -> None:
+        self.x = self.kept
+        self.taken_back.append(self.x)
 
 
 def rosenbrock(x: list[float]) -> Curve:
@@ -81,6 +90,42 @@ def test_chi2_never_rises(start: list[float]) -> None:
     np.testing.assert_allclose(problem.x, [1.0, 1.0], atol=1e-8)
     assert (np.diff(problem.chi2s) <= 0.0).all()
     assert course.chi2 == problem.chi2s[-1]
+
+
+OVER_HILLS = dataclasses.replace(SETTLE, nonmonotone=5)
+
+
+def test_over_a_hill_there_are_few_steps_where_damped_ones_go_around_it() -> None:
+    """From the classical start Gauss-Newton goes to (1, -3.84), which is a hundred times higher, and then to (1, 1)."""
+    around, over = rosenbrock([-1.2, 1.0]), rosenbrock([-1.2, 1.0])
+    minimise(around, around.chi2s[0], 0.0, SETTLE)
+    course = minimise(over, over.chi2s[0], 0.0, OVER_HILLS)
+    assert over.chi2s[1] > 50 * over.chi2s[0]
+    np.testing.assert_allclose(over.x, [1.0, 1.0], atol=1e-9)
+    assert (course.iterations, course.converged, over.factorised, over.taken_back) == (2, True, [0.0] * 3, [])
+    assert course.chi2 == over.chi2s[-1]
+    assert len(around.factorised) > 10
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.5])
+def test_steps_that_never_lead_down_are_taken_back(damping: float) -> None:
+    """Once; then the damping that was given counts."""
+    problem = arctan([3.0])
+    course = minimise(problem, problem.chi2s[0], damping, OVER_HILLS)
+    assert course.converged
+    assert abs(problem.x[0]) < 1e-9
+    assert [x.tolist() for x in problem.taken_back] == [[3.0]]
+    first_damped = next(n for n, used in enumerate(problem.factorised) if used)
+    assert 1 < first_damped <= 1 + OVER_HILLS.nonmonotone
+    assert problem.factorised[first_damped] == (damping or 1e-5)
+    assert course.chi2 <= problem.chi2s[0]
+
+
+def test_what_another_step_would_take_off_is_told() -> None:
+    problem = rosenbrock([0.0, 0.0])
+    course = minimise(problem, problem.chi2s[0], 0.0, Rule(1e-6, 1e-12, limit=1))
+    assert course.left == pytest.approx(problem.decrease())
+    assert minimise(arctan([30.0]), 2.4, 1.0, Rule(1e-6, 1e-12, limit=1)).left == np.inf
 
 
 def test_a_limit_stops_and_the_damping_is_handed_on() -> None:

@@ -1,6 +1,6 @@
 """A front end in a process of its own: drives a noisy loop into a map, several inserts in flight.
 
-front_end.py ENDPOINT MAP LETTER POSES     then a line `go` → `done LAST-REVISION`
+front_end.py ENDPOINT MAP LETTER POSES     then a line `go` → `done LAST-REVISION`, when the map has come to rest
 """
 
 import sys
@@ -15,12 +15,14 @@ SIGMAS = (0.1, 0.1, 0.02)
 def main() -> None:
     endpoint, name, letter, poses = sys.argv[1:]
     random = np.random.default_rng(ord(letter))
-    with connect(endpoint, client=letter) as bus, bus.map(name, window=8, mirror=False) as driven:
+    with connect(endpoint, client=letter) as bus, bus.map(name, window=8) as driven:
         print("ready", flush=True)
         sys.stdin.readline()
         driven.insert(Draft().se2(f"{letter}0", (ord(letter), 0, 0), fixed=True), timeout_s=60)
-        last = [driven.send(draft(letter, n, random), timeout_s=60) for n in range(1, int(poses))]
-        print("done", max(ticket.result(60).revision for ticket in last), flush=True)
+        for n in range(1, int(poses)):
+            driven.send(draft(letter, n, random), timeout_s=60)
+        driven.wait_converged(60)
+        print("done", driven.estimate.revision, flush=True)
 
 
 def draft(letter: str, n: int, random: np.random.Generator) -> Draft:

@@ -64,6 +64,7 @@ def test_an_insert_is_undone_and_everybody_sees_it(endpoint: str, square: Map) -
 
 def test_refusals_are_whole_and_have_their_codes(square: Map) -> None:
     (first, accepted), *_ = drive(square, 0, 6)[1:]
+    square.wait_converged()
     revision = square.stats()["revision"]
     for changes, code in (
         (Changes().undo(first, accepted), "in_use"),
@@ -118,6 +119,7 @@ def test_a_restart_after_a_kill_has_the_changes(spawn: Callable[..., Process], t
         done = drive(joined, 0, 8)
         joined.change(Changes().undo(*done[-1]).fix("x3").weigh([2], 0.25))
         drive(joined, 7, 10)
+        joined.wait_converged()
         before, graph, row = joined.ask_estimate(), joined.graph(), joined.stats()
     service.signal(signal.SIGKILL)
     service.wait()
@@ -153,6 +155,7 @@ def test_a_marginal_of_many_poses_is_there_again_after_a_kill(spawn: Callable[..
             joined.change(Changes().remove_factors([int(pieces[0].ids[0])]))
         assert refused.value.code == "not_positive_definite"
         drive(joined, 12, 14)
+        joined.wait_converged()
         before, graph = joined.ask_estimate(), joined.graph()
     service.signal(signal.SIGKILL)
     service.wait()

@@ -49,6 +49,7 @@ def prepared(joined: Map) -> None:
     joined.insert(Draft().point2("l1").landmark_se2("x5", "l1", (2, 1), sigmas=(0.1, 0.1)))
     joined.insert(Draft().landmark_se2("x25", "l1", (2, 1.5), sigmas=(0.1, 0.1), loss=("huber", 1.0)))
     joined.change(Changes().remove_factors([30, 22]).loss([24], "dcs", 1.5).weigh([7], 0.5).fix("x9"))
+    joined.wait_converged()
 
 
 def later(n: int) -> Draft:
@@ -70,6 +71,8 @@ def test_a_fork_is_the_same_to_the_bit_and_goes_on_by_itself(endpoint: str, mode
             assert everything(fork) == before == everything(original)
             for n in (40, 41, 42):
                 assert original.insert(later(n)).first_factor == fork.insert(later(n)).first_factor
+            for each in (fork, original):
+                each.wait_converged()
             assert everything(fork) == everything(original), "the same inserts lead to the same bits"
             then = everything(original)
             fork.change(Changes().remove_variables("l1").weigh([5], 0.1), settle=True)
@@ -149,11 +152,12 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
         stream.wait_for(len(batches))
         stream.join(PATIENCE_S)
         with bus.map("what-if", create=False) as fork:
-            assert fork.stats()["revision"] == row.revision >= 1
+            assert fork.stats()["revision"] >= row.revision >= 1
             if durability == "commit":
                 count = len(rows(fork.ask_estimate().variables))
                 fork.insert(Draft().se2("y1").between_se2("x50", "y1", (0, 1, 0), sigmas=SIGMAS))
                 fork.change(Changes().fix("x40").remove_variables(f"x{count - 1}"))
+            fork.wait_converged()
             before, epoch = everything(fork), fork.epoch
     running.end(signal.SIGKILL)
     with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus:
@@ -161,10 +165,11 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
             assert everything(fork) == before
             assert (fork.epoch == epoch) == (durability == "commit")
             fork.insert(Draft().se2("z1").between_se2("x45", "z1", (0, 1, 0), sigmas=SIGMAS))
+            fork.wait_converged()
             again = bus.fork("what-if", "what-if-2")  # a fork of a fork that was opened
             with bus.map("what-if-2", create=False) as second:
                 assert everything(second) == everything(fork)
-                assert again.revision == before[0] + 1
+                assert again.revision == fork.estimate.revision > before[0]
         (journal / "taken").mkdir()
         (journal / "taken" / "something").touch()
         with pytest.raises(Refused) as refused:

@@ -55,7 +55,7 @@ def test_killed_at_any_moment_nothing_answered_is_lost_and_nothing_is_done_twice
         stream.stop.set()
         stream.allow(1)
         stream.join(PATIENCE_S)
-        driven.flush(PATIENCE_S)
+        driven.wait_converged(PATIENCE_S)
         assert not stream.fault
         assert stream.acknowledged == {ticket.sequence for ticket in stream.tickets}
         sent, estimate = len(stream.tickets), driven.ask_estimate()

@@ -142,6 +142,7 @@ def test_nothing_is_lost_when_the_disk_takes_nothing_for_a_while(
         stream.wait_for(BEFORE + AFTER)
         assert not stream.fault
         running.eventually(lambda: health(bus, "m2"), lambda seen: seen[1])
+        driven.wait_converged(PATIENCE_S)
         estimate = driven.ask_estimate()
         events.close()
     running.end(signal.SIGTERM)
@@ -171,6 +172,7 @@ def test_killed_on_a_full_disk_and_started_on_it(services: Callable[..., Service
         disk.empty()
         stream.wait_for(BEFORE + AFTER)
         assert not stream.fault
+        driven.wait_converged(PATIENCE_S)
         estimate, epoch = driven.ask_estimate(), driven.epoch
         assert driven.stats()["epoch"] == epoch
     running.end(signal.SIGTERM)
@@ -187,7 +189,7 @@ def test_a_read_only_journal_answers_and_goes_on_when_it_can_be_written(
     with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m2", "inc-l") as driven:
         for batch in batches[:BEFORE]:
             driven.send(batch)
-        driven.flush(PATIENCE_S)
+        driven.wait_converged(PATIENCE_S)
         running.eventually(lambda: driven.stats()["journal"]["inserts"], lambda written: written == BEFORE)
         before = driven.ask_estimate()
         running.end(number)
@@ -205,7 +207,7 @@ def test_a_read_only_journal_answers_and_goes_on_when_it_can_be_written(
             driven.rejoin()
         for batch in batches[BEFORE:]:
             driven.send(batch, timeout_s=PATIENCE_S)
-        driven.flush(PATIENCE_S)
+        driven.wait_converged(PATIENCE_S)
         assert driven.ask_estimate().epoch == after.epoch
         assert health(bus, "m2")[:2] == (True, True) or running.eventually(
             lambda: health(bus, "m2"), lambda seen: seen[1]

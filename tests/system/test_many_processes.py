@@ -65,7 +65,7 @@ def test_a_stopped_viewer_slows_nobody_and_catches_up(endpoint: str, spawn: Spaw
         (seen,) = shown([watching], last)
     assert statistics.median(during) < 3 * statistics.median(before) + 0.005
     assert max(during) < 0.6, "no insert waits for the stopped viewer (a blocking publication would wait a second)"
-    assert int(seen[0]) == last
+    assert int(seen[0]) >= last, "or further steps later"
 
 
 def digest(estimate: Estimate) -> str:

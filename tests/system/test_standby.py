@@ -49,6 +49,7 @@ def test_it_takes_over_while_a_client_streams(
         stream.allow(EACH)
         stream.wait_for(len(batches))
         assert not stream.fault
+        driven.wait_converged(PATIENCE_S)
         estimate = driven.ask_estimate()
         assert estimate.epoch == driven.epoch, "it is the same map"
     print(f"{hub}: answered again {min(times):.2f} to {max(times):.2f} s after the kill of its owner")

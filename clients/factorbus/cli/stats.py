@@ -68,10 +68,11 @@ def _map(row: Mapping[str, Any]) -> str:
 
 
 def _convergence(row: Mapping[str, Any]) -> str:
-    if row["converged"]:
-        return "converged"
-    so_far = f"after {row['further_steps']} further steps"
-    return f"converging, {so_far}" if row["converging"] else f"not converged {so_far}: gave up, as {row['gave_up']}"
+    state = "converged" if row["converged"] else "not converged"
+    so_far = f" after {row['further_steps']} further steps"
+    if row["converging"]:
+        return f"{state}, converging,{so_far}"
+    return f"{state}{so_far}: gave up, as {row['gave_up']}" if row["gave_up"] else state
 
 
 def _steps(strategies: Mapping[str, int]) -> str:

@@ -31,7 +31,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
     In the tables:
       steps/s    steps since the look before; inserts/s: accepted inserts
       step ms    solver's time of a step, mean since the look before
-      χ²         converging: the map has not converged, and goes on by itself; gave up: it does not
+      χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
       answer ms  from asking for these numbers to having them, over the bus
     """
@@ -91,14 +91,14 @@ def _maps(seen: dict[str, Any]) -> "RenderableType":
             f"{row['steps_per_s']:.1f}",
             f"{row['inserts_per_s']:.1f}",
             "" if row["step_ms"] is None else f"{row['step_ms']:.2f}",
-            f"{row['chi2']:.6g}" + _not_converged(row),
+            f"{row['chi2']:.6g}" + _convergence(row),
             f"{row['waiting']}" + (f" +{row['parked']}" if row["parked"] else ""),
             f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
         )
     return table
 
 
-def _not_converged(row: dict[str, Any]) -> str:
+def _convergence(row: dict[str, Any]) -> str:
     return " converging" if row["converging"] else " gave up" if row["gave_up"] else ""
 
 

@@ -80,7 +80,8 @@ def command(
                 view.show(lookout.last_look(joined.timeout_s))
         finally:
             view.close()
-    converging = ", which had not converged" if joined.estimate.converged is False else ""
+    unconverged = ", which had not converged" if joined.estimate.converged is False else ""
+    converging = unconverged or (", which was converging" if joined.estimate.converging else "")
     note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 

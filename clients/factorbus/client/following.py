@@ -9,7 +9,8 @@ deltas that go on from it are applied.  So no change is ever skipped, and what i
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,9 @@ class Following:
         self.epoch = 0
         self.revision = 0
         self.live = False
-        self.converged: bool | None = None  # at this revision; None: nobody has said
+        # At this revision; None: nobody has said.
+        self.converged: bool | None = None
+        self.converging: bool | None = None
         self._tables: dict[str, Table] = {}
         self._aside: deque[Delta] = deque(maxlen=_KEPT_ASIDE)
 
@@ -59,7 +62,7 @@ class Following:
         self._aside.clear()
         news = [Delta(estimate.epoch, estimate.revision, 0, estimate.variables)]
         if (estimate.epoch, estimate.revision) != (self.epoch, self.revision):
-            self.converged = None
+            self.converged = self.converging = None
         self.epoch, self.revision, self._tables, self.live = estimate.epoch, estimate.revision, tables, True
         for delta in aside:
             if delta.epoch == self.epoch:
@@ -95,8 +98,14 @@ class Following:
         self._be_at(delta)
 
     def _be_at(self, delta: Delta) -> None:
-        told = delta.report.get("converged")
-        self.revision, self.converged = delta.revision, told if isinstance(told, bool) else None
+        self.revision = delta.revision
+        self.take_convergence(delta.report)
+
+    def take_convergence(self, told: Mapping[str, Any]) -> None:
+        """What a report, or the stats, say of this revision."""
+        converged, converging = told.get("converged"), told.get("converging")
+        self.converged = converged if isinstance(converged, bool) else None
+        self.converging = converging if isinstance(converging, bool) else None
 
 
 def tables_of(estimate: Estimate) -> dict[str, Table]:

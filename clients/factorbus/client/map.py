@@ -37,7 +37,7 @@ class MapRow:
     state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
     (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
-    list of maps.  converging: it has not converged, and takes further steps by itself.
+    list of maps.  converging: it takes further steps by itself, unless an insert comes.
     """
 
     name: str
@@ -213,9 +213,11 @@ class Map:
         self._catch_up(timeout_s)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
-        """Wait until everything sent is answered and the map, left alone since, has converged; the mirror has it then.
+        """Wait until everything sent is answered and the map, left alone since, is at its optimum to 1e-6 of χ².
 
-        Nothing is sent for it: a map goes on converging by itself when nobody inserts.  `settle` demands it, as a step.
+        Nothing more is published then until the next insert, and the mirror has it.  Nothing is sent for it: a map goes
+        on by itself when nobody inserts, for a tenth of a second where it has not converged, else for a second.
+        `settle` demands it at once, as a step.
         Raises NotConverged when time is up, or at once where the map gave up; as `flush` does; Unavailable for a map
         opened with mirror=False.
         """

@@ -113,6 +113,11 @@ class Mirror:
         return self._following.converged
 
     @property
+    def converging(self) -> bool | None:
+        """Whether further revisions are to follow by themselves, unless an insert comes; None as for `converged`."""
+        return self._following.converging
+
+    @property
     def age_s(self) -> float:
         """Seconds since the service last confirmed these values: by a delta, or by answering that nothing changed."""
         return time.monotonic() - self._confirmed_at
@@ -144,13 +149,13 @@ class Mirror:
         raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
-        """Until the values are the latest and the map has converged at them.
+        """Until the values are the latest, the map has converged at them, and no further steps are to follow.
 
         Raises NotConverged when time is up, and at once where the map gave up; Unavailable, at once, on a closed map.
         """
         timeout_s = self._timeout_s if timeout_s is None else timeout_s
-        self._try_wait(lambda: self._is_latest and (self.converged or bool(self._gave_up)), timeout_s)
-        if self._is_latest and self.converged:
+        self._try_wait(lambda: self._is_at_rest, timeout_s)
+        if self._is_at_rest and self.converged:
             return
         self._check_open()
         raise NotConverged(self._map, self.revision, timeout_s, self._gave_up)
@@ -208,6 +213,10 @@ class Mirror:
     @property
     def _is_latest(self) -> bool:
         return self._there(self._expected)
+
+    @property
+    def _is_at_rest(self) -> bool:
+        return self._is_latest and self.converging is False
 
     def _check_open(self) -> None:
         if self._closing:
@@ -317,8 +326,8 @@ class Mirror:
                 self._confirm()
 
     def _take_convergence(self, told: Mapping[str, Any]) -> None:
-        converged, gave_up = told.get("converged"), told.get("gave_up")
-        self._following.converged = converged if isinstance(converged, bool) else None
+        self._following.take_convergence(told)
+        gave_up = told.get("gave_up")
         self._gave_up = gave_up if isinstance(gave_up, str) else ""
 
     def _take_owner(self, token: str, alive: bool) -> None:

@@ -30,7 +30,7 @@ async def follow(socket: WebSocket, mirror: Mirror) -> None:
     leaving = asyncio.ensure_future(_leaves(socket))
     try:
         snapshot = mirror.snapshot()
-        report = {"converging": True} if mirror.converged is False else {}
+        report = {"converging": True} if mirror.converging else {}
         await _send(socket, {"type": "estimate", **estimate(snapshot), "report": report})
         at = (snapshot.epoch, snapshot.revision)
         while not leaving.done():

@@ -103,9 +103,9 @@ class LiveView:
                 self._to.log(f"plots/{name}", rr.Scalars(float(delta.report[name])))
         if delta.report:
             text = f"{delta.report.get('strategy', '')}: {delta.report.get('because', '')}"
-            converging = delta.report.get("converging") is True
-            text += "; converging: it has not converged yet" if converging else ""
-            self._to.log("log", rr.TextLog(text, level="WARN" if converging else "INFO"))
+            text += "; converging: further steps follow" if delta.report.get("converging") is True else ""
+            far = delta.report.get("converged") is False
+            self._to.log("log", rr.TextLog(text, level="WARN" if far else "INFO"))
 
     def _log_map(self, look: Look, track: Track) -> None:
         letters = track.keys >> _LETTER_BITS

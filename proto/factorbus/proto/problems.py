@@ -249,7 +249,7 @@ class NotConverged(Problem):
     code = "not_converged"
 
     def __init__(self, name: str, revision: int, waited_s: float, gave_up: str) -> None:
-        seen = f"map {name!r} has not converged at revision {revision}"
+        seen = f"map {name!r} has not converged to its optimum at revision {revision}"
         wanted = f"after {waited_s:g} s; it goes on by itself: wait longer, or look at ask/stats"
         if gave_up:
             wanted = f"and goes on no more by itself: {gave_up}; `settle` it, or ask `repair` what is wrong in it"

@@ -1,10 +1,11 @@
-"""When a map whose last step had not converged takes further steps, without an insert.  Pure: the core asks.
+"""When a map to which nothing comes takes further steps, without an insert.  Pure: the core asks.
 
     converged ──a step that could not finish──▶ waits ──no insert for a moment──▶ goes on ──▶ converged
-                                                  ▲                                  │
-                                                  └───────── an insert ──────────────┴──▶ gave up
+        │                                                                                        │
+        └──no insert for longer──▶ goes on ──▶ finished: a step would not lower what χ² shows ◀───┘
 
-It gives up, until something else changes the map, where further steps are of no use, and where there were too many.
+An insert comes first at any time, and ends the waiting.  Where further steps are of no use, or were too many, the map
+gives up until something else changes it.
 Reasons and figures: docs/decisions/further-steps.md.
 """
 
@@ -12,7 +13,9 @@ import math
 
 from factorbus.service.events import Stepped
 
-QUIET_S = 0.1  # without a step of another sort, before the first further one
+# Idle is a map whose last step of another sort ended so long ago: one that has not converged goes on, and one that has
+# is polished, that is, goes on to its optimum.
+CONVERGE_IDLE_S, POLISH_IDLE_S = 0.1, 1.0
 FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
 MOST, MOST_S = 10_000, 300.0  # so many in a row, and so much of a core for them
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
@@ -21,12 +24,13 @@ _USELESS, _STILL = 20, 3  # so many in a row
 
 
 class Converging:
-    """Whether a map has converged at the revision that is told, and what is done about it."""
+    """How near a map is to its optimum at the revision that is told, and what is done about it."""
 
     def __init__(self) -> None:
         self.converged = True
-        self.gave_up = ""  # why no further step is made; empty: it is, or need not be
+        self.gave_up = ""  # why no further step is made, though one is wanted
         self.steps = 0  # further ones since the last of another sort
+        self._unfinished = False  # a step would still bring it nearer to its optimum, though it may have converged
         self._untold = False  # a further step is under way, or not told yet
         self._goes_on = False
         self._under_way = ""  # "further", "inserts", or neither
@@ -36,16 +40,17 @@ class Converging:
 
     @property
     def converging(self) -> bool:
-        """Has not converged, and will have further steps by itself."""
-        return not self.converged and not self.gave_up
+        """Will have further steps by itself, unless an insert comes first."""
+        return self._unfinished and not self.gave_up
 
     def is_due(self, now: float) -> bool:
         """Whether the solver, which is free, is to take a further step now."""
         return self.converging and self._goes_on and not self._untold and now >= self._rests_until
 
     def look(self, now: float) -> None:
-        """Time went by: was it quiet for long enough?"""
-        self._goes_on = self._goes_on or now - self._busy_at >= QUIET_S
+        """Time went by: has the map been idle for long enough?"""
+        idle_s = POLISH_IDLE_S if self.converged else CONVERGE_IDLE_S
+        self._goes_on = self._goes_on or now - self._busy_at >= idle_s
 
     def began(self, further: bool) -> None:
         """The solver was given a further step, or inserts."""
@@ -62,29 +67,32 @@ class Converging:
             self._busy_at = now
         self._under_way = ""
 
-    def failed(self) -> None:
-        """The further step could not be made: nothing has changed, so the next one could not either."""
+    def refused(self) -> None:
+        """The further step was refused: the map is where it was, so the next one would be, too."""
         self._untold, self.gave_up = False, "the solver refused it, see the service's log"
 
     def undone(self) -> None:
         """What was not told did not happen."""
         self._untold = False
 
-    def moved_on(self, converged: bool, chi2: float) -> None:
+    def moved_on(self, converged: bool, unfinished: bool, chi2: float) -> None:
         """A step of another sort is told."""
-        self.converged, self.gave_up, self.steps, self._spent_s = converged, "", 0, 0.0
+        self.converged, self._unfinished, self.gave_up = converged, unfinished or not converged, ""
+        self.steps, self._spent_s = 0, 0.0
         self._least, self._useless, self._still = chi2, 0, 0
 
     def went_on(self, stepped: Stepped) -> None:
         """A further step is told: was it of use?"""
         self._untold, self.converged = False, stepped.converged
+        self._unfinished = stepped.unfinished or not stepped.converged
         self.steps += 1
         useful = stepped.chi2 < (1.0 - _SHARE) * self._least - _NOTHING
         if useful:
             self._least = stepped.chi2
         self._useless = 0 if useful else self._useless + 1
         self._still = self._still + 1 if not stepped.changed else 0
-        self.gave_up = "" if stepped.converged else self._why_give_up(stepped)
+        if self._unfinished and not self.gave_up:
+            self.gave_up = self._why_give_up(stepped)
 
     def _why_give_up(self, stepped: Stepped) -> str:
         if stepped.rebuilt:

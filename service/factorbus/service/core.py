@@ -3,7 +3,7 @@
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
     Asked ───▶ reads ──────────────┴▶ Run ─▶ Folded ────┼─▶ Publish           delta of every step
                                     (solver thread)     └─▶ Run               what came in meanwhile; nothing did, and
-                                                                              it had not converged: a further step
+                                                                              it is not at its optimum: a further step
 
 At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
 """
@@ -57,6 +57,7 @@ class Restored(NamedTuple):
     factors: int
     chi2: float
     converged: bool = True
+    unfinished: bool = False
 
 
 class MapCore:
@@ -161,7 +162,7 @@ class MapCore:
         seconds = alone.now - insert.now
         self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
         self._moved_on(alone.revision, size)
-        self._converging.moved_on(alone.converged, alone.chi2)
+        self._converging.moved_on(alone.converged, alone.unfinished, alone.chi2)
         self._moved_at = alone.revision
         self._free(alone, 1)
         return self._go_on(others, alone.now)
@@ -199,8 +200,8 @@ class MapCore:
         """The map was here before: what its clients have sent, and how it is."""
         for name, following, answered in senders:
             self._admission.restore(name, following, answered, self._created)
-        self.revision, self.variables, self.factors, self._account.chi2, converged = restored
-        self._converging.moved_on(converged, restored.chi2)
+        self.revision, self.variables, self.factors, self._account.chi2 = restored[:4]
+        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
         self._moved_at = restored.revision
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
@@ -211,7 +212,7 @@ class MapCore:
         if stepped.further:
             self._converging.went_on(stepped)
         else:
-            self._converging.moved_on(stepped.converged, stepped.chi2)
+            self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
             self._moved_at = stepped.revision
         return [Publish("delta", stepped.delta)]
 
@@ -229,8 +230,8 @@ class MapCore:
         taken = self._running.inserts if self._running else ()
         for insert in taken:
             self._account.took(folded.now - insert.now)
-        if folded.failed:
-            self._converging.failed()
+        if folded.refused:
+            self._converging.refused()
         self._free(folded, len(taken))
         return self._go_on([], folded.now)
 

@@ -82,10 +82,11 @@ class Judged(NamedTuple):
 class Stepped(NamedTuple):
     """The solver made a step; the delta tells of it.
 
-    converged: if not, further steps are to follow.  changed: how many variables; damping: what the next step would
-    begin with.  further: without an insert, because the step before had not converged.  rebuilt: it brought back what
-    had been accepted, in a new solver, after a fault.  reordered: another solver took its place, which was made of what
-    there was after this fold, in a fresh order, and has been given all since.
+    converged, unfinished: if not, or if so, further steps are to follow when no insert does.  changed: how many
+    variables; damping: what the next step would begin with.  further: without an insert, because the map was not at its
+    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  reordered: another
+    solver took its place, which was made of what there was after this fold, in a fresh order, and has been given all
+    since.
     """
 
     revision: int
@@ -99,19 +100,20 @@ class Stepped(NamedTuple):
     changed: int = 0
     damping: float = 0.0
     further: bool = False
+    unfinished: bool = False
 
 
 class Folded(NamedTuple):
     """The solver is done with a Run; how large the map is now, and what its thread has used.
 
-    failed: a further step could not be made.
+    refused: a further step was, and the map is where it was.
     """
 
     variables: int
     factors: int
     solver_cpu_s: float
     now: float
-    failed: bool = False
+    refused: bool = False
 
 
 class Alone(NamedTuple):
@@ -130,6 +132,7 @@ class Alone(NamedTuple):
     solver_cpu_s: float
     now: float
     converged: bool = True
+    unfinished: bool = False
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@
 An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
 the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
 
-Where a step had not converged and nothing waits, a further step goes on from it, with nothing staged.
+Where the map is not at its optimum and nothing waits, a further step goes on, with nothing staged.
 
 Where the solver itself fails it is replaced (see `holding`), and the insert that brought the fault about is refused as
 internal.
@@ -89,7 +89,8 @@ class Folder(Holding):
         if isinstance(came, Alone):
             judged = Judged((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
             told = came.strategy, came.chi2, came.solver_ms
-            stepped = Stepped(came.revision, came.delta, *told, converged=came.converged)
+            left = {"converged": came.converged, "unfinished": came.unfinished}
+            stepped = Stepped(came.revision, came.delta, *told, **left)
             return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now)
         events: list[Judged | Stepped] = []
         folded = self._folded(time.thread_time())
@@ -108,26 +109,41 @@ class Folder(Holding):
 
     def go_on(self) -> Iterator[Stepped | Folded]:
         """One step without an insert: Stepped, unless the solver refuses it and is as it was; Folded."""
-        cpu_s, started, revision = time.thread_time(), time.perf_counter(), self._revision
+        cpu_s, revision, refused = time.thread_time(), self._revision, True
         stepped: list[Stepped] = []
         try:
             if not self._broken:
-                stepped = [self._further_step(started)]
-        except SolverError as problem:
-            log.warning("a further step, without an insert, is refused: %s", problem)
+                stepped, refused = self._further_step()
         except Exception:
             self._revision = revision
-            stepped = [each._replace(further=True) for each in self._replace_solver(self._fault())]
-        yield from stepped
-        yield self._folded(cpu_s)._replace(failed=not stepped)
+            stepped = list(self._replace_solver(self._fault()))
+            refused = not stepped
+        yield from (each._replace(further=True) for each in stepped)
+        yield self._folded(cpu_s)._replace(refused=refused)
 
-    def _further_step(self, started: float) -> Stepped:
-        report = self._solver.step()
+    def _further_step(self) -> tuple[list[Stepped], bool]:
+        """What comes of it, and whether it is refused.  As those of inserts, it is tried on a copy where numbers are of
+        unusual sizes, and one that diverged all the same is undone in a step of its own."""
+        started, kept, report = time.perf_counter(), None, None
+        if self._wary or not is_usual(self._solver):
+            kept, self._solver, self._wary = self._solver, copied(self._solver), True
+        try:
+            report = self._solver.step()
+            check_step(self._solver, report)
+        except SolverError as problem:
+            log.warning("a further step, without an insert, is refused; none is tried until the next one: %s", problem)
+            if kept is None and report is not None:
+                return list(self._go_back(report)), True
+            self._solver = kept or self._solver
+            return [], True
+        except Exception:
+            self._solver = kept or self._solver
+            raise
         account = report.as_dict()
         account["because"] = f"{GOES_ON}: {report.because}"
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
-        return self._told(account)._replace(changed=report.changed, damping=report.damping, further=True)
+        return [self._told(account)._replace(changed=report.changed, damping=report.damping)], False
 
     def fold(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped | Folded]:
         """Fold `inserts` in; every one of them is accepted or refused whole.
@@ -207,7 +223,7 @@ class Folder(Holding):
                 return self._diverged_alone(insert, report)
             account = report.as_dict()
             account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
-            account["converging"] = not report.converged
+            account["converging"] = solver.unfinished or not report.converged
             answer, delta = write_messages(
                 insert.sequence, self._epoch, self._revision + 1, first_factor, self._pack(account), changed,
                 graph.var, graph.keys, graph.values, WORDS, LETTERS, self._out,
@@ -225,6 +241,7 @@ class Folder(Holding):
         return Alone(
             insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
             report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(), self._converged,
+            self._unfinished,
         )  # fmt: skip
 
     def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:

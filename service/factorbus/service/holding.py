@@ -56,7 +56,7 @@ class Holding:
         self._account: dict[str, Any] = {}  # of the last step
         self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
         self._held = (0, 0)  # variables and factors that were accepted
-        self._converged = True
+        self._converged, self._unfinished = True, False
         self._broken = ""
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
         self._room = Room()
@@ -99,6 +99,11 @@ class Holding:
         """Whether the last step had; of an empty map, it has."""
         return self._converged
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether a further step would bring the estimate nearer to its optimum."""
+        return self._unfinished
+
     def enter(self, epoch: int) -> None:
         """From now on answers and deltas name this epoch."""
         self._epoch = epoch
@@ -118,13 +123,14 @@ class Holding:
     def load(self, state: Mapping[str, Any] | None) -> None:
         """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
         self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
-        self._held, self._converged = (0, 0), True
+        self._held, self._converged, self._unfinished = (0, 0), True, False
         if state is not None:
             self._solver.load(state["solver"])
             self._wary = not is_usual(self._solver)
             self._revision = int(state["revision"])
             self._held = tuple(state["held"])
             self._converged = bool(state["converged"])
+            self._unfinished = bool(self._solver.unfinished)
 
     def content(self) -> dict[str, Any]:
         """What another one `beside` this one begins with, a copy.  Raises Broken."""
@@ -161,7 +167,8 @@ class Holding:
         self._next(account)
         delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
         told = account["strategy"], account["chi2"], account["solver_ms"]
-        return Stepped(self._revision, delta, *told, reordered=after, converged=self._converged)
+        left = {"converged": self._converged, "unfinished": self._unfinished}
+        return Stepped(self._revision, delta, *told, reordered=after, **left)
 
     @property
     def nonzeros(self) -> int:
@@ -186,14 +193,14 @@ class Holding:
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
         delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
         told = account["strategy"], account["chi2"], account["solver_ms"]
-        return Stepped(self._revision, delta, *told, converged=self._converged)
+        return Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
 
     def _next(self, account: dict[str, Any]) -> None:
         """The solver has made a step: its `account` says, too, whether more are to follow."""
         self._revision += 1
         self._account, self._uncertain = account, None
-        self._converged = _has_converged(account)
-        account["converging"] = not self._converged
+        self._converged, self._unfinished = _has_converged(account), bool(self._solver.unfinished)
+        account["converging"] = self._unfinished or not self._converged
 
     def _fault(self) -> str:
         """Log what is being handled; the reference under which it is found."""

@@ -226,14 +226,14 @@ class Host:
                 self._read(run.reads)
             events = self._folder.fold_run(run.inserts, run.further)
             if not isinstance(events, Alone):
-                self._tell(run.inserts, events, tell)
+                self._tell(run, events, tell)
                 return
             answered = events.insert.askers[0]
             if tell is self._send:
                 self._send_both(answered, events.answer, events.delta)
             else:
                 tell([Answer(answered, events.answer), Publish("delta", events.delta)])
-            self._tidy(run.inserts, ())
+            self._tidy(run, ())
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:
@@ -245,13 +245,13 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _tell(self, inserts: Sequence[Arrived], events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
+    def _tell(self, run: Run, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
         """What comes of a Run, step by step."""
         effects: list[Effect] = []
         came: list[Judged | Stepped] = []
         for event in events:
             if isinstance(event, Folded):
-                self._tidy(inserts, came)
+                self._tidy(run, came)
                 with self._lock:
                     effects += self.core.folded(event)
                 self._perform(effects)
@@ -274,13 +274,13 @@ class Host:
         if run.reads:
             self._read(run.reads)
         events, folded = self._folder.fold_whole(run.inserts, run.further)
-        keeper.hand(run.inserts, events)
+        keeper.hand(run.inserts, events, run.further)
         if not keeper.waits:
             with self._lock:
                 effects = self.core.kept(events, time.monotonic())
             tell(effects)
         replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
-        replaced = self._tidy_kept(run.inserts, events, keeper) or replaced
+        replaced = self._tidy_kept(run, events, keeper) or replaced
         busy = self._reordering is not None and self._reordering.busy
         if replaced or ((run.inserts or run.further) and keeper.wants_snapshot() and not busy):
             started = time.perf_counter()
@@ -289,16 +289,17 @@ class Host:
             effects = self.core.folded(folded)
         self._perform(effects)
 
-    def _tidy(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped]) -> None:
+    def _tidy(self, run: Run, events: Sequence[Judged | Stepped]) -> None:
         """What is done when a Run is told and the solver is not free yet."""
-        if self._reordering is not None and (stepped := self._reordering.after(inserts, events, 0)) is not None:
+        stepped = self._reordering.after(run, events, 0) if self._reordering is not None else None
+        if stepped is not None:
             with self._lock:
                 effects = self.core.stepped(stepped)
             self._do(effects)
 
-    def _tidy_kept(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], keeper: Keeper) -> bool:
+    def _tidy_kept(self, run: Run, events: Sequence[Judged | Stepped], keeper: Keeper) -> bool:
         """The same with a journal; gives whether another solver took the place."""
-        stepped = self._reordering.after(inserts, events, keeper.folds) if self._reordering is not None else None
+        stepped = self._reordering.after(run, events, keeper.folds) if self._reordering is not None else None
         if stepped is not None:
             keeper.hand((), [stepped])
             if not keeper.waits:

@@ -62,6 +62,7 @@ class _Folded:
     number: int
     inserts: Sequence[Arrived]
     events: Events
+    further: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +141,13 @@ class Keeper:
         self._thread.start()
         return problem
 
-    def hand(self, inserts: Sequence[Arrived], events: Events) -> None:
-        """Write down that `inserts` were folded, and what came of it; of none, a further step, or another solver."""
-        if inserts or events:
+    def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False) -> None:
+        """Write down that `inserts` were folded, and what came of it; of none, a `further` step, which may have been
+        refused, or another solver."""
+        if inserts or events or further:
             self._number += 1
             self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
-            self._items.put(_Folded(self._number, inserts, events))
+            self._items.put(_Folded(self._number, inserts, events, further))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
         """Do `call` when all that was handed in so far is told; `dropped` if it never will be."""
@@ -258,7 +260,7 @@ class Keeper:
         folds, last = [], self._last
         for item in batch:
             if isinstance(item, _Folded):
-                fold = written(item.number, item.inserts, item.events, last)
+                fold = written(item.number, item.inserts, item.events, last, item.further)
                 folds.append(fold)
                 last = Last(fold.number, fold.revision, fold.chain)
         try:

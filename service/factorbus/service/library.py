@@ -44,7 +44,8 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
 
 def restored(folder: Folder) -> Restored:
     """How the map in `folder` is."""
-    return Restored(folder.revision, *folder.size, folder.chi2() if folder.revision else 0.0, folder.converged)
+    chi2 = folder.chi2() if folder.revision else 0.0
+    return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished)
 
 
 def log_owner(owner: str) -> None:

@@ -119,7 +119,7 @@ _GAUGES = {
     "revision": "Its revision",
     "chi2": "Sum of squared errors",
     "converged": "1 while the last step had converged",
-    "converging": "1 while it had not, and the map takes further steps by itself",
+    "converging": "1 while the map, left alone, takes further steps by itself to its optimum",
     "clients": "Client names whose sequence is known",
     "waiting": "Inserts that wait for a step",
     "parked": "Inserts that wait for the one before them",

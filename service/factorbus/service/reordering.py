@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from factorbus.service.events import Arrived, Judged, Stepped
+from factorbus.service.events import Arrived, Judged, Run, Stepped
 from factorbus.service.fold import Folder
 from factorbus.solver.errors import SolverError
 
@@ -61,8 +61,8 @@ class Reordering:
         beside = self._beside
         return beside is not None and not beside.orders
 
-    def after(self, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], fold: int) -> Stepped | None:
-        """A Run has ended; gives the step by which another solver took the place of the map's.
+    def after(self, run: Run, events: Sequence[Judged | Stepped], fold: int) -> Stepped | None:
+        """`run` has ended; gives the step by which another solver took the place of the map's.
 
         fold: the number that the journal gives to what was folded.
         """
@@ -71,9 +71,8 @@ class Reordering:
             if self._is_due():
                 self._beside = _Beside(self._folder, fold, self._grown, self._name)
             return None
-        further = any(isinstance(event, Stepped) and event.further for event in events)
-        if inserts or further:
-            beside.note(_tried(inserts, events), further)
+        if run.inserts or run.further:
+            beside.note(_tried(run.inserts, events), run.further)
         stays, taken = beside.go_on()
         if not stays:
             self._beside = None

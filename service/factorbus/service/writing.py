@@ -11,9 +11,11 @@ from factorbus.service.events import Arrived, Judged, Outcome, Stepped
 from factorbus.solver.errors import SolverError
 
 
-def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last) -> Fold:
-    """What is written down of a Run."""
-    present, revision, rebuilt, reordered, further = last.chain, last.revision, False, None, False
+def written(
+    number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last, further: bool = False
+) -> Fold:
+    """What is written down of a Run.  further: it was for a further step, which may have been refused."""
+    present, revision, rebuilt, reordered = last.chain, last.revision, False, None
     outcomes: dict[int, tuple[Outcome, Judged]] = {}
     for event in events:
         if isinstance(event, Judged):
@@ -22,9 +24,8 @@ def written(number: int, inserts: Sequence[Arrived], events: Sequence[Judged | S
         else:
             present, revision = chain.follow(present, event.delta), event.revision
             rebuilt, reordered = rebuilt or event.rebuilt, event.reordered
-            further = event.further and not event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
-    return Fold(number, revision, rebuilt, present, entries, reordered, further)
+    return Fold(number, revision, rebuilt, present, entries, reordered, further and not rebuilt)
 
 
 def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:

@@ -42,6 +42,14 @@ class Problem(Protocol):
         """Move to the point linearised last."""
         ...
 
+    def keep(self) -> None:
+        """Remember the present point."""
+        ...
+
+    def go_back(self) -> None:
+        """Move to the point that was kept, and linearise there anew."""
+        ...
+
 
 class LinearProblem(Problem, Protocol):
     """A problem that can stay linearised where it was."""
@@ -57,6 +65,8 @@ class Rule:
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
     polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
+    nonmonotone: where the first undamped step would raise χ², it and so many in a row at most are made all the same,
+    undamped, until χ² is lower than before them; if it never is, they are taken back.
     """
 
     tolerance: float
@@ -64,6 +74,7 @@ class Rule:
     limit: int
     reuse: float = 0.0
     polish: int = 0
+    nonmonotone: int = 0
 
     def is_negligible(self, decrease: float, chi2: float) -> bool:
         """Whether a decrease of χ² is not worth a step.  False for NaN."""
@@ -72,7 +83,11 @@ class Rule:
 
 @dataclass(slots=True)
 class Course:
-    """How a minimisation went.  failed: the block column whose pivot failed in the last factorisation, or −1."""
+    """How a minimisation went.
+
+    failed: the block column whose pivot failed in the last factorisation, or −1.  left: what the next undamped step
+    would take off χ², as predicted last; infinite where that is not known.
+    """
 
     chi2: float
     damping: float
@@ -80,18 +95,22 @@ class Course:
     factorisations: int = 0
     converged: bool = False
     failed: int = -1
+    left: float = math.inf
 
 
 def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
-    """Lower χ² from where `problem` stands until `rule` says stop.  χ² never rises.
+    """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
 
     Each try: 1. factorise and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
-    3. linearise at its end; 4. accept it if χ² does not rise there, else factorise with more damping.  5. After an
-    undamped step the old factor with the new gradient gives, for the price of one solve, what another step would gain:
-    nothing, and the loop ends; little, and that step is tried as it is; else Λ has changed and is factorised anew.
-    With `have_factor` the loop begins with a factor that is there, as after an undamped step.
+    3. linearise at its end; 4. accept it if χ² does not rise there, else factorise with more damping, or go over the
+    hill where `rule` has non-monotone steps.  5. After an undamped step the old factor with the new gradient gives, for
+    the price of one solve, what another step would gain: nothing, and the loop ends; little, and that step is tried as
+    it is; else Λ has changed and is factorised anew.
+    With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
+    it begins without `damping`, which counts once they have been taken back.
     """
-    course = Course(chi2, damping)
+    hills = rule.nonmonotone
+    course = Course(chi2, 0.0 if hills else damping)
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
         if not solved:
@@ -103,6 +122,7 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
                 break
             decrease, fresh = problem.decrease(), True
         undamped = course.damping == 0.0
+        course.left = decrease if undamped else math.inf
         if undamped and rule.is_negligible(decrease, course.chi2):
             course.converged = True
             break
@@ -112,7 +132,16 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
             if not fresh:
                 continue
             course.converged = undamped and _is_rounding(decrease, course.chi2)
-            if course.converged or not _damp_more(course):
+            if course.converged:
+                break
+            if undamped and hills:
+                over, hills = _go_over_hill(problem, course, reached, hills), 0
+                if over:
+                    continue
+                if damping > 0.0:
+                    course.damping = damping
+                    continue
+            if not _damp_more(course):
                 break
             continue
         problem.accept()
@@ -121,6 +150,7 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
         _damp_less(course, gained, expected=decrease)
         if undamped:
             decrease, fresh = problem.decrease(), False
+            course.left = decrease
             if gained == 0.0:
                 course.converged = True
                 break
@@ -146,6 +176,29 @@ def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
     problem.accept_linear()
     course.chi2, course.iterations = reached, 1
     return course
+
+
+def _go_over_hill(problem: Problem, course: Course, reached: float, most: int) -> bool:
+    """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
+    first, which led to χ² `reached`.
+
+    What turns by much in one step is far off in the model of the second order: χ² rises in the first step, as the
+    turned parts are stretched, and the next ones make them right.  Damped steps go around that hill in hundreds.
+    """
+    problem.keep()
+    for made in range(1, most + 1):
+        if not math.isfinite(reached):
+            break
+        problem.accept()
+        if reached < course.chi2:
+            course.chi2, course.iterations = reached, course.iterations + made
+            return True
+        course.factorisations += 1
+        if problem.factorize(0.0) >= 0 or _is_rounding(problem.decrease(), reached):
+            break
+        reached = problem.linearise_at(problem.step())
+    problem.go_back()
+    return False
 
 
 def _polish(problem: Problem, course: Course, most: int) -> None:

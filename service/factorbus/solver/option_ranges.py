@@ -50,6 +50,7 @@ RANGES = types.MappingProxyType(
         "loop_share": _AMOUNT,
         "negligible": _AMOUNT,
         "max_iterations": _count(0),
+        "nonmonotone_steps": _count(0),
         "settle_tolerance": _AMOUNT,
         "settle_iterations": _count(0),
         "recent_poses": _count(1),

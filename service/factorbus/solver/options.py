@@ -33,6 +33,8 @@ class Options:
     negligible      a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A step whose new
                     factors add less solves nothing, and no step goes on for less
     max_iterations  maxIT: at most this many tries (accepted or not) in an ordinary step; the next step goes on
+    nonmonotone_steps   where an undamped step would raise χ², so many in a row may, until it is lower than before them;
+                    else they are taken back, and Levenberg-Marquardt's damping follows.  0: it is damped at once
     settle_tolerance, settle_iterations   the same for a step that is to converge
     last_pose_last  constrain the ordering: the last pose last, the landmarks seen lately right before it
     recent_poses    "lately": from the last so many poses
@@ -74,6 +76,7 @@ class Options:
     place_new: bool = True
     negligible: float = 1e-12
     max_iterations: int = 10
+    nonmonotone_steps: int = 20
     settle_tolerance: float = 1e-14
     settle_iterations: int = 500
     last_pose_last: bool = True

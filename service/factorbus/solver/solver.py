@@ -16,7 +16,7 @@ from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.upkeep import Upkeep
 from factorbus.solver.edited import edited
 from factorbus.solver.elimination import Elimination
-from factorbus.solver.gauss_newton import Course, Rule, glide, minimise
+from factorbus.solver.gauss_newton import Course, glide, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.groups import Addition, BatchLike, FactorGroup, Group
 from factorbus.solver.incremental import Incremental, Where
@@ -30,6 +30,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.packing import Packing
 from factorbus.solver.report import StepReport, Stopwatch
 from factorbus.solver.ripening import find_ripe, is_held, with_points
+from factorbus.solver.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.strategy import Plan
 from factorbus.solver.symbolic import Symbolic
@@ -42,8 +43,6 @@ _FEW = 8
 # The old R is tried while it served in more than _LEAST_TRUST + _DEAR · (factors per variable) of the steps that tried
 # lately: a try that fails costs two linearisations, one that does not saves a factorisation.
 _LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
-_REUSE = 0.05
-_POLISH = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +50,7 @@ class _Done:
     """Where the last step left things: what a failed step goes back to.
 
     unsolved: χ² of the factors taken in since the system was last solved; infinite if that had not converged.
+    finished: nothing has moved since another step would have taken no more than a share `FINISHED` off χ².
     batch: variables when the whole system was last solved anew, which the modes with forced batches count from.
     """
 
@@ -60,6 +60,7 @@ class _Done:
     unsolved: float = 0.0
     damping: float = 0.0
     batch: int = 0
+    finished: bool = True
 
 
 _VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Where)})
@@ -140,14 +141,14 @@ class Solver:
             plan = self._follow(suspects, watch)
             # 4. Solve, if there is anything to solve.
             because = self._reason_to_solve(added, settle, suspects)
-            batch = settle or self._is_batch_due()
-            course = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
+            batch = settle or self._goes_on or self._is_batch_due()
+            course, finished = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
         except BaseException:
             self._take_back()
             raise
         # 5. Remember where this leaves things, and account for it.
         report = self._report(course, added, self._told(plan, because, batch), watch)
-        self._commit(course, added, solved=bool(because), batch=batch)
+        self._commit(course, added, bool(because), batch, finished)
         return report
 
     def estimate(self) -> list[Group]:
@@ -173,9 +174,9 @@ class Solver:
     def unfinished(self) -> bool:
         """Whether a step with nothing staged may bring the estimate nearer to the optimum by what χ² shows.
 
-        That is so where a step has not converged, and in the mode "tree" also by as much as one that has leaves undone.
+        That is so where a step has not converged, and also by as much as one that has leaves undone.
         """
-        return self._tree.unfinished if self._tree else not bool(np.isfinite(self._done.unsolved))
+        return self._tree.unfinished if self._tree else not self._done.finished
 
     def ripe(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
@@ -339,11 +340,18 @@ class Solver:
             return f"{suspects.size} new variables are held only by several factors together"
         if not np.isfinite(self._done.unsolved):
             return "the last step had not converged"
+        if self._goes_on:
+            return "nothing is new: to the optimum"
         if self._system.drifted and self._is_batch_due():
             return "a batch is due"
         if self._done.unsolved + added > self._options.negligible:
             return f"new factors add {added:.3g} to χ²"
         return ""
+
+    @property
+    def _goes_on(self) -> bool:
+        """Nothing is staged, and there is still something to gain."""
+        return not self._done.finished and self._graph.mark() == self._done.graph
 
     def _is_batch_due(self) -> bool:
         every = self._mode.batch_every
@@ -359,14 +367,16 @@ class Solver:
             return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
         return self._system.factor.fold(self._graph, self._system.blocks, self._done.graph, watch)
 
-    def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> Course:
-        """Gauss-Newton from the present values, or between forced batches one linear step."""
+    def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> tuple[Course, bool]:
+        """Gauss-Newton from the present values, or between forced batches one linear step; and whether that is the
+        optimum to what χ² shows."""
         system, options, chi2 = self._system, self._options, self._done.chi2 + added
-        rule = Rule(
-            options.tol if self._mode.updates else options.tolerance, options.negligible, options.max_iterations
-        )
+        tolerance = options.tol if self._mode.updates else options.tolerance
+        rule, goes_on = ordinary_rule(options, tolerance), self._goes_on and not settle
         if settle:
-            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH)
+            rule = settling_rule(options)
+        elif goes_on:
+            rule = further_rule(options, tolerance)
         system.begin(suspects, watch)
         course = None
         if self._mode.batch_every and not batch:
@@ -374,14 +384,17 @@ class Solver:
         if course is None:
             if self._mode.batch_every:
                 system.relinearise()
-            have_factor = self._done.damping == 0.0 and system.factor.serve()
+            have_factor = self._done.damping == 0.0 and not goes_on and system.factor.serve()
             course = minimise(system, chi2, self._done.damping, rule, have_factor)
             if not (self._mode.updates and course.converged and self._keeps(have_factor, course)):
                 system.have_lambda()
         if course.failed >= 0 and course.iterations == 0:
             raise system.underconstrained(system.variable_of(course.failed))
         self._changed = system.end(self._done.graph[at.VARIABLES])
-        return course
+        finished = course.converged and (settle or goes_on)
+        if goes_on:
+            course.converged |= ordinary_rule(options, tolerance).is_negligible(course.left, course.chi2)
+        return course, finished
 
     def _keeps(self, had_factor: bool, course: Course) -> bool:
         """Whether R is to stay in use at the new linearisation point.
@@ -399,16 +412,16 @@ class Solver:
         dear = _LEAST_TRUST + _DEAR * self.factor_count / self.variable_count
         return self._trust > dear or self._moves % _TRY_AGAIN == 0
 
-    def _extend(self, added: float) -> Course:
+    def _extend(self, added: float) -> tuple[Course, bool]:
         """Nothing moves: what is new has the values it was given or composed to."""
         self._changed = np.arange(self._done.graph[at.VARIABLES], self.variable_count)
-        return Course(self._done.chi2 + added, damping=0.0, converged=True)
+        return Course(self._done.chi2 + added, damping=0.0, converged=True), self._done.finished
 
     def _take_back(self) -> None:
         self._graph.forget(self._done.graph)
         self._system.take_back(self._done.fill)
 
-    def _commit(self, course: Course, added: float, solved: bool, batch: bool) -> None:
+    def _commit(self, course: Course, added: float, solved: bool, batch: bool, finished: bool) -> None:
         unsolved = self._done.unsolved + added
         if solved:
             unsolved = 0.0 if course.converged else np.inf
@@ -420,6 +433,7 @@ class Solver:
             unsolved,
             0.0 if course.converged else course.damping,
             self.variable_count if batch else self._done.batch,
+            finished,
         )
 
     def _told(self, plan: Plan, because: str, batch: bool) -> Plan:

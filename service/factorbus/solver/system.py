@@ -20,13 +20,14 @@ _FREE_DIRECTION = (
 class System:
     """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
 
-    NOT_KEPT = ("_before", "_moved", "_suspects", "_trial", "_watch", "graph")
+    NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
 
     def __init__(self, graph: Graph, factor: Incremental) -> None:
         self.graph = graph
         self.blocks = Blocks()
         self.factor = factor
         self._before: F64 = np.zeros(0)
+        self._kept: F64 = np.zeros(0)
         self._trial: F64 = np.zeros(0)
         self._moved = False
         self._have_lambda, self.drifted = True, False
@@ -82,6 +83,15 @@ class System:
         self.blocks.swap_eta()
         self.factor.turned()
         self._have_lambda, self._spare_is_here, self._moved = False, True, True
+
+    def keep(self) -> None:
+        """Remember the values as they are."""
+        self._kept = self.graph.values[: self.graph.counts[at.VALUES]].copy()
+
+    def go_back(self) -> None:
+        """The values that were kept; Λ and η are made there anew."""
+        self.graph.values[: self._kept.size] = self._kept
+        self.anew()
 
     def accept_linear(self) -> None:
         """Move to the point linearised last; Λ, R and the linear model stay, whose gradient is zero there."""

@@ -12,7 +12,7 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.elimination import Elimination
-from factorbus.solver.gauss_newton import Course, Rule, minimise
+from factorbus.solver.gauss_newton import Course, minimise
 from factorbus.solver.graph import Graph, Mark
 from factorbus.solver.incremental import Incremental
 from factorbus.solver.kernels import layout as at
@@ -23,17 +23,17 @@ from factorbus.solver.kernels.move import differing
 from factorbus.solver.kernels.tree_step import FINISHED, LEAST_CHI2
 from factorbus.solver.options import Options
 from factorbus.solver.report import Shares, StepReport, Stopwatch
+from factorbus.solver.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
 
 _START: Mark = (0,) * at.COUNTS
-_POLISH = 100
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
 _COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
 _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
-_FINISHED_LEFT = 1e-6
+_FINISHED_LEFT = 1e-7
 # By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
 _AT_END = 1e-6
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
@@ -136,13 +136,14 @@ class TreeSteps:
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
         chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
         course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
-        goes_on = after & tl.RAISED and self._graph.mark() == self._mark and not self._is_within(_AT_END, chi2)
+        continues = self._graph.mark() == self._mark
+        goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
         if settle or worse or rises or goes_on:
             tree.exchange()
             before = self._graph.values.copy()
             if not worse:
                 tree.exchange()
-            course = self._batch(before, settle)
+            course = self._batch(before, settle, continues)
             because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
@@ -180,19 +181,19 @@ class TreeSteps:
         system.factor.moved()
         return system
 
-    def _batch(self, before: F64, settle: bool) -> Course:
+    def _batch(self, before: F64, settle: bool, continues: bool) -> Course:
         """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows, and stays where they
         end if its own step from there would raise χ².
 
-        before: the values as they were before the step
+        before: the values as they were before the step.  continues: with nothing new
         """
         options, self.before_batch = self._options, before
         system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
-        rule = Rule(options.tolerance, options.negligible, options.max_iterations)
+        rule = (further_rule if continues else ordinary_rule)(options, options.tolerance)
         if settle:
-            rule = Rule(options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH)
+            rule = settling_rule(options)
         course = minimise(system, chi2, 0.0, rule)
         if course.iterations or not settle:
             self._tree.move_all()

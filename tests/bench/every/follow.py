@@ -33,14 +33,15 @@ class Seen:
 class Followed:
     """A drive and its rest.
 
-    seen: the steps that were judged.  idle: those without anything new that followed, until one said `converged` and
-    moved nothing; done: whether it came to that.  steps_s, idle_s: seconds that the solver took for each part.
-    oracle_off: the most that judge and oracle differ, as a share of χ².
+    seen: the steps that were judged.  idle: those without anything new that followed, until nothing was left to do;
+    done: whether it came to that, with a report that says `converged`.  rest: where that ended.  steps_s, idle_s:
+    seconds that the solver took for each part.  oracle_off: the most that judge and oracle differ, as a share of χ².
     """
 
     seen: list[Seen]
     idle: list[Seen]
     done: bool
+    rest: Look
     steps_s: float
     idle_s: float
     oracle_off: float
@@ -65,8 +66,9 @@ def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int 
             off = max(off, _disagreement(judge, oracle, solver.estimate()))
         if k % every == every - 1 or k == len(steps) - 1 or not report.converged:
             seen.append(Seen(k, judge.look(solver.estimate()), report, judge.chi2(before) if before else None))
-    idle, done, idle_s = _leave_alone(solver, judge, len(steps))
-    return Followed(seen, idle, done, seconds, idle_s, off)
+    idle, done, idle_s = _leave_alone(solver, judge, len(steps), seen[-1].report)
+    rest = judge.look(solver.estimate(), coarse=FINE)
+    return Followed(seen, idle, done, rest, seconds, idle_s, off)
 
 
 def _disagreement(judge: Judge, oracle: Oracle, estimate: Sequence[Group]) -> float:
@@ -76,15 +78,14 @@ def _disagreement(judge: Judge, oracle: Oracle, estimate: Sequence[Group]) -> fl
     return max(abs(mine - its) / max(its, UNIT) for mine, its in pairs)
 
 
-def _leave_alone(solver: Solver, judge: Judge, first: int) -> tuple[list[Seen], bool, float]:
+def _leave_alone(solver: Solver, judge: Judge, first: int, report: StepReport) -> tuple[list[Seen], bool, float]:
     """Step without anything new, as a service does when nothing comes, until there is nothing left to do."""
-    seen, done, seconds = [], False, 0.0
-    while not done and seconds < MOST_IDLE_S:
+    seen, seconds = [], 0.0
+    while (solver.unfinished or not report.converged) and seconds < MOST_IDLE_S:
         before = solver.estimate()
         start = time.perf_counter()
         report = solver.step()
         seconds += time.perf_counter() - start
         look = judge.look(solver.estimate(), coarse=FINE)
         seen.append(Seen(first + len(seen), look, report, judge.chi2(before)))
-        done = report.converged and not report.changed
-    return seen, done, seconds
+    return seen, report.converged and not solver.unfinished, seconds

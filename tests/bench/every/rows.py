@@ -31,7 +31,7 @@ def row_of(world: str, seed: int, steps: int, found: Followed, isam2: tuple[list
         "idle_steps": len(found.idle),
         "idle_s": found.idle_s,
         "idle_done": found.done,
-        "idle_ratio": found.idle[-1].look.ratio,
+        "idle_ratio": found.rest.ratio,
         "steps_s": found.steps_s,
         "oracle_off": found.oracle_off,
         "ratios": [look.ratio for look in looks],

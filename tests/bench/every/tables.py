@@ -24,8 +24,8 @@ _NAME = 14
 LEGEND = """\
 p50, p99, max: χ² of the estimate over that of the batch optimum from there.  odo σ: the most that √(rᵀΩr) of a new
 odometry factor exceeds the optimum's.  unconv: steps that said they have not converged; w.conv: the worst of those
-that said they have.  untrue: the most that a report's χ² is off.  idle: steps without anything new until one says that
-it is done; off: χ² over the optimum's then, less 1.  Behind the bar: GTSAM's iSAM2 (0.1, skip 1), by its own error
+that said they have.  untrue: the most that a report's χ² is off.  idle: steps without anything new until nothing is
+left to do; off: χ² over the optimum's then, less 1.  Behind the bar: GTSAM's iSAM2 (0.1, skip 1), by its own error
 function and optimum; *: not by Cholesky, or not to the end, as `isam2_note` of the document says."""
 
 

@@ -63,7 +63,7 @@ LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
-FINISHED = 1e-7  # a step with nothing new goes on while Σ error² is more than this share of χ²
+FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
 ENOUGH = 0.25  # of `converged_share`
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
