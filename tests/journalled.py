@@ -18,10 +18,12 @@ from factorbus.client.map import Map
 from factorbus.client.ticket import Ticket
 from factorbus.journal.store import open_store
 from factorbus.proto.messages import Batch
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.solver import Options, Solver
 
 NURSERY = str(Path(__file__).parent / "system" / "journal_nursery.py")
 SIGMAS = (0.1, 0.1, 0.05)
+T0 = 1_403_636_579_763_555_584  # nanoseconds
 T = TypeVar("T")
 
 
@@ -84,9 +86,9 @@ def _pair(setting: str) -> tuple[str, str]:
 
 def drafts(count: int) -> list[Batch]:
     """A robot that goes round and round a noisy loop, and sees where it was."""
-    noise, made = np.random.default_rng(7), [Draft().se2("x0", (0, 0, 0), fixed=True).batch()]
+    noise, made = np.random.default_rng(7), [Draft().se2("x0", (0, 0, 0), fixed=True, stamp=T0).batch()]
     for n in range(1, count):
-        draft = Draft().se2(f"x{n}")
+        draft = Draft().se2(f"x{n}", stamp=None if n % 7 == 3 else T0 + n)
         draft.between_se2(f"x{n - 1}", f"x{n}", noise.normal((1, 0, 0.3), 0.02), sigmas=SIGMAS)
         if n >= 21 and n % 5 == 0:
             draft.between_se2(f"x{n - 21}", f"x{n}", noise.normal((0, 0, 0.02), 0.02), sigmas=SIGMAS)
@@ -145,7 +147,7 @@ def check_journal(folder: Path, sent: int) -> list[list[int]]:
     return groups
 
 
-def uninterrupted(mode: str, batches: list[Batch], groups: list[list[int]]) -> dict[int, bytes]:
+def uninterrupted(mode: str, batches: list[Batch], groups: list[list[int]]) -> dict[int, tuple[bytes, int]]:
     """The estimate of a solver that was never stopped, after the same steps."""
     solver = Solver(Options(mode=mode))
     for group in groups:
@@ -155,5 +157,11 @@ def uninterrupted(mode: str, batches: list[Batch], groups: list[list[int]]) -> d
     return rows(solver.estimate())
 
 
-def rows(groups: Any) -> dict[int, bytes]:
-    return {int(key): row.tobytes() for g in groups for key, row in zip(g.keys, g.values, strict=True)}
+def rows(groups: Any) -> dict[int, tuple[bytes, int]]:
+    """The value of each variable, bit for bit, and its time stamp."""
+    found: dict[int, tuple[bytes, int]] = {}
+    for group in groups:
+        stamps = np.full(group.keys.size, NO_STAMP) if group.stamps is None else group.stamps
+        columns = zip(group.keys.tolist(), group.values, stamps.tolist(), strict=True)
+        found |= {key: (row.tobytes(), stamp) for key, row, stamp in columns}
+    return found

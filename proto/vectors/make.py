@@ -38,6 +38,7 @@ from factorbus.proto.messages import (
     Variables,
 )
 from factorbus.proto.problems import BetterOptimum, Busy
+from factorbus.proto.stamps import LEAST_STAMP, NO_STAMP
 from factorbus.proto.symbols import symbol
 
 _COLUMNS = {"keys": "i64", "values": "f64", "measured": "f64", "information": "f64", "scale": "f64"}
@@ -47,6 +48,8 @@ _COLUMNS |= dict.fromkeys(("covariance", "distance", "threshold", "gain", "dista
 _COLUMNS |= dict.fromkeys(("plausible", "matched"), "u8")
 # Of changes and repairs, §17.
 _COLUMNS |= {"factors": "i64", "ids": "i64", "weight": "f64"}
+# Of variables, §4.
+_COLUMNS |= {"stamps": "i64"}
 
 
 def main() -> None:
@@ -75,6 +78,10 @@ def vectors() -> dict[str, bytes]:
         "insert_marginalise": codec.encode_insert(
             Insert(9, Batch(), epoch=7, changes=(Change("marginalise", keys=np.array([symbol("x", 1)])),))
         ),
+        "insert_stamps": codec.encode_insert(Insert(11, Batch(_stamped(), (_odometry(0), _odometry(1))), epoch=7)),
+        "estimate_stamps": codec.encode_estimate(Estimate(7, 3, _stamped())),
+        "delta_stamps": codec.encode_delta(Delta(7, 3, 2, _stamped()[1:], report)),
+        "graph_stamps": codec.encode_graph(Graph(7, 3, Batch(_stamped(), (_odometry(0), _odometry(1))))),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         "accepted": codec.encode_accepted(Accepted(1, 7, 1, 0, 1, report)),
         # What readers do without: `report` is optional.
@@ -193,6 +200,16 @@ def _poses(first: int, values: Any = None, fixed: bool = False) -> Variables:
     rows = None if values is None else np.array(values, float)
     count = 1 if rows is None else len(rows)
     return Variables("se2", np.array([symbol("x", first + i) for i in range(count)]), rows, fixed)
+
+
+def _stamped() -> tuple[Variables, ...]:
+    """A fixed pose at the time 0; two, of which one has a time and the other none; a point with the least there is."""
+    first, both = _poses(first=0, values=[[0, 0, 0]], fixed=True), [[1.5, 0.25, 0.125], [3.0, 0.75, 0.25]]
+    return (
+        first._replace(stamps=np.array([0])),
+        _poses(first=1, values=both)._replace(stamps=np.array([1_403_636_579_763_555_584, NO_STAMP])),
+        Variables("point2", np.array([symbol("l", 1)]), np.array([[3.0, 4.0]]), True, np.array([LEAST_STAMP])),
+    )
 
 
 def _odometry(first: int) -> Factors:

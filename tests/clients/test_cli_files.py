@@ -3,12 +3,16 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from factorbus.cli import reading
+from factorbus.cli.columns import merged
 from factorbus.cli.exits import BAD_FILE, OK, REFUSED, USAGE
 from factorbus.cli.main import main
-from factorbus.formats import DIALECTS, IDS, read
+from factorbus.formats import IDS, READS, read
+from factorbus.proto.messages import Batch, Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 
 INFO3 = "1 0 0 1 0 1"
@@ -34,7 +38,7 @@ def robots() -> str:
 
 
 def test_the_options_are_those_of_the_reader_and_the_writer() -> None:
-    assert set(reading.DIALECTS) == set(DIALECTS)
+    assert set(reading.DIALECTS) == set(READS)
     assert set(reading.IDS) == set(IDS) - {"apart"}
 
 
@@ -48,6 +52,33 @@ def test_convert_says_what_it_leaves_out(folder: Path, capsys: pytest.CaptureFix
     assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
     assert told["read"]["notes"] == [line[7:] for line in shown.err.splitlines() if line.startswith("a.g2o: ")]
     assert (told["files"], told["poses"], told["factors"]) == (["b.g2o"], 5, 4)
+
+
+def test_a_trajectory_is_converted_with_its_times(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pose = "1.0 2.0 3.0 0.0 0.0 0.6 0.8\n"
+    way = f"1403636579.763555584 {pose}1403636579.863555585 {pose}"
+    (folder / "a.tum").write_text(f"# time tx ty tz qx qy qz qw\n{way}")
+    assert main(["convert", "a.tum", "b.tum"]) == OK
+    assert (folder / "b.tum").read_text() == way
+    assert main(["convert", "a.tum", "c.kitti"]) == OK
+    assert len((folder / "c.kitti").read_text().splitlines()) == 2
+    capsys.readouterr()
+    assert main(["convert", "a.tum", "d.g2o"]) == OK
+    assert "d.g2o: 2 time stamps left out: g2o has no record for when a se3 was" in capsys.readouterr().err
+    assert read(folder / "d.g2o").poses == 2
+    assert main(["convert", "a.tum", "e.g2o", "--strict"]) == BAD_FILE
+    assert not (folder / "e.g2o").exists()
+    capsys.readouterr()
+    assert main(["replay", "a.tum", "--in-process"]) == BAD_FILE
+    assert "a.tum: a trajectory, which has no measurements; wanted a graph, with its factors" in capsys.readouterr().err
+
+
+def test_batches_put_together_keep_their_time_stamps() -> None:
+    groups = [Variables("se2", np.array([n]), None, False, np.array([7]) if n == 2 else None) for n in range(3)]
+    (together,) = merged(Batch((group,)) for group in groups).variables
+    assert together.stamps is not None
+    assert together.stamps.tolist() == [NO_STAMP, NO_STAMP, 7]
+    assert merged([Batch((groups[0],))]).variables[0].stamps is None
 
 
 def test_strict_refuses_and_writes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,7 @@ class Source:
         from factorbus.client.mirror import Snapshot
 
         keys = np.arange(self.last.revision)
-        return Snapshot(1, self.last.revision, {"point2": (keys, np.ones((len(keys), 2)))})
+        return Snapshot(1, self.last.revision, {"point2": (keys, np.ones((len(keys), 2)))}, {"point2": keys})
 
     def step(self) -> None:
         self.last = Delta(1, self.last.revision + 1, self.last.revision, ())
@@ -50,6 +50,7 @@ def test_a_reader_that_falls_behind_gets_the_whole_estimate() -> None:
     assert (whole.previous, whole.revision) == (0, 10)
     assert [type(group) for group in whole.variables] == [Variables]
     assert len(whole.variables[0].keys) == 10
+    assert whole.variables[0].stamps.tolist() == list(range(10))
     assert stream.try_take() is None
     source.step()
     assert stream.try_take().revision == 11

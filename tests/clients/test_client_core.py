@@ -1,5 +1,7 @@
 """The pure parts of the client: what a reply means, numbering, following deltas, drafting."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,6 +18,7 @@ from factorbus.proto.problems import (
     BadInformation,
     BadSequence,
     BadShape,
+    BadStamp,
     BadSymbol,
     Busy,
     Problem,
@@ -24,6 +27,7 @@ from factorbus.proto.problems import (
     UnknownKind,
     WrongEpoch,
 )
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 
 
@@ -221,21 +225,56 @@ def test_whatever_is_lost_a_live_mirror_is_bitwise_the_map(losses: list[bool], a
             assert dict(zip(keys_now.tolist(), values[:, 0].tolist(), strict=True)) == truth
 
 
-@given(st.lists(st.lists(st.integers(0, 40), min_size=1, max_size=20, unique=True), max_size=12))
-def test_a_table_is_a_dictionary(puts: list[list[int]]) -> None:
+@given(st.lists(st.lists(st.integers(0, 40), min_size=1, max_size=20, unique=True), max_size=12), st.booleans())
+def test_a_table_is_a_dictionary(puts: list[list[int]], stamped: bool) -> None:
+    """Every third has a time stamp, if any: it comes with the first value, and may be told again or not."""
     table, truth = Table(2), {}
     for turn, keys in enumerate(puts):
         values = np.array([[turn, key] for key in keys], float)
-        table.put(np.array(keys), values)
+        stamps = np.array([NO_STAMP if key % 3 else -key for key in keys]) if stamped else None
+        table.put(np.array(keys), values, None if turn % 2 and set(keys) <= set(truth) else stamps)
         truth |= {key: value.tolist() for key, value in zip(keys, values, strict=True)}
     keys, values = table.columns()
     assert keys.tolist() == sorted(truth)
     assert {key: value.tolist() for key, value in zip(keys.tolist(), values, strict=True)} == truth
     assert all(table.get(key).tolist() == value for key, value in truth.items())
     assert table.get(99) is None
+    times = [-key if stamped and key % 3 == 0 else None for key in sorted(truth)]
+    assert [table.stamp(key) for key in sorted(truth)] == times
+    assert table.stamps().tolist() == [NO_STAMP if time is None else time for time in times]
+    assert table.stamp(99) is None
 
 
 # ---- drafting -----------------------------------------------------------------------------------------------------
+
+
+NS = 1_403_636_579_763_555_584
+
+
+@pytest.mark.parametrize("stamp", [0, -1, NS, np.int64(NS), np.uint64(NS), np.int32(5), NO_STAMP + 1, 2**63 - 1])
+@pytest.mark.parametrize("kind", ["se2", "se3", "point2", "point3", "idp"])
+def test_a_draft_keeps_every_digit_of_a_time_stamp(kind: str, stamp: int) -> None:
+    draft = getattr(Draft(), kind)("x1", stamp=stamp)
+    getattr(draft, kind)("x2")
+    (group,) = draft.batch().variables
+    assert group.stamps is not None
+    assert (group.stamps.dtype, group.stamps.tolist()) == (np.int64, [int(stamp), NO_STAMP])
+
+
+def test_a_draft_without_time_stamps_has_no_column_of_them() -> None:
+    assert all(g.stamps is None for g in Draft().se2("x1").point2("l1", (0, 0), stamp=None).batch().variables)
+
+
+@pytest.mark.parametrize(
+    "stamp", [1.0, 1.5e9, math.nan, np.float64(NS), True, np.bool_(True), "12", b"1", 2**63, -(2**63), [1], NS * 1j]
+)
+def test_what_is_no_time_stamp_is_refused_with_a_word_on_nanoseconds(stamp: object) -> None:
+    draft = Draft()
+    with pytest.raises(BadStamp, match=r"se2 x3: stamp is .*; wanted whole nanoseconds") as refused:
+        draft.se2("x3", (0, 0, 0), stamp=stamp)  # type: ignore[arg-type]
+    assert refused.value.code == "bad_stamp"
+    assert refused.value.detail["where"] == "se2 x3"
+    assert draft.batch().variable_count == 0
 
 
 def test_a_draft_becomes_columns() -> None:

@@ -119,10 +119,25 @@ def test_changes_that_would_be_skipped_are_not_sent(tmp_path: Path, protocol: di
         service.close()
 
 
+@pytest.mark.parametrize("fields", [None, ["kind", "keys", "values", "fixed"]])
+def test_time_stamps_that_would_be_skipped_are_not_sent(tmp_path: Path, fields: list[str] | None) -> None:
+    protocol = {name: value for name, value in known().items() if name != "variable_fields"}
+    service = Older(tmp_path, protocol | ({} if fields is None else {"variable_fields": fields}))
+    try:
+        with connect(endpoint_in(tmp_path)) as bus, bus.map(MAP, mirror=False) as kitchen:
+            with pytest.raises(NotSupported) as refused:
+                kitchen.insert(Draft().point2("l1", (1, 2), stamp=0))
+            assert refused.value.detail["what"] == "time stamps of variables"
+            assert kitchen.insert(Draft().point2("l1", (1, 2))).sequence == 1, "its number was not used"
+    finally:
+        service.close()
+
+
 def test_what_it_knows_is_sent(tmp_path: Path) -> None:
     service = Older(tmp_path, known())
     try:
         with connect(endpoint_in(tmp_path)) as bus, bus.map(MAP, mirror=False) as kitchen:
             assert kitchen.change(Changes().weigh([0], 0.5)).sequence == 1
+            assert kitchen.insert(Draft().point2("l1", (1, 2), stamp=5)).sequence == 2
     finally:
         service.close()

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,11 @@ def robot(built: Path, endpoint: str, name: str) -> "subprocess.CompletedProcess
     return run(built / "robot", host, port, name)
 
 
+def stamps(text: str) -> dict[str, int]:
+    """The time stamps of poses, by key, as they are shown last."""
+    return {key: int(stamp) for key, stamp in re.findall(r"^(x\d+) .* at (-?\d+) ns$", text, re.M)}
+
+
 def poses(text: str) -> list[tuple[int, dict[str, list[float]]]]:
     """(revision, values by key) of each time they are shown."""
     shown: list[tuple[int, dict[str, list[float]]]] = []
@@ -60,7 +66,7 @@ def poses(text: str) -> list[tuple[int, dict[str, list[float]]]]:
         if line.endswith(":"):
             shown.append((int(re.findall(r"revision (\d+)", line)[0]), {}))
         else:
-            key, *numbers = line.split()
+            key, *numbers = line.partition(" at ")[0].split()
             shown[-1][1][key] = [float(number) for number in numbers]
     return shown
 
@@ -117,6 +123,10 @@ def test_a_robot_in_c_drives(built: Path, endpoint: str) -> None:
         for key, value in after.items():
             np.testing.assert_array_equal(looked.estimate[key], value)
         assert len(after) == len(looked.estimate) == 5
+        seen = {key: looked.estimate.stamp(key) for key in after}
+        assert stamps(ran.stdout) == seen
+        assert sorted(seen.values()) == list(seen.values())
+        assert abs(seen["x4"] - time.time_ns()) < 400e9
     assert np.hypot(*before["x4"][:2]) > 0.05
     assert np.hypot(*after["x4"][:2]) < np.hypot(*before["x4"][:2]) / 10
 

@@ -17,11 +17,17 @@ from turned import closing, in_one
 from factorbus.cli.exits import OK, USAGE
 from factorbus.cli.main import main
 from factorbus.client import Draft, connect
+from factorbus.proto.messages import Delta, Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 from factorbus.simulate import city_trees, manhattan
 from factorbus.viz import style
 
 pytest.importorskip("starlette")
+
+from factorbus.gateway.live import _together
+
+T0 = 1_403_636_579_763_555_584
 
 
 @pytest.fixture
@@ -47,8 +53,9 @@ def refusal(address: str, **headers: str) -> tuple[int, str]:
 
 def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None:
     with connect(endpoint, client="robot") as bus, bus.map("asked") as joined:
-        for step in city_trees(poses=80, seed=3):
-            joined.insert(step.batch)
+        for n, step in enumerate(city_trees(poses=80, seed=3)):
+            pose, *others = step.batch.variables
+            joined.insert(step.batch._replace(variables=(pose._replace(stamps=np.array([T0 + n])), *others)))
         joined.wait_converged(60)
         snapshot, graph = joined.estimate.snapshot(), joined.graph().batch
         root = f"{gateway}/api/maps/asked"
@@ -59,6 +66,8 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
             keys, values = snapshot.columns[group["kind"]]
             assert group["keys"] == [format_symbol(key) for key in keys.tolist()]
             np.testing.assert_array_equal(group["values"], values)
+            times = [str(T0 + n) for n in range(80)] if group["kind"] == "se2" else None
+            assert group.get("stamps") == times, "as text, which JavaScript does not round"
         assert sum(len(group["keys"]) for group in get(f"{root}/graph")["factors"]) == graph.factor_count
         assert get(f"{root}/stats")["factors"] == graph.factor_count
         assert get(f"{root}/export?format=kitti") == joined.export("kitti")
@@ -82,6 +91,25 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
         for key, *local in zip(spread["keys"], xx + yy, xx * yy - xy * xy, strict=True):
             block = covariances[key][:2, :2]  # turned into the map: the same trace and determinant
             np.testing.assert_allclose(local, [np.trace(block), np.linalg.det(block)], rtol=1e-9, atol=1e-15)
+
+
+def test_time_stamps_come_with_what_is_sent_live() -> None:
+    """Deltas of which a browser is told at once: the last value of each, and the stamp whenever it came."""
+
+    def delta(revision: int, keys: list[int], stamps: list[int] | None) -> Delta:
+        column = None if stamps is None else np.array(stamps)
+        group = Variables("point2", np.array(keys), np.full((len(keys), 2), float(revision)), False, column)
+        return Delta(1, revision, revision - 1, (group,))
+
+    (group,) = _together([delta(5, [1, 2], [-T0, NO_STAMP]), delta(6, [1, 3], None)])["variables"]
+    assert group == {
+        "kind": "point2",
+        "keys": ["1", "2", "3"],
+        "values": [[6.0, 6.0], [5.0, 5.0], [6.0, 6.0]],
+        "stamps": [str(-T0), None, None],
+    }
+    (group,) = _together([delta(6, [1], None)])["variables"]
+    assert "stamps" not in group
 
 
 def test_a_contradiction_is_named(endpoint: str, gateway: str) -> None:

@@ -17,10 +17,15 @@ from factorbus.cli.columns import merged
 from factorbus.cli.exits import FAILED, OK
 from factorbus.cli.main import main
 from factorbus.client import connect
+from factorbus.proto.messages import Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.simulate import city_trees
 
 pytest.importorskip("foxglove")
+
+from factorbus.viz.lookout import Look
+from factorbus.viz.mcap import Recording
 
 
 def messages(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
@@ -41,20 +46,30 @@ def messages(path: Path) -> tuple[dict[str, list[Any]], dict[str, str]]:
     return found, schemas
 
 
+T0 = 1_403_636_579_763_555_584
+
+
+def stamped(group: Variables, n: int) -> Variables:
+    """Of the n-th step; of a pose, but for every fifth."""
+    return group._replace(stamps=np.array([T0 + n])) if group.kind == "se2" and n % 5 != 2 else group
+
+
 def test_a_recording_has_every_estimate_and_every_factor(
     endpoint: str, spawn: Callable[..., Process], tmp_path: Path
 ) -> None:
     steps = list(city_trees(poses=120, seed=5))
+    timed = [step.batch._replace(variables=tuple(stamped(group, n) for group in step.batch.variables))
+             for n, step in enumerate(steps)]  # fmt: skip
     with connect(endpoint, client="robot") as bus, bus.map("taped") as joined:
-        for step in steps[:40]:
-            joined.insert(step.batch)
+        for batch in timed[:40]:
+            joined.insert(batch)
         path = tmp_path / "tape.mcap"
         recorder = spawn(
             "-m", "factorbus.cli", "record", "taped", "--connect", endpoint, "--out", str(path), "--every", "0.1"
         )
         assert recorder.ready() == [str(path)]
-        for step in steps[40:]:
-            joined.insert(step.batch)
+        for batch in timed[40:]:
+            joined.insert(batch)
         joined.wait_converged(60)
         last, graph = joined.estimate.snapshot(), joined.graph().batch
         recorder.signal(signal.SIGINT)
@@ -65,18 +80,22 @@ def test_a_recording_has_every_estimate_and_every_factor(
         "/map/step": "factorbus.Step", "/map/delta": "factorbus.Delta", "/map/factors": "factorbus.Factors",
     }  # fmt: skip
     # Replaying the deltas gives the estimate at the end, bit for bit.
-    estimate, revision = {}, 0
+    estimate, stamps, revision = {}, {}, 0
     for delta in found["/map/delta"]:
         assert delta["previous"] in (0, revision)
         revision = delta["revision"]
         for group in delta["variables"]:
             estimate |= dict(zip(group["keys"], group["values"], strict=True))
+            if "stamps" in group:
+                stamps |= dict(zip(group["keys"], group["stamps"], strict=True))
     wanted = {
         format_symbol(key): value.tolist()
         for keys, values in last.columns.values()
         for key, value in zip(keys.tolist(), values, strict=True)
     }
     assert (revision, estimate) == (last.revision, wanted)
+    known = {key: stamp for key, stamp in stamps.items() if stamp is not None}
+    assert known == {f"x{n}": str(T0 + n) for n in range(120) if n % 5 != 2}, "all digits, as text"
     # Every factor once, in order.
     for group in graph.factors:
         mine = [each for each in found["/map/factors"] if each["kind"] == group.kind]
@@ -94,8 +113,23 @@ def test_a_recording_has_every_estimate_and_every_factor(
     assert len(scene["landmarks"].spheres) == len(last.columns["point2"][0])
     pose = found["/tf"][-1]
     assert (pose.parent_frame_id, pose.child_frame_id) == ("map", "x")
+    assert (pose.timestamp.seconds, pose.timestamp.nanos) == divmod(T0 + 119, 10**9), "when the pose was"
     assert [pose.translation.x, pose.translation.y] == last.columns["se2"][1][-1, :2].tolist()
     assert len(found["/map/poses"][-1].poses) == 120
+
+
+@pytest.mark.parametrize(
+    ("stamp", "told"), [(NO_STAMP, 7), (-1, 7), (0, 0), (2**32 * 10**9 - 1, 2**32 * 10**9 - 1), (2**32 * 10**9, 7)]
+)
+def test_a_transform_has_the_time_of_its_pose_where_there_is_a_place_for_it(
+    tmp_path: Path, stamp: int, told: int
+) -> None:
+    poses = Variables("se2", np.array([parse_symbol("x1")]), np.zeros((1, 3)), False, np.array([stamp]))
+    with Recording(tmp_path / "one.mcap") as recording:
+        recording.take(Look(1, 1, (poses,), (), (), 1, False), now_ns=7)
+    found, _ = messages(tmp_path / "one.mcap")
+    (transform,) = found["/tf"]
+    assert (transform.timestamp.seconds, transform.timestamp.nanos) == divmod(told, 10**9)
 
 
 def test_a_recording_never_replaces_a_file(endpoint: str, tmp_path: Path, capsys) -> None:

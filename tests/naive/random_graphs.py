@@ -68,14 +68,18 @@ def factor(kind: str, keys: list[int], truth: dict[int, np.ndarray], noise: floa
 
 
 def random_steps(seed: int, steps: int = 7, noise: float = 0.03) -> Iterator[Batch]:
-    """Steps of a robot in the plane and one in space that share a map; every kind occurs, and edges run both ways."""
-    rng = np.random.default_rng(seed)
+    """Steps of a robot in the plane and one in space that share a map; every kind occurs, and edges run both ways.
+
+    Some variables have time stamps.
+    """
+    rng, clock = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     truth: dict[int, np.ndarray] = {}
 
     def new(kind: str, letter: str, index: int, value: np.ndarray, fixed: bool = False) -> Variables:
         truth[symbol(letter, index)] = value
         keys = np.array([symbol(letter, index)])
-        return Variables(kind, keys, value[None] if fixed else None, fixed)
+        stamps = clock.integers(-(2**63), 2**63, 1) if clock.random() < 0.6 else None
+        return Variables(kind, keys, value[None] if fixed else None, fixed, stamps)
 
     def between(kind: str, i: int, j: int) -> Factors:
         keys = [i, j] if rng.random() < 0.7 else [j, i]

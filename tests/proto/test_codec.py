@@ -33,6 +33,7 @@ from factorbus.proto.messages import (
     Variables,
 )
 from factorbus.proto.problems import BadMessage, Problem, Refused, TooLarge, UnknownKind, UnknownMap
+from factorbus.proto.stamps import NO_STAMP
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
 MAKE = runpy.run_path(str(VECTORS / "make.py"))
@@ -142,7 +143,8 @@ def variables(draw: st.DrawFn, valued: bool = False) -> Variables:
     keys = draw(arrays("<i8", (count,), elements=st.integers(-(2**63), 2**63 - 1)))
     has_values = valued or draw(st.booleans())
     values = draw(arrays("<f8", (count, kind.size), elements=DOUBLES)) if has_values else None
-    return Variables(kind.name, keys, values, draw(st.booleans()))
+    stamps = draw(arrays("<i8", (count,), elements=st.integers(-(2**63), 2**63 - 1))) if draw(st.booleans()) else None
+    return Variables(kind.name, keys, values, draw(st.booleans()), stamps)
 
 
 @st.composite
@@ -210,6 +212,18 @@ def test_a_message_survives_the_wire_bit_for_bit(name: str, data: st.DataObject)
     assert ENCODERS[name](arrived) == sent  # the repr of an array is rounded, its bytes are not
 
 
+@pytest.mark.parametrize("group", [{}, {"stamps": None}])
+def test_no_stamps_and_nil_are_the_same(group: dict[str, Any]) -> None:
+    made = codec.decode_insert(msgpack.packb({"sequence": 1, "variables": [GROUP | group]})).batch.variables[0]
+    assert made.stamps is None
+
+
+def test_stamps_keep_every_digit() -> None:
+    stamps = codec.decode_delta(GOLDEN["delta_stamps"]).variables[0].stamps
+    assert stamps is not None
+    assert stamps.tolist() == [1_403_636_579_763_555_584, NO_STAMP]
+
+
 def test_arrays_arrive_as_read_only_views() -> None:
     group = codec.decode_estimate(GOLDEN["estimate"]).variables[0]
     assert not group.keys.flags.writeable
@@ -269,6 +283,23 @@ EDGE = {"kind": "between_se2", "keys": b"\0" * 16, "measured": b"\0" * 24, "info
         ({"sequence": 1, "variables": [GROUP | {"values": b"1"}]}, "variables[0].values: 1 bytes; wanted 24 (1 rows"),
         ({"sequence": 1, "variables": [GROUP | {"values": [0.0]}]}, "variables[0].values: is an array"),
         ({"sequence": 1, "variables": [GROUP | {"fixed": None}]}, "variables[0].fixed: is nil"),
+        (
+            {"sequence": 1, "variables": [GROUP, GROUP | {"stamps": b"1"}]},
+            "variables[1].stamps: 1 bytes; wanted 8 (1 int64)",
+        ),
+        ({"sequence": 1, "variables": [GROUP | {"stamps": b""}]}, "variables[0].stamps: 0 bytes; wanted 8 (1 int64)"),
+        *(
+            ({"sequence": 1, "variables": [GROUP | {"stamps": wrong}]}, f"variables[0].stamps: is {seen}; wanted a bin")
+            for wrong, seen in (
+                (True, "a boolean True"),
+                (0, "an integer 0"),
+                (1.5, "a float 1.5"),
+                (float("nan"), "a float nan"),
+                (2**63, "an integer 9223372036854775808"),
+                ("2026", "a string '2026'"),
+                ([1], "an array"),
+            )
+        ),
         (
             {"sequence": 1, "factors": [EDGE, EDGE | {"keys": b"0" * 17}]},
             "factors[1].keys: 17 bytes; wanted a multiple",

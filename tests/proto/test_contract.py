@@ -15,7 +15,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver.modes import MODES
 
 CONTRACT = (Path(__file__).parents[2] / "proto" / "README.md").read_text()
-CLIENT_SIDE = {"bad_symbol", "bad_endpoint", "bad_information", "bad_setting", "not_converged", "problem"}
+CLIENT_SIDE = {"bad_symbol", "bad_stamp", "bad_endpoint", "bad_information", "bad_setting", "not_converged", "problem"}
 
 
 def every_problem(base: type[problems.Problem]) -> set[str]:

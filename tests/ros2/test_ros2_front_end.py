@@ -58,6 +58,12 @@ def only(draft: Draft | None, kind: str) -> Factors:
     return group
 
 
+def stamps_of(draft: Draft | None) -> list[int]:
+    """The time stamps of the new poses."""
+    assert draft is not None
+    return [stamp for g in draft.batch().variables if g.stamps is not None for stamp in g.stamps.tolist()]
+
+
 def covariance_of(group: Factors, dim: int) -> np.ndarray:
     information = np.zeros((dim, dim))
     information[np.triu_indices(dim)] = group.information[0]
@@ -124,9 +130,12 @@ def test_the_first_odometry_begins_the_map_and_the_next_makes_keyframes() -> Non
     assert first is not None
     (group,) = first.batch().variables
     assert (group.kind, group.fixed, group.keys.tolist()) == ("se2", True, [symbol("x", 0)])
+    assert stamps_of(first) == [SECOND]
     assert_allclose(group.values, [[3.0, 4.0, 0.5]])
     assert say(made, 2, ros.compose((3.0, 4.0, 0.5), (0.4, 0.0, 0.1))) is None  # neither far nor turned
-    edge = only(say(made, 3, ros.compose((3.0, 4.0, 0.5), (0.6, 0.1, 0.2))), "between_se2")
+    second = say(made, 3.000000001, ros.compose((3.0, 4.0, 0.5), (0.6, 0.1, 0.2)))
+    assert stamps_of(second) == [3 * SECOND + 1]
+    edge = only(second, "between_se2")
     assert edge.keys.tolist() == [[symbol("x", 0), symbol("x", 1)]]
     assert_allclose(edge.measured, [[0.6, 0.1, 0.2]], atol=1e-12)
     turned = only(say(made, 4, ros.compose((3.0, 4.0, 0.5), (0.6, 0.1, 0.6))), "between_se2")
@@ -177,6 +186,14 @@ def test_where_twists_say_nothing_the_growth_of_the_pose_counts() -> None:
         message.pose.covariance = ros.diagonal(0.1 + grown, 0.1 + 2 * grown, 0, 0, 0, 0.0)
         draft = made.odometry(read(ODOMETRY, message))
     assert_allclose(np.diag(covariance_of(only(draft, "between_se2"), 3))[:2], [0.01, 0.02], rtol=1e-6)
+
+
+def test_a_map_that_begins_with_a_pose_begins_at_the_odometry_before_it() -> None:
+    made = front_end(wait=True)
+    for at_s in (1, 2):
+        assert say(made, at_s, (0.1 * at_s, 0.0, 0.0)) is None
+    told = made.pose("/p", read(POSE, ros.known_pose(int(1.5 * SECOND), (7.0, 8.0, 0.0), [0.1] * 6)))
+    assert stamps_of(told) == [SECOND]
 
 
 def test_a_pose_is_carried_to_its_keyframe_with_its_covariance() -> None:

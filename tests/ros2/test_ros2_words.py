@@ -13,6 +13,7 @@ from factorbus.cli.exits import USAGE
 from factorbus.cli.main import main
 from factorbus.cli.ros2 import DISTRIBUTIONS
 from factorbus.client import Snapshot
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.ros2 import display, messages
 from factorbus.ros2.geometry import from_plane, from_quaternion
@@ -137,10 +138,12 @@ def test_what_is_published_is_read_by_another_library() -> None:
     snapshot = Snapshot(1, 1, {
         "se3": (keys, np.hstack([random.normal(size=(4, 3)), quats])),
         "point3": (np.array([symbol("l", 1)]), np.array([[1.0, 2.0, 3.0]])),
-    })  # fmt: skip
+    }, {"se3": np.array([1_499_999_999, NO_STAMP, -5, 8]), "point3": np.array([NO_STAMP])})  # fmt: skip
     settings = Settings(space="space")
     path = words.Path.deserialize(display.path(MESSAGES, settings, snapshot, 1_500_000_000))
     assert (path.header.stamp.sec, path.header.stamp.nanosec, path.header.frame_id) == (1, 500_000_000, "map")
+    stamps = [(each.header.stamp.sec, each.header.stamp.nanosec) for each in path.poses]
+    assert stamps == [(1, 499_999_999), (1, 500_000_000), (1, 500_000_000)], "its own, and what ROS has a place for"
     read = [each.pose for each in path.poses]  # of this robot only
     np.testing.assert_allclose(
         [[p.position.x, p.position.y, p.position.z] for p in read], snapshot.columns["se3"][1][:3, :3]

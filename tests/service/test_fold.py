@@ -296,7 +296,7 @@ def told(folded: Result) -> Any:
         for m in messages
     ]
     columns = [
-        (g.kind, g.keys.tobytes(), None if g.values is None else g.values.tobytes(), g.fixed)
+        (g.kind, g.keys.tobytes(), *(None if c is None else c.tobytes() for c in (g.values, g.stamps)), g.fixed)
         for d in deltas(folded)
         for g in d.variables
     ]

@@ -16,6 +16,7 @@ from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.limits import REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.service.arrival import read_insert, try_locate
 from factorbus.service.digest import digest_of
 from factorbus.service.events import Arrived, Located
@@ -49,15 +50,18 @@ def content_of(located: Located) -> tuple[list[Any], list[Any]]:
             information = column(row, row[at.G_INFORMATION], row[at.G_TRIANGLE])
             factors.append((FACTOR_KIND_OF_CODE[int(row[at.G_KIND])].name, keys, numbers, information))
         else:
-            variables.append((VARIABLE_KIND_OF_CODE[int(row[at.G_KIND])].name, keys, numbers, bool(row[at.G_FIXED])))
+            stamps, kind = column(row, row[at.G_STAMPS], 1), VARIABLE_KIND_OF_CODE[int(row[at.G_KIND])].name
+            variables.append((kind, keys, numbers, bool(row[at.G_FIXED]), stamps))
     return variables, factors
+
+
+def bits(column: np.ndarray | None) -> bytes | None:
+    return None if column is None else column.tobytes()
 
 
 def content(batch: Batch) -> tuple[list[Any], list[Any]]:
     """The same of a batch."""
-    variables = [
-        (g.kind, g.keys.tobytes(), None if g.values is None else g.values.tobytes(), g.fixed) for g in batch.variables
-    ]
+    variables = [(g.kind, g.keys.tobytes(), bits(g.values), g.fixed, bits(g.stamps)) for g in batch.variables]
     return variables, [(g.kind, g.keys.tobytes(), g.measured.tobytes(), g.information.tobytes()) for g in batch.factors]
 
 
@@ -88,7 +92,8 @@ def random_batch(rng: np.random.Generator) -> Batch:
     for kind in rng.choice(list(VARIABLE_KINDS), rng.integers(0, 5)).tolist():
         n = int(rng.integers(0, 6))
         values = numbers(n, VARIABLE_KINDS[kind].size) if rng.random() < 0.7 else None
-        variables.append(Variables(kind, rng.integers(-(2**63), 2**63, n), values, bool(rng.random() < 0.3)))
+        stamps = rng.integers(-(2**63), 2**63, n) if rng.random() < 0.5 else None
+        variables.append(Variables(kind, rng.integers(-(2**63), 2**63, n), values, bool(rng.random() < 0.3), stamps))
     for name in rng.choice(QUICK, rng.integers(0, 5)).tolist():
         kind, n = FACTOR_KINDS[name], int(rng.integers(0, 20))
         ends = rng.integers(-(2**63), 2**63, (n, len(kind.connects)))
@@ -142,7 +147,9 @@ def test_what_is_wrong_or_unusual_is_left_to_the_codec(seed: int) -> None:
             case 0:
                 del level[name]
             case 1:
-                level[str(rng.choice(["sequence", "values", "measured", "fixed", "settle", "colour"]))] = other
+                level[str(rng.choice(["sequence", "values", "measured", "fixed", "settle", "stamps", "colour"]))] = (
+                    other
+                )
             case 2 if isinstance(level[name], bytes):
                 level[name] = level[name][: rng.integers(0, len(level[name]) + 1)] + bytes(rng.integers(0, 17))
             case _ if name not in ("variables", "factors"):
@@ -196,6 +203,16 @@ UNUSUAL = {
     ),
     "nothing": b"",
     "something behind": msgpack.packb({"sequence": 1}) + b"\xc0",
+    "stamps of factors": msgpack.packb(
+        {
+            "sequence": 1,
+            "factors": [{"kind": "prior_se2", "keys": b"", "measured": b"", "information": b"", "stamps": b""}],
+        }
+    ),
+    "stamps that are too few": msgpack.packb(
+        {"sequence": 1, "variables": [{"kind": "se2", "keys": bytes(16), "stamps": bytes(8)}]}
+    ),
+    "stamps twice": b"\x82\xa8sequence\x01\xa9variables\x91\x84\xa4kind\xa3se2\xa4keys\xc4\x00" + 2 * b"\xa6stamps\xc0",
     "more groups than usual": msgpack.packb({"sequence": 1, "variables": [{"kind": "se2", "keys": b""}] * 16}),
 }
 
@@ -246,12 +263,13 @@ def test_the_digest_of_a_message_never_changes() -> None:
 def arenas(solver: Solver) -> list[bytes]:
     """All that is in use."""
     graph = solver._graph
-    variables, factors, values, payload, columns, _ = graph.counts.tolist()
+    variables, factors, values, payload, columns, *_ = graph.counts.tolist()
     return [
         part.tobytes()
         for part in (
             graph.counts, graph.keys[:variables], graph.var[:variables], graph.dims[:columns], graph.values[:values],
             graph.fac[:factors], graph.payload[:payload], np.flatnonzero(graph.table), graph.table[graph.table > 0],
+            graph.stamps[:variables],
         )
     ]  # fmt: skip
 
@@ -345,9 +363,9 @@ def test_answer_and_delta_are_the_bytes_of_the_codec(
         changed, graph = solver.pick_changed()
         answer, delta = write_messages(
             sequence, epoch, revision, first_factor, codec.report_encoder()(account), changed, graph.var, graph.keys,
-            graph.values, WORDS, LETTERS, out,
+            graph.values, graph.stamps, WORDS, LETTERS, out,
         )  # fmt: skip
-        told = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in solver.changed())
+        told = tuple(Variables(*group) for group in solver.changed())
         wanted = Accepted(sequence, epoch, revision, first_factor, 1, account)
         assert out[:answer].tobytes() == codec.encode_accepted(wanted)
         assert out[answer : answer + delta].tobytes() == codec.encode_delta(
@@ -356,21 +374,24 @@ def test_answer_and_delta_are_the_bytes_of_the_codec(
 
 
 @pytest.mark.parametrize("count", [1, 3, 10, 31, 32, 255, 300, 2000])
-def test_columns_of_any_length(count: int) -> None:
+@pytest.mark.parametrize("stamped", [False, True])
+def test_columns_of_any_length(count: int, stamped: bool) -> None:
     """Each change of form of a bin, and what does not fit."""
     solver = Solver()
     keys, values = np.arange(count), np.random.default_rng(1).normal(size=(count, 7))
     values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
-    solver.stage(Batch((Variables("se3", keys, values, fixed=True),)))
+    stamps = np.where(np.arange(count) == count // 2, -7, NO_STAMP) if stamped else None
+    solver.stage(Batch((Variables("se3", keys, values, True, stamps),)))
     solver.step()
     changed, graph = solver.pick_changed()
-    told = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in solver.changed())
+    told = tuple(Variables(*group) for group in solver.changed())
+    assert (told[0].stamps is not None) == stamped
     wanted = codec.encode_accepted(Accepted(1, 2, 3, 4, 1)) + codec.encode_delta(Delta(2, 3, 2, told))
     for room in (1 << 20, len(wanted) + 512, len(wanted) - 1, 0):
         out = np.full(room + 64, 0xAA, np.uint8)
         sizes = write_messages(
-            1, 2, 3, 4, codec.report_encoder()({}), changed, graph.var, graph.keys, graph.values, WORDS, LETTERS,
-            out[:room],
+            1, 2, 3, 4, codec.report_encoder()({}), changed, graph.var, graph.keys, graph.values, graph.stamps, WORDS,
+            LETTERS, out[:room],
         )  # fmt: skip
         assert sum(sizes) == (len(wanted) if room > len(wanted) else 0)
         assert out[: sum(sizes)].tobytes() == wanted[: sum(sizes)]

@@ -95,6 +95,12 @@ def shuffled(count: int) -> Iterator[Batch]:
         yield Batch((), (between([loops[k]]),))
 
 
+def stamped(batch: Batch, n: int) -> Batch:
+    """The n-th pose and its time."""
+    own = (group._replace(stamps=np.full(group.keys.size, 7 + n)) for group in batch.variables)
+    return batch._replace(variables=tuple(own))
+
+
 def between(edges: list[tuple[np.ndarray, ...]]) -> Factors:
     return Factors("between_se2", *(np.concatenate(column) for column in zip(*edges, strict=True)))
 
@@ -123,7 +129,7 @@ def leave(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 def test_it_takes_the_place_with_what_came_meanwhile(leave: threading.Event) -> None:
     driven, plain = Driven(ALWAYS), Driven(0.0)
-    batches = [step.batch for step in manhattan(400, 1)]
+    batches = [stamped(step.batch, n) for n, step in enumerate(manhattan(400, 1))]
     n = 0
     while not driven.replaced:
         for one in (driven, plain):
@@ -147,6 +153,10 @@ def test_it_takes_the_place_with_what_came_meanwhile(leave: threading.Event) -> 
     there, known = driven.values(), plain.values()
     told = {int(k): row for g in delta.variables for k, row in zip(g.keys, g.values, strict=True)}
     assert {key: row.tobytes() for key, row in told.items()} == {key: row.tobytes() for key, row in there.items()}
+    times = {
+        int(k): int(t) for g in delta.variables if g.stamps is not None for k, t in zip(g.keys, g.stamps, strict=True)
+    }
+    assert times == {key: 7 + (key & 0xFFFF) for key in told}, "its delta tells all time stamps anew"
     assert there.keys() == known.keys()
     assert max(np.abs(there[key] - known[key]).max() for key in there) < 1e-2
     assert driven.folder.chi2() == pytest.approx(plain.folder.chi2(), rel=1e-3)

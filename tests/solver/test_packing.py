@@ -26,7 +26,7 @@ def rows(solver: Solver) -> list[bytes]:
     """The graph."""
     graph = solver._graph
     variables, factors, values, payload, *_ = graph.counts.tolist()
-    used = graph.keys[:variables], graph.var[:variables], graph.fac[:factors, : at.F_AT + 1]
+    used = graph.keys[:variables], graph.stamps[:variables], graph.var[:variables], graph.fac[:factors, : at.F_AT + 1]
     return [array.tobytes() for array in (graph.counts, *used, graph.values[:values], graph.payload[:payload])]
 
 
@@ -64,6 +64,8 @@ def edge(measured: np.ndarray, keys: np.ndarray | None = None, **more: object) -
         Batch((Variables("se4", np.array([3])),)),
         Batch((Variables("se2", np.array([3]), np.zeros((1, 2))),)),
         Batch((Variables("se2", np.arange(65)),)),
+        Batch((Variables("se2", np.array([3]), stamps=np.array([1, 2])),)),
+        Batch((Variables("se2", np.array([3]), stamps=np.array([1.0])),)),  # type: ignore[arg-type]
     ],
 )
 def test_what_is_not_plain_is_left_to_admission(batch: Batch) -> None:

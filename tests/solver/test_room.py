@@ -13,7 +13,7 @@ from factorbus.solver.graph import Graph, roomy
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.tree import Tree
 
-GRAPH = {"keys": 1, "var": 1, "dims": 1, "values": 7, "fac": 1, "payload": 28}
+GRAPH = {"keys": 1, "var": 1, "dims": 1, "stamps": 1, "values": 7, "fac": 1, "payload": 28}
 TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "turns": 1, "pending": 1}
 TREE |= {"changed": 1, "moved": 1, "marked": 1, "motions": 8}
 
@@ -31,8 +31,11 @@ def cramped() -> Solver:
     return solver
 
 
-def bits(groups: list[Group]) -> list[tuple[str, bytes, bytes, bool]]:
-    return [(g.kind, g.keys.tobytes(), g.values.tobytes(), g.fixed) for g in groups]
+def bits(groups: list[Group]) -> list[Any]:
+    return [
+        (g.kind, g.keys.tobytes(), g.values.tobytes(), g.fixed, g.stamps is not None and g.stamps.tobytes())
+        for g in groups
+    ]
 
 
 def account(report: Any) -> dict[str, Any]:

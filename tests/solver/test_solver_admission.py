@@ -162,10 +162,13 @@ def small_map(mode: str = "auto") -> Solver:
 def everything(solver: Solver) -> bytes:
     """All there is to see of a solver and of what it keeps, to the bit."""
     graph = solver._graph
-    n, m, v, p, _, scalars = graph.counts.tolist()
+    n, m, v, p, _, scalars, _ = graph.counts.tolist()
     return pickle.dumps(
         [
-            [a.tobytes() for a in (graph.counts, graph.keys[:n], graph.values[:v], *rows(solver, n, m))],
+            [
+                a.tobytes()
+                for a in (graph.counts, graph.keys[:n], graph.stamps[:n], graph.values[:v], *rows(solver, n, m))
+            ],
             [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
             normal_equations(solver._system.blocks, scalars) if solver._tree is None else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
@@ -251,7 +254,13 @@ def test_read_only_and_strided_arrays_are_taken() -> None:
         other.stage(
             Batch(
                 tuple(
-                    Variables(v.kind, awkward(v.keys), None if v.values is None else awkward(v.values), v.fixed)
+                    Variables(
+                        v.kind,
+                        awkward(v.keys),
+                        None if v.values is None else awkward(v.values),
+                        v.fixed,
+                        None if v.stamps is None else awkward(v.stamps),
+                    )
                     for v in batch.variables
                 ),
                 tuple(

@@ -14,10 +14,10 @@ BATCH = Options(mode="all-batch")
 
 def state(solver: Solver) -> list[bytes]:
     graph, blocks = solver._graph, solver._system.blocks
-    variables, factors, values, payload, columns, scalars = graph.counts.tolist()
+    variables, factors, values, payload, columns, scalars, _ = graph.counts.tolist()
     arrays = [
         *(graph.keys[:variables], graph.var[:variables], graph.fac[:factors], graph.values[:values]),
-        *(graph.payload[:payload], graph.dims[:columns], graph.counts),
+        *(graph.payload[:payload], graph.dims[:columns], graph.stamps[:variables], graph.counts),
         *(blocks.pattern[:, : blocks.fill[0]], blocks.fill, blocks.data[: blocks.fill[1]], blocks.eta[:scalars]),
         np.array([solver.chi2(), solver._done.unsolved, solver._done.damping]),
     ]

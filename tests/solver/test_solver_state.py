@@ -21,8 +21,11 @@ def account(report: Any) -> dict[str, Any]:
     return {name: value for name, value in report.as_dict().items() if name not in timed}
 
 
-def bits(groups: Any) -> list[tuple[str, bytes, bytes, bool]]:
-    return [(g.kind, g.keys.tobytes(), g.values.tobytes(), g.fixed) for g in groups]
+def bits(groups: Any) -> list[Any]:
+    return [
+        (g.kind, g.keys.tobytes(), g.values.tobytes(), g.fixed, g.stamps is not None and g.stamps.tobytes())
+        for g in groups
+    ]
 
 
 def loose() -> Batch:

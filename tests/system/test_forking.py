@@ -30,7 +30,10 @@ SIGMAS = (0.1, 0.1, 0.02)
 def everything(joined: Map) -> tuple[Any, ...]:
     """All that a map has, but its name and epoch."""
     graph = joined.graph()
-    variables = [(g.kind, g.fixed, g.keys.tobytes(), g.values.tobytes()) for g in graph.batch.variables]
+    variables = [
+        (g.kind, g.fixed, *(None if c is None else c.tobytes() for c in (g.keys, g.values, g.stamps)))
+        for g in graph.batch.variables
+    ]
     factors = [
         (
             g.kind,

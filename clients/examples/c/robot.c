@@ -12,6 +12,9 @@
 #include <string.h>
 #include <time.h>
 
+/* Nanoseconds of a variable without a time stamp, §4. */
+#define NO_STAMP INT64_MIN
+
 enum { POSES = 5, TRY_MS = 10000, TRIES = 20, FIRST_PAUSE_MS = 100, LONGEST_PAUSE_MS = 1000, PATIENCE_MS = 10000 };
 
 static const double SIDE[3] = {1.0, 0.02, 1.55}, HOME[3] = {0.0, 0.0, 0.0};
@@ -23,6 +26,7 @@ typedef struct {
     uint64_t epoch, revision;
     bool known[POSES], gap, live;
     double poses[POSES][3];
+    int64_t stamps[POSES];
 } estimate;
 
 typedef struct {
@@ -48,13 +52,16 @@ static void apply(estimate *now, const mp_value *message)
     const mp_value *groups = mp_field(message, "variables");
     for (uint32_t i = 0; groups != NULL && i < groups->count; i++) {
         const mp_value *keys = mp_field(&groups->children[i], "keys"), *values = mp_field(&groups->children[i], "values");
+        const mp_value *stamps = mp_field(&groups->children[i], "stamps");
         if (!mp_is(mp_field(&groups->children[i], "kind"), "se2") || keys == NULL || values == NULL) continue;
         if (values->size != 3 * keys->size) continue;
+        if (stamps != NULL && stamps->size != keys->size) continue;
         for (size_t k = 0; k < keys->size / 8; k++) {
             int64_t index = mp_i64_at(keys, k) - key_of('x', 0);
             if (index < 0 || index >= POSES) continue;
             now->known[index] = true;
             for (size_t c = 0; c < 3; c++) now->poses[index][c] = mp_f64_at(values, 3 * k + c);
+            now->stamps[index] = stamps != NULL ? mp_i64_at(stamps, k) : NO_STAMP;
         }
     }
     now->epoch = whole(message, "epoch");
@@ -196,14 +203,24 @@ static void begin_insert(mp_buffer *out, uint64_t sequence, uint64_t epoch)
     mp_uint(out, epoch);
 }
 
-/* A pose: with a value it is held there, without one the service composes it from its factor. */
+static int64_t now_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_REALTIME, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+}
+
+/* A pose of now: with a value it is held there, without one the service composes it from its factor. */
 static void put_pose(mp_buffer *out, int64_t key, const double *fixed_at)
 {
-    mp_map(out, fixed_at ? 4 : 2);
+    const int64_t stamp = now_ns();
+    mp_map(out, fixed_at ? 5 : 3);
     mp_str(out, "kind");
     mp_str(out, "se2");
     mp_str(out, "keys");
     mp_i64s(out, &key, 1);
+    mp_str(out, "stamps");
+    mp_i64s(out, &stamp, 1);
     if (fixed_at == NULL) return;
     mp_str(out, "values");
     mp_f64s(out, fixed_at, 3);
@@ -265,10 +282,14 @@ static bool close_loop(robot *me)
 
 static void show(const robot *me, const char *when)
 {
-    printf("%s, revision %" PRIu64 ":\n", when, me->now.revision);
-    for (int i = 0; i < POSES; i++)
-        if (me->now.known[i])
-            printf("x%d %.17g %.17g %.17g\n", i, me->now.poses[i][0], me->now.poses[i][1], me->now.poses[i][2]);
+    const estimate *now = &me->now;
+    printf("%s, revision %" PRIu64 ":\n", when, now->revision);
+    for (int i = 0; i < POSES; i++) {
+        if (!now->known[i]) continue;
+        printf("x%d %.17g %.17g %.17g", i, now->poses[i][0], now->poses[i][1], now->poses[i][2]);
+        if (now->stamps[i] != NO_STAMP) printf(" at %" PRId64 " ns", now->stamps[i]);
+        printf("\n");
+    }
 }
 
 static bool drive(robot *me)

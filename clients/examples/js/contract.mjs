@@ -14,6 +14,7 @@ const COLUMNS = {
   threshold: "f64", gain: "f64", distances: "f64", numbers: "f64", state: "f64", pixels: "f64", y: "f64", rows: "f64",
   cross: "f64", blocks: "f64", turn: "f64", own: "f64", U: "f64", S: "f64",
   factors: "i64", ids: "i64", weight: "f64", // §17
+  stamps: "i64", // §4
   plausible: "u8", matched: "u8", payload: "msgpack", ask: "msgpack", shard: "msgpack",
 };
 

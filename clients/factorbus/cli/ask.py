@@ -313,6 +313,7 @@ def _variable_rows(account: Any) -> list[tuple[str, str]]:
     steps = [(name.replace("_", " "), account[name]) for name in ("linearised_step", "changed_step", "seen_step")]
     return [
         ("kind", account["kind"] + (", fixed" if account["fixed"] else "")),
+        *([("time stamp", f"{account['stamp']} ns")] if account.get("stamp") is not None else []),
         ("value", "  ".join(f"{number:.6g}" for number in account["value"])),
         ("sigmas", "  ".join(f"{number:.4g}" for number in account["sigmas"])),
         ("smallest pivot", f"{account['pivot']:.4g}, {account['conditioning']:.2g} of what its factors bring"),

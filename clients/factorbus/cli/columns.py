@@ -6,6 +6,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
 
 _POSITION = {"se2": 2, "se3": 3, "point2": 2, "point3": 3}  # an idp's first three numbers are a camera's
 
@@ -70,4 +71,8 @@ def _scale(group: Factors) -> F64:
 def _variables(kind: str, fixed: bool, groups: list[Variables]) -> Variables:
     keys = np.concatenate([group.keys for group in groups])
     values = None if groups[0].values is None else np.concatenate([_values(group) for group in groups])
-    return Variables(kind, keys, values, fixed)
+    if all(group.stamps is None for group in groups):
+        return Variables(kind, keys, values, fixed)
+    none = (np.full(group.keys.size, NO_STAMP) for group in groups)
+    stamps = [own if group.stamps is None else group.stamps for group, own in zip(groups, none, strict=True)]
+    return Variables(kind, keys, values, fixed, np.concatenate(stamps))

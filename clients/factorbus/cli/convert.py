@@ -30,10 +30,10 @@ _WRITES = (".g2o", ".tum", ".kitti")
 def command(
     source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str, as_json: bool
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM or SLAM++ text) and write TARGET (.g2o, .tum or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++ or TUM text) and write TARGET (.g2o, .tum or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
-    letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum.
+    letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
 
     \b
     factorbus convert w10000.graph w10000.g2o

@@ -113,4 +113,4 @@ def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
 
 
 def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
-    return tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in groups)
+    return tuple(Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in groups)

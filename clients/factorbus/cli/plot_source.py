@@ -85,7 +85,9 @@ def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
     from factorbus.solver import solve_batch
 
     result = solve_batch(drawn.graph.variables, drawn.graph.factors)
-    groups = tuple(Variables(group.kind, group.keys, group.values, group.fixed) for group in result.values)
+    groups = tuple(
+        Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in result.values
+    )
     about = f"χ² {result.chi2:.6g}, {optimum_from(result.start, on_file)}, after {result.iterations} iterations"
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
 

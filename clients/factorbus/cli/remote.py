@@ -86,8 +86,7 @@ class RemoteMap:
 
     def estimate(self) -> tuple[Variables, ...]:
         """The mirror's present values."""
-        columns = self._mirror.snapshot().columns
-        return tuple(Variables(kind, keys, values) for kind, (keys, values) in columns.items())
+        return self._mirror.snapshot().variables()
 
     def graph(self) -> Batch:
         """The map's graph, from the service."""

@@ -25,7 +25,7 @@ def command(name: str, target: Path, robot: str | None, endpoint: str, zenoh: st
     """Write MAP as it is now into FILE: the whole graph as .g2o, or trajectories as .tum or .kitti, by its ending.
 
     A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
-    out-a.tum and out-b.tum.
+    out-a.tum and out-b.tum. Its times are the poses' time stamps, else the numbers of their keys.
 
     \b
     factorbus save warehouse warehouse.g2o

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
-from factorbus.client.key_numbers import Key, key_number, key_numbers
+from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.linear import linear_pieces
 from factorbus.client.mounted import moved_se2, moved_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadShape, UnknownKind
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 _Kind = TypeVar("_Kind")
@@ -29,36 +30,41 @@ class Draft:
     """Variables and factors to be inserted together or not at all.  Every method returns the draft, to be chained.
 
     A key is "x12" or an int64.  A variable without a value gets one from the first factor of the same insert that
-    reaches it.  fixed: the variable is held where it is (a map's first pose, say).
+    reaches it.  fixed: the variable is held where it is (a map's first pose, say).  stamp: when it was, nanoseconds as
+    an int (`time.time_ns()`, or any other clock); the map keeps it, and gives it back with the value.
     Every factor needs a certainty: sigmas=, standard deviations in metres and radians (also of rotations in space), or
     information=, and may have a loss= (`factorbus.client.certainty.Certainty`).
-    Raises BadSymbol, BadShape, BadInformation, BadLoss, UnknownKind.
+    Raises BadSymbol, BadShape, BadStamp, BadInformation, BadLoss, UnknownKind.
     """
 
     def __init__(self) -> None:
-        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row]]] = {}
+        self._variables: dict[tuple[str, bool, bool], tuple[list[int], list[_Row], list[int]]] = {}
         self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
         self._linear: list[Factors] = []
 
-    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
-        return self.variable("se2", key, value, fixed=fixed)
+        return self.variable("se2", key, value, fixed=fixed, stamp=stamp)
 
-    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
         """A pose in space: x y z (metres), unit quaternion qx qy qz qw."""
-        return self.variable("se3", key, value, fixed=fixed)
+        return self.variable("se3", key, value, fixed=fixed, stamp=stamp)
 
-    def point2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def point2(
+        self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None
+    ) -> Draft:
         """A point in the plane: x y (metres)."""
-        return self.variable("point2", key, value, fixed=fixed)
+        return self.variable("point2", key, value, fixed=fixed, stamp=stamp)
 
-    def point3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def point3(
+        self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None
+    ) -> Draft:
         """A point in space: x y z (metres)."""
-        return self.variable("point3", key, value, fixed=fixed)
+        return self.variable("point3", key, value, fixed=fixed, stamp=stamp)
 
-    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
-        return self.variable("idp", key, value, fixed=fixed)
+        return self.variable("idp", key, value, fixed=fixed, stamp=stamp)
 
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
@@ -253,13 +259,24 @@ class Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
         return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
 
-    def variable(self, kind: str, key: Key, value: ArrayLike | None = None, *, fixed: bool = False) -> Draft:
+    def variable(
+        self,
+        kind: str,
+        key: Key,
+        value: ArrayLike | None = None,
+        *,
+        fixed: bool = False,
+        stamp: int | None = None,
+    ) -> Draft:
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
         number = key_number(key)
-        row = None if value is None else _row(f"{kind} {format_symbol(number)}", value, size)
-        keys, rows = self._variables.setdefault((kind, row is not None, fixed), ([], []))
+        where = f"{kind} {format_symbol(number)}"
+        row = None if value is None else _row(where, value, size)
+        time = stamp_number(where, stamp)
+        keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
         keys.append(number)
+        stamps.append(time)
         if row is not None:
             rows.append(row)
         return self
@@ -295,8 +312,14 @@ class Draft:
         """What has been drafted so far, as columns."""
         return Batch(
             tuple(
-                Variables(kind, np.array(keys, np.int64), np.array(rows) if valued else None, fixed)
-                for (kind, valued, fixed), (keys, rows) in self._variables.items()
+                Variables(
+                    kind,
+                    np.array(keys, np.int64),
+                    np.array(rows) if valued else None,
+                    fixed,
+                    np.array(stamps, np.int64) if any(stamp != NO_STAMP for stamp in stamps) else None,
+                )
+                for (kind, valued, fixed), (keys, rows, stamps) in self._variables.items()
             ),
             (
                 *(

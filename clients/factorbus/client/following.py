@@ -80,6 +80,14 @@ class Following:
                 return value
         return None
 
+    def stamp(self, key: int) -> int | None:
+        """The time stamp of one variable, if it has one."""
+        return next((stamp for table in self._tables.values() if (stamp := table.stamp(key)) is not None), None)
+
+    def stamps(self) -> dict[str, I64]:
+        """Copies of the time stamps by kind, in the order of `columns`."""
+        return {kind: table.stamps() for kind, table in self._tables.items()}
+
     def columns(self) -> dict[str, tuple[I64, F64]]:
         """Copies of (keys, values) by kind, ordered by key."""
         return {kind: table.columns() for kind, table in self._tables.items()}
@@ -123,4 +131,4 @@ def _put(tables: dict[str, Table], groups: Iterable[Variables]) -> None:
         table = tables.get(group.kind)
         if table is None:
             table = tables[group.kind] = Table(values.shape[1])
-        table.put(np.asarray(group.keys), values)
+        table.put(np.asarray(group.keys), values, group.stamps)

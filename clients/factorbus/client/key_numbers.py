@@ -1,4 +1,4 @@
-"""Keys of variables and ids of factors as int64; one of them will do where a list of one is meant."""
+"""Keys of variables, ids of factors and time stamps as int64; one will do where a list of one is meant."""
 
 import operator
 from collections.abc import Iterable
@@ -7,7 +7,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from factorbus.proto.arrays import I64
-from factorbus.proto.problems import BadShape, BadSymbol
+from factorbus.proto.problems import BadShape, BadStamp, BadSymbol
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import parse_symbol
 
 Key: TypeAlias = str | int
@@ -39,6 +40,16 @@ def id_numbers(where: str, factors: Iterable[int] | int) -> I64:
             raise BadShape(where, f"factor {each!r}", "ids of factors: whole numbers, 0 or more")
         found.append(number)
     return np.array(found, np.int64)
+
+
+def stamp_number(where: str, stamp: int | None) -> int:
+    """A time stamp in nanoseconds as the wire has it; None: the variable has none.  Raises BadStamp."""
+    if stamp is None:
+        return NO_STAMP
+    number = _whole(stamp)
+    if number is None or number == NO_STAMP:
+        raise BadStamp(where, f"{stamp!r:.60} ({type(stamp).__name__})")
+    return number
 
 
 def _each(given: Any) -> Iterable[Any]:

@@ -179,9 +179,10 @@ class Map:
     ) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
-        Raises Unavailable if the window stays full for `timeout_s`, TooLarge: `batch` is then not sent.
+        Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported: `batch` is then not sent.
         """
         batch = batch.batch() if isinstance(batch, Draft) else batch
+        self._check_stamps(batch)
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
@@ -328,6 +329,13 @@ class Map:
                 if change.change not in names:
                     raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
         return listed
+
+    def _check_stamps(self, batch: Batch) -> None:
+        """Raises NotSupported where the service would skip them."""
+        protocol = self._protocol
+        skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())
+        if skipped and any(group.stamps is not None for group in batch.variables):
+            raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
 
     def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
         window = self._window

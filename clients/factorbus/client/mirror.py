@@ -18,8 +18,9 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_asked
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.messages import Delta
+from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.problems import BadSymbol, NotConverged, Unavailable
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -37,11 +38,20 @@ _IMPATIENT_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """An estimate at one revision: {kind: (keys (n,), values (n, size))}, ordered by key."""
+    """An estimate at one revision: {kind: (keys (n,), values (n, size))}, ordered by key.
+
+    stamps: {kind: (n,)}, the time stamps in the same order, nanoseconds; NO_STAMP (-2^63) of a variable without.
+    """
 
     epoch: int
     revision: int
     columns: dict[str, tuple[I64, F64]]
+    stamps: dict[str, I64]
+
+    def variables(self) -> tuple[Variables, ...]:
+        """The same as groups of a message, one for each kind."""
+        groups = (Variables(kind, *columns, stamps=self.stamps[kind]) for kind, columns in self.columns.items())
+        return tuple(g if (g.stamps != NO_STAMP).any() else g._replace(stamps=None) for g in groups)
 
 
 class Mirror:
@@ -122,6 +132,12 @@ class Mirror:
         """Seconds since the service last confirmed these values: by a delta, or by answering that nothing changed."""
         return time.monotonic() - self._confirmed_at
 
+    def stamp(self, key: str | int) -> int | None:
+        """When a variable was, "x12" or its number: the nanoseconds that it came with, or None.  Raises KeyError."""
+        with self._lock:
+            self[key]
+            return self._following.stamp(key_number(key))
+
     def columns(self, kind: str) -> tuple[I64, F64]:
         """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises KeyError."""
         with self._lock:
@@ -133,7 +149,7 @@ class Mirror:
     def snapshot(self) -> Snapshot:
         """Everything, at one revision."""
         with self._lock:
-            return Snapshot(self.epoch, self.revision, self._following.columns())
+            return Snapshot(self.epoch, self.revision, self._following.columns(), self._following.stamps())
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""

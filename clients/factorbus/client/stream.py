@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 
 from factorbus.client.mirror import Mirror
-from factorbus.proto.messages import Delta, Variables
+from factorbus.proto.messages import Delta
 
 # Deltas that may wait for the reader; when it falls further behind it gets the whole estimate instead.
 _BACKLOG = 1024
@@ -53,5 +53,4 @@ class DeltaStream:
     def _whole(self) -> Delta:
         seen = self._mirror.snapshot()
         self._at = (seen.epoch, seen.revision)  # what was queued meanwhile is in it
-        groups = tuple(Variables(kind, numbers, values) for kind, (numbers, values) in seen.columns.items())
-        return Delta(seen.epoch, seen.revision, 0, groups)
+        return Delta(seen.epoch, seen.revision, 0, seen.variables())

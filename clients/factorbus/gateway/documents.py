@@ -8,6 +8,7 @@ from starlette.responses import JSONResponse
 
 from factorbus.client import Snapshot
 from factorbus.proto.messages import Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 
@@ -32,9 +33,13 @@ def _finite(content: Any) -> Any:
 
 
 def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:
-    """[{kind, keys, values}] of the groups that have values."""
+    """[{kind, keys, values}] of the groups that have values; with stamps where any of a group has one.
+
+    A stamp is text: JavaScript rounds numbers of so many digits.  null: none.
+    """
     return [
         {"kind": g.kind, "keys": [format_symbol(key) for key in g.keys.tolist()], "values": g.values.tolist()}
+        | ({} if g.stamps is None else {"stamps": [None if t == NO_STAMP else str(t) for t in g.stamps.tolist()]})
         for g in variables
         if g.values is not None
     ]
@@ -42,8 +47,7 @@ def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:
 
 def estimate(snapshot: Snapshot) -> dict[str, Any]:
     """A whole estimate."""
-    variables = (Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items())
-    return {"epoch": str(snapshot.epoch), "revision": snapshot.revision, "variables": groups(variables)}
+    return {"epoch": str(snapshot.epoch), "revision": snapshot.revision, "variables": groups(snapshot.variables())}
 
 
 def plain(report: Mapping[str, Any]) -> dict[str, Any]:

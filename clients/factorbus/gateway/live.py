@@ -15,6 +15,7 @@ from factorbus.client import Mirror
 from factorbus.client.stream import DeltaStream
 from factorbus.gateway.documents import estimate, groups, plain
 from factorbus.proto.messages import Delta, Variables
+from factorbus.proto.stamps import NO_STAMP
 
 _LEAST_PAUSE_S = 0.05
 
@@ -81,10 +82,19 @@ def _together(deltas: list[Delta]) -> dict[str, Any]:
 
 
 def _latest(deltas: Iterable[Delta]) -> list[Variables]:
-    """The last value of each variable, by kind."""
+    """The last value of each variable, by kind, and its time stamp."""
     found: dict[str, dict[int, Any]] = {}
+    stamps: dict[int, int] = {}
     for delta in deltas:
         for group in delta.variables:
             if group.values is not None:
                 found.setdefault(group.kind, {}).update(zip(group.keys.tolist(), group.values, strict=True))
-    return [Variables(kind, np.array(list(rows)), np.array(list(rows.values()))) for kind, rows in found.items()]
+            if group.stamps is not None:
+                stamps.update(zip(group.keys.tolist(), group.stamps.tolist(), strict=True))
+    return [_group(kind, rows, stamps) for kind, rows in found.items()]
+
+
+def _group(kind: str, rows: dict[int, Any], stamps: dict[int, int]) -> Variables:
+    own = np.array([stamps.get(key, NO_STAMP) for key in rows], np.int64)
+    known = own if (own != NO_STAMP).any() else None
+    return Variables(kind, np.array(list(rows)), np.array(list(rows.values())), stamps=known)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from factorbus.client import Bus, Map
 from factorbus.proto.asking import Covariances
-from factorbus.proto.messages import Graph, Variables
+from factorbus.proto.messages import Graph
 from factorbus.viz import Spread, spread_of
 from factorbus.viz.certainty import blocks_of, chosen
 
@@ -55,7 +55,7 @@ class Maps:
         """The revision, and where some variables may be in it; asked for once.  Raises Refused, Unavailable."""
         async with joined.asking:
             snapshot, have = joined.map.estimate.snapshot(), joined.covariances
-            variables = [Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items()]
+            variables = snapshot.variables()
             if have is None or (have.epoch, have.revision) != (snapshot.epoch, snapshot.revision):
                 keys = chosen(variables, _ELLIPSES).tolist()
                 asked = joined.map.doubt.ask.covariance("diagonal", keys, None, None)

@@ -7,7 +7,7 @@ import numpy as np
 from factorbus.client import Snapshot
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.geometry import Transform, quaternion
-from factorbus.ros2.messages import Messages
+from factorbus.ros2.messages import LATEST_S, Messages
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 
@@ -17,13 +17,21 @@ _LANDMARK_M, _POSE_M = 0.2, 0.1
 
 
 def path(messages: Messages, settings: Settings, snapshot: Snapshot, stamp_ns: int) -> bytes:
-    """The keyframes of this robot (of its letter), in the order of their keys, as CDR."""
+    """The keyframes of this robot (of its letter), in the order of their keys, as CDR.
+
+    Each has its own time stamp; one without, or with one that ROS has no place for, `stamp_ns`, as the whole has.
+    """
     space = SPACES[settings.space]
     header = messages.header(stamp_ns, settings.map_frame)
     keys, rows = snapshot.columns.get(space.pose, (np.empty(0, np.int64), np.empty((0, 3))))
     mine = (keys >= symbol(settings.letter, 0)) & (keys < symbol(settings.letter, 0) + (1 << 56))
     stamped = messages.type_of("geometry_msgs/msg/PoseStamped")
-    poses = [stamped(header, pose(messages, space.transform(row))) for row in rows[mine]]
+    stamps = snapshot.stamps.get(space.pose, np.empty(0, np.int64))[mine]
+    headers = [
+        messages.header(stamp, settings.map_frame) if 0 <= stamp < (LATEST_S + 1) * 10**9 else header
+        for stamp in stamps.tolist()
+    ]
+    poses = [stamped(own, pose(messages, space.transform(row))) for own, row in zip(headers, rows[mine], strict=True)]
     return messages.write("nav_msgs/msg/Path", messages.type_of("nav_msgs/msg/Path")(header, poses))
 
 

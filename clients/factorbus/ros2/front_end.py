@@ -1,8 +1,8 @@
 """From what a robot says to what goes into the map.  No bus and no clock: messages in, drafts out.
 
-Odometry makes keyframes and the factors between them.  A pose or a sighting belongs to the last keyframe before it: it
-is carried there by odometry, and what that adds to its covariance is added.  What is stamped later than the last
-odometry waits for the next.
+Odometry makes keyframes, which have its time stamp, and the factors between them.  A pose or a sighting belongs to the
+last keyframe before it: it is carried there by odometry, and what that adds to its covariance is added.  What is
+stamped later than the last odometry waits for the next.
 """
 
 import hashlib
@@ -78,7 +78,8 @@ class FrontEnd:
         draft = Draft()
         keyframe = self._track.keyframe
         if keyframe is None and not self._wait_for_pose:
-            draft.variable(self._space.pose, self._mark(sample), self._space.row(sample.T_odom_base), fixed=True)
+            row = self._space.row(sample.T_odom_base)
+            draft.variable(self._space.pose, self._mark(sample), row, fixed=True, stamp=sample.stamp_ns)
         elif keyframe is not None and self._is_far(sample):
             self._add_keyframe(draft, sample)
         self._use_what_waited(draft)
@@ -126,7 +127,7 @@ class FrontEnd:
         place = self._track.place_of(sample)
         weight = information(self._space.residual(self._floored_way(place)))
         key = self._mark(sample)
-        draft.variable(self._space.pose, key)
+        draft.variable(self._space.pose, key, stamp=sample.stamp_ns)
         measured = self._space.row(place.T)
         draft.factor(f"between_{self._space.pose}", (place.keyframe.key, key), measured, information=weight)
 
@@ -169,9 +170,9 @@ class FrontEnd:
         covariance = self._checked(topic, "pose", message.pose.covariance, self._space.axes).whole
         covariance = local(covariance, T_map_base.R)
         covariance = self._space.floored(covariance, self._floors.pose_m, self._floors.pose_rad)
-        begins = self.waits_for_pose
+        begins, sample = self.waits_for_pose, self._track.before(stamp_ns)
         if begins:
-            self._mark(self._track.before(stamp_ns))
+            self._mark(sample)
         place = self._track.try_place(stamp_ns)
         if place is None:
             raise BadRosMessage(topic, "a pose from before the first keyframe", "one from after it")
@@ -181,7 +182,7 @@ class FrontEnd:
             covariance = carried(covariance, T_base_keyframe) + carried(self._floored_way(place), T_base_keyframe)
         row = self._space.row(T_map_keyframe)
         if begins:
-            draft.variable(self._space.pose, place.keyframe.key, row)
+            draft.variable(self._space.pose, place.keyframe.key, row, stamp=sample.stamp_ns)
         weight = information(self._space.residual(covariance))
         draft.factor(f"prior_{self._space.pose}", (place.keyframe.key,), row, information=weight)
 

@@ -104,4 +104,4 @@ class Lookout:
 
 
 def _groups(snapshot: Snapshot) -> tuple[Variables, ...]:
-    return tuple(Variables(kind, keys, values) for kind, (keys, values) in snapshot.columns.items())
+    return snapshot.variables()

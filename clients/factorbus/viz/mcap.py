@@ -2,12 +2,15 @@
 
 | topic | schema | |
 |---|---|---|
-| /tf | foxglove.FrameTransform | map → robot: the pose with the largest key, one for each letter |
+| /tf | foxglove.FrameTransform | map → robot: the pose with the largest key, one for each letter, at its time stamp |
 | /map/scene | foxglove.SceneUpdate | trajectory, landmarks, loop closures coloured by how badly they fit |
 | /map/poses | foxglove.PosesInFrame | all poses |
 | /map/step | factorbus.Step, JSON | the account of each step, for plots: chi2, step_ms, eliminated, … |
-| /map/delta | factorbus.Delta, JSON | each delta, whole: variables by kind, keys and values |
+| /map/delta | factorbus.Delta, JSON | each delta, whole: variables by kind, keys, values and time stamps |
 | /map/factors | factorbus.Factors, JSON | factors when they were first seen, by kind: keys, measured, information |
+
+Messages are logged at the time at which they are written.  A time stamp is in nanoseconds, in JSON as text with all its
+digits, null of a variable without.  A pose without, or with one that MCAP has no place for, is in /tf at the log time.
 """
 
 import math
@@ -24,10 +27,12 @@ from foxglove.channels import FrameTransformChannel, PosesInFrameChannel, SceneU
 
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
 from factorbus.viz.lookout import Look
 from factorbus.viz.mcap_scene import scene_of
 
+_BEYOND_NS = 2**32 * 10**9  # MCAP's seconds are 32 bits without a sign
 _NUMBERS = {"type": "array", "items": {"type": "number"}}
 _ROWS = {"type": "array", "items": _NUMBERS}
 _KEYS = {"type": "array", "items": {"type": "string"}}
@@ -37,7 +42,11 @@ _STEP = {
     "properties": {name: {"type": "number"} for name in ("epoch", "revision", "chi2", "step_ms", "changed")}
     | {name: {"type": "string"} for name in ("strategy", "because")},
 }
-_GROUP = {"type": "object", "properties": {"kind": {"type": "string"}, "keys": _KEYS, "values": _ROWS}}
+_STAMPS = {"type": "array", "items": {"type": ["string", "null"]}}
+_GROUP = {
+    "type": "object",
+    "properties": {"kind": {"type": "string"}, "keys": _KEYS, "values": _ROWS, "stamps": _STAMPS},
+}
 _DELTA = {
     "title": "factorbus.Delta",
     "type": "object",
@@ -98,9 +107,10 @@ class Recording:
         for group in look.factors:
             self._take_factors(look, group, now_ns)
         stamp = fox.Timestamp(now_ns // 10**9, now_ns % 10**9)
-        for key, value in _last_poses(look.variables):
-            name = symbol_parts(key)[0] or "robot"
-            self._tf.log(_transform(name, value, stamp), log_time=now_ns)
+        for key, value, own_ns in _last_poses(look.variables):
+            name, known = symbol_parts(key)[0] or "robot", 0 <= own_ns < _BEYOND_NS
+            at = fox.Timestamp(own_ns // 10**9, own_ns % 10**9) if known else stamp
+            self._tf.log(_transform(name, value, at), log_time=now_ns)
         self._poses.log(_poses_in_frame(look.variables, stamp), log_time=now_ns)
         self._scene.log(scene_of(look, stamp), log_time=now_ns)
 
@@ -108,11 +118,7 @@ class Recording:
         at = {"epoch": delta.epoch, "revision": delta.revision}
         numbers = {k: v for k, v in delta.report.items() if isinstance(v, (int, float, str)) and _finite(v)}
         self._step.log(at | numbers, log_time=now_ns)
-        groups = [
-            {"kind": g.kind, "keys": [format_symbol(k) for k in g.keys.tolist()], "values": g.values.tolist()}
-            for g in delta.variables
-            if g.values is not None
-        ]
+        groups = [_group(group, group.values) for group in delta.variables if group.values is not None]
         self._delta.log(at | {"previous": delta.previous, "variables": groups}, log_time=now_ns)
         self.deltas += 1
 
@@ -138,16 +144,24 @@ def _finite(value: Any) -> bool:
     return isinstance(value, str) or math.isfinite(value)
 
 
-def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64]]:
-    """(key, x y z qx qy qz qw) of the pose with the largest index, for each letter."""
-    last: dict[str, tuple[int, F64]] = {}
+def _group(group: Variables, values: F64) -> dict[str, Any]:
+    content = {"kind": group.kind, "keys": [format_symbol(k) for k in group.keys.tolist()], "values": values.tolist()}
+    if group.stamps is None:
+        return content
+    return content | {"stamps": [None if stamp == NO_STAMP else str(stamp) for stamp in group.stamps.tolist()]}
+
+
+def _last_poses(variables: Sequence[Variables]) -> list[tuple[int, F64, int]]:
+    """(key, x y z qx qy qz qw, time stamp or NO_STAMP) of the pose with the largest index, for each letter."""
+    last: dict[str, tuple[int, F64, int]] = {}
     for group in variables:
         if group.kind in ("se2", "se3") and group.values is not None:
-            for key, value in zip(group.keys.tolist(), group.values, strict=True):
+            stamps = np.full(group.keys.size, NO_STAMP) if group.stamps is None else group.stamps
+            for key, value, stamp in zip(group.keys.tolist(), group.values, stamps.tolist(), strict=True):
                 letter = symbol_parts(key)[0]
                 if letter not in last or key > last[letter][0]:
-                    last[letter] = (key, value)
-    return [(key, lifted(value)) for key, value in last.values()]
+                    last[letter] = (key, value, stamp)
+    return [(key, lifted(value), stamp) for key, value, stamp in last.values()]
 
 
 def lifted(value: F64) -> F64:

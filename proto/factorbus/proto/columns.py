@@ -56,6 +56,8 @@ def _variables_map(group: Variables) -> dict[str, Any]:
         content["values"] = _bytes(group.values, F8)
     if group.fixed:
         content["fixed"] = True
+    if group.stamps is not None:
+        content["stamps"] = _bytes(group.stamps, I8)
     return content
 
 
@@ -93,7 +95,9 @@ def _read_variables(index: int, content: Map, strict: bool) -> Variables:
     else:
         size = known.size if known else _row_size(content, len(keys))
         values = fields.rows(place, content, "values", len(keys), size)
-    return Variables(str(kind), keys, values, fields.flag(f"variables[{index}]", content, "fixed"))
+    fixed = fields.flag(f"variables[{index}]", content, "fixed")
+    stamps = None if content.get("stamps") is None else _read_numbers(place, content, "stamps", len(keys))
+    return Variables(str(kind), keys, values, fixed, stamps)
 
 
 def _read_factors(index: int, content: Map) -> Factors:
@@ -107,7 +111,7 @@ def _read_factors(index: int, content: Map) -> Factors:
     keys = fields.keys(place, content, len(known.connects))
     measured = fields.rows(place, content, "measured", len(keys), known.size)
     information = fields.rows(place, content, "information", len(keys), known.information_size)
-    ids = _read_ids(place, content, len(keys)) if "ids" in content else None
+    ids = _read_numbers(place, content, "ids", len(keys)) if "ids" in content else None
     loss = content.get("loss")
     if loss is None:
         return Factors(known.name, keys, measured, information, ids=ids)
@@ -119,10 +123,11 @@ def _read_factors(index: int, content: Map) -> Factors:
     return Factors(known.name, keys, measured, information, loss, scale, ids)
 
 
-def _read_ids(place: Callable[[], str], content: Map, count: int) -> I64:
-    value = fields.binary(place(), content, "ids")
+def _read_numbers(place: Callable[[], str], content: Map, name: str, count: int) -> I64:
+    """A column with one int64 for each row."""
+    value = fields.binary(place(), content, name)
     if len(value) != 8 * count:
-        raise BadMessage(f"{place()}.ids", f"{len(value)} bytes", f"{8 * count} ({count} int64)")
+        raise BadMessage(f"{place()}.{name}", f"{len(value)} bytes", f"{8 * count} ({count} int64)")
     return np.ndarray((count,), I8, value)
 
 

@@ -23,12 +23,14 @@ class Variables(NamedTuple):
 
     keys (n,); values (n, kind.size) in the kind's order, or None: the service composes a value from the first
     factor of the same insert that reaches the variable.  fixed: not estimated (the gauge of a map).
+    stamps (n,): when each was, nanoseconds of the sender's clock, NO_STAMP of one without; None: none has one.
     """
 
     kind: str
     keys: I64
     values: F64 | None = None
     fixed: bool = False
+    stamps: I64 | None = None
 
 
 class Factors(NamedTuple):

@@ -62,6 +62,14 @@ class BadSymbol(Problem):
         super().__init__(f"variable key {text!r} cannot be read: wanted {wanted}", seen=text)
 
 
+class BadStamp(Problem):
+    code = "bad_stamp"
+
+    def __init__(self, where: str, seen: str) -> None:
+        wanted = "whole nanoseconds, an int from -2^63 + 1 to 2^63 - 1; of seconds t that is round(t * 1e9)"
+        super().__init__(f"{where}: stamp is {seen}; wanted {wanted}", where=where, seen=seen, wanted=wanted)
+
+
 class BadName(Problem):
     code = "bad_name"
 

@@ -8,6 +8,8 @@ from factorbus.proto.version import __version__
 
 # The fields of an insert: a reader skips those that it does not know.
 INSERT_FIELDS = ("sequence", "epoch", "settle", "points_below", "changes", "variables", "factors")
+# Those of a group of variables in it, likewise.
+VARIABLE_FIELDS = ("kind", "keys", "values", "fixed", "stamps")
 
 
 def known() -> dict[str, Any]:
@@ -16,6 +18,7 @@ def known() -> dict[str, Any]:
         "version": 1,
         "product": __version__,
         "insert": list(INSERT_FIELDS),
+        "variable_fields": list(VARIABLE_FIELDS),
         "variables": list(VARIABLE_KINDS),
         "factors": list(FACTOR_KINDS),
         "losses": list(LOSSES),

@@ -1,4 +1,4 @@
-"""Graph files in and out: g2o, TORO, iSAM and SLAM++ text are read, g2o, TUM and KITTI are written.
+"""Graph files in and out: g2o, TORO, iSAM, SLAM++ and TUM text are read, g2o, TUM and KITTI are written.
 
 `read` gives a `GraphFile`: the whole graph as one `Batch`, and its replay as one `Batch` a pose, in time order.
 """
@@ -6,16 +6,15 @@
 from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.numbering import IDS
-from factorbus.formats.reader import read
-from factorbus.formats.records import DIALECTS
+from factorbus.formats.reader import READS, read
 from factorbus.formats.steps import Steps
 from factorbus.formats.write_g2o import Written, as_g2o, g2o_text, write_g2o
 from factorbus.formats.write_kitti import kitti_text, write_kitti
-from factorbus.formats.write_tum import tum_text, write_tum
+from factorbus.formats.write_tum import tum_notes, tum_text, write_tum
 
 __all__ = [
-    "DIALECTS",
     "IDS",
+    "READS",
     "FormatError",
     "GraphFile",
     "Steps",
@@ -24,6 +23,7 @@ __all__ = [
     "g2o_text",
     "kitti_text",
     "read",
+    "tum_notes",
     "tum_text",
     "write_g2o",
     "write_kitti",

@@ -57,6 +57,8 @@ class GraphFile:
 
     def _joined(self) -> tuple[Batch, tuple[I64, ...]]:
         """The graph, and the lines of its factors, without what nothing is known of.  Raises FormatError."""
+        if self.dialect == "tum":
+            raise FormatError(self.path, None, "a trajectory, which has no measurements", "a graph, with its factors")
         if not self.batch.factors:
             if not self.poses:
                 raise FormatError(self.path, None, "no pose", "at least one pose to replay")
@@ -79,7 +81,8 @@ def _without(batch: Batch, lines: tuple[I64, ...], keys: I64) -> tuple[Batch, tu
         kept = ~np.isin(group.keys, keys)
         if kept.any():
             values = None if group.values is None else group.values[kept]
-            variables.append(group._replace(keys=group.keys[kept], values=values))
+            stamps = None if group.stamps is None else group.stamps[kept]
+            variables.append(group._replace(keys=group.keys[kept], values=values, stamps=stamps))
     for group, at in zip(batch.factors, lines, strict=True):
         kept = ~np.isin(group.keys, keys).any(axis=1)
         if kept.any():

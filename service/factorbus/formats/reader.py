@@ -17,12 +17,15 @@ from factorbus.formats.mixtures import best_components
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
 from factorbus.formats.parallax import lone_bearings
-from factorbus.formats.records import G2O, SWITCH_PRIOR, Dialect, Vertex
+from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
+from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
 from factorbus.formats.rotations import normalised_poses
 from factorbus.formats.sniff import named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.symbols import MAX_INDEX, format_symbol
+
+READS = (*DIALECTS, TUM)
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
 _OF_POSES = {"prior_point2": "position_se2", "prior_point3": "position_se3"}
@@ -31,13 +34,14 @@ _CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 
 
 def read(path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False) -> GraphFile:
-    """The graph in `path`: g2o, TORO, iSAM or SLAM++ text, plain or gzipped.
+    """The graph in `path`: g2o, TORO, iSAM, SLAM++ or TUM text, plain or gzipped.
 
-    dialect: "g2o", "toro", "isam" or "slam++"; without it the names of the records decide, and the ending where they
-    do not; a guess is in the notes.  Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is
-    2^56 or more, as GTSAM's symbols and time stamps are, all keys are the ids themselves.  Quaternions are normalised;
-    angles stay as they are.  Records that have no kind here are left out, which `notes` and `left_out` say; with
-    `strict` they are refused.  Raises FormatError, which names the file and the line.
+    dialect: "g2o", "toro", "isam", "slam++" or "tum"; without it the names of the records decide, and the ending where
+    they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.  Keys are
+    symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols and time
+    stamps are, all keys are the ids themselves.  Quaternions are normalised; angles stay as they are.  Records that
+    have no kind here are left out, which `notes` and `left_out` say; with `strict` they are refused.  Raises
+    FormatError, which names the file and the line.
     """
     with np.errstate(all="ignore"):  # what overflows is not finite or not positive definite, and refused as such
         return _read(Path(path), dialect, strict)
@@ -46,6 +50,8 @@ def read(path: str | os.PathLike[str], dialect: str | None = None, strict: bool 
 def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     file = str(path)
     buckets = read_buckets(path)
+    if dialect == TUM or (dialect is None and is_trajectory(buckets)):
+        return read_trajectory(file, buckets)
     guess = sniffed(path, buckets) if dialect is None else named(file, dialect)
     chosen, left = guess.dialect, LeftOut(file, strict)
     if guess.why:

@@ -10,6 +10,7 @@ from factorbus.formats.schedule import POSES, Roster, Schedule, roster, schedule
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +19,7 @@ class _VariableColumns:
     keys: I64
     values: F64 | None
     fixed: bool
+    stamps: I64 | None
     bounds: list[int]
 
 
@@ -70,7 +72,8 @@ class Steps(Sequence[Batch]):
             low, high = group.bounds[k], group.bounds[k + 1]
             if low < high:
                 values = None if group.values is None else group.values[low:high]
-                variables.append(Variables(group.kind, group.keys[low:high], values, group.fixed))
+                stamps = None if group.stamps is None else group.stamps[low:high]
+                variables.append(Variables(group.kind, group.keys[low:high], values, group.fixed, stamps))
         for group in self._factors:
             low, high = group.bounds[k], group.bounds[k + 1]
             if low < high:
@@ -115,32 +118,37 @@ def _variable_columns(
         fixed[plan.root] = valued[plan.root] = True
     columns = []
     for kind in VARIABLE_KINDS:
-        rows, table = _values(batch, kind)
+        rows, table, stamps = _values(batch, kind)
         for is_fixed in (True, False):
             for has_value in (True, False):
                 mine = (fixed[rows] == is_fixed) & (valued[rows] == has_value)
                 if mine.any():
-                    columns.append(_sorted(kind, rows[mine], table[mine], is_fixed, has_value, names, step, count))
+                    given = Variables(kind, rows[mine], table[mine] if has_value else None, is_fixed, stamps[mine])
+                    columns.append(_sorted(given, names, step, count))
     return columns
 
 
-def _sorted(
-    kind: str, rows: I64, table: F64, fixed: bool, valued: bool, names: Roster, step: I64, count: int
-) -> _VariableColumns:
+def _sorted(given: Variables, names: Roster, step: I64, count: int) -> _VariableColumns:
+    """By step.  given: in place of keys, rows in the roster."""
+    kind, rows, table, fixed, stamps = given
     order = np.lexsort((names.keys[rows] if kind in POSES else rows, step[rows]))
     rows = rows[order]
-    return _VariableColumns(kind, names.keys[rows], table[order] if valued else None, fixed, _bounds(step[rows], count))
+    values = None if table is None else table[order]
+    known = None if stamps is None or (stamps == NO_STAMP).all() else stamps[order]
+    return _VariableColumns(kind, names.keys[rows], values, fixed, known, _bounds(step[rows], count))
 
 
-def _values(batch: Batch, kind: str) -> tuple[I64, F64]:
-    """(rows in the roster, values) of the variables of a kind; the origin where the file has no value."""
+def _values(batch: Batch, kind: str) -> tuple[I64, F64, I64]:
+    """(rows in the roster, values, time stamps) of the variables of a kind; the origin where there is no value."""
     rows, tables, first = [np.empty(0, np.int64)], [np.empty((0, VARIABLE_KINDS[kind].size))], 0
+    stamps = [np.empty(0, np.int64)]
     for group in batch.variables:
         if group.kind == kind:
             rows.append(np.arange(first, first + len(group.keys)))
             tables.append(_origins(kind, len(group.keys)) if group.values is None else group.values)
+            stamps.append(np.full(len(group.keys), NO_STAMP) if group.stamps is None else group.stamps)
         first += len(group.keys)
-    return np.concatenate(rows), np.concatenate(tables)
+    return np.concatenate(rows), np.concatenate(tables), np.concatenate(stamps)
 
 
 def _origins(kind: str, count: int) -> F64:

@@ -4,22 +4,32 @@ import math
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from factorbus.formats.errors import FormatError
-from factorbus.proto.messages import Batch
+from factorbus.formats.left_out import shown
+from factorbus.proto.arrays import I64
+from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import SeveralRobots
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
 
-# (time stamp, x y z qx qy qz qw)
-Stamped = tuple[int, list[float]]
+
+class Stamped(NamedTuple):
+    """A pose, x y z qx qy qz qw: its key, the key's number (x12 → 12), and its time stamp in nanoseconds, if any."""
+
+    key: int
+    number: int
+    stamp: int | None
+    pose: list[float]
 
 
 def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
-    """The poses of each robot of `batch`, in the order of the stamps, by its letter ("" for keys without one).
+    """The poses of each robot of `batch`, in the order of time, by its letter ("" for keys without one).
 
-    A robot is the letter of its keys, and a time stamp the number of a key (x12 → 12), which is all of a key without a
-    letter.  2D poses lie in the plane z = 0.  Points are left out.  Raises FormatError, which speaks of `form`, for a
-    pose without a value.
+    A robot is the letter of its keys.  Its order is that of the time stamps where all its poses have one, else that of
+    the numbers of its keys, which of a key without a letter is all of it.  2D poses lie in the plane z = 0.  Points are
+    left out.  Raises FormatError, which speaks of `form`, for a pose without a value.
     """
     robots: dict[str, list[Stamped]] = defaultdict(list)
     for group in batch.variables:
@@ -29,10 +39,11 @@ def trajectories(batch: Batch, form: str) -> dict[str, list[Stamped]]:
                     form, None, f"{format_symbol(int(group.keys[0]))} has no value", "a value for every pose"
                 )
             lift = _lifted if group.kind == "se2" else list
-            for key, value in zip(group.keys.tolist(), group.values.tolist(), strict=True):
+            rows = zip(group.keys.tolist(), _stamps(group).tolist(), group.values.tolist(), strict=True)
+            for key, stamp, value in rows:
                 letter, number = symbol_parts(key)
-                robots[letter].append((number, lift(value)))
-    return {letter: sorted(robots[letter], key=lambda row: row[0]) for letter in sorted(robots)}
+                robots[letter].append(Stamped(key, number, None if stamp == NO_STAMP else stamp, lift(value)))
+    return {letter: _in_order(robots[letter]) for letter in sorted(robots)}
 
 
 def one_trajectory(batch: Batch, form: str, robot: str | None = None) -> list[Stamped]:
@@ -46,6 +57,19 @@ def one_trajectory(batch: Batch, form: str, robot: str | None = None) -> list[St
     if robot not in found:
         raise SeveralRobots(robot, tuple(found))
     return found[robot]
+
+
+def untimed(rows: list[Stamped]) -> list[Stamped]:
+    """The poses without a time stamp of a trajectory in which others have one: there is no time to give them."""
+    lacking = [row for row in rows if row.stamp is None]
+    return lacking if len(lacking) < len(rows) else []
+
+
+def untimed_note(rows: list[Stamped]) -> str:
+    """What is to be said of those, for people; empty: there are none."""
+    lacking = untimed(rows)
+    names = shown([format_symbol(row.key) for row in lacking])
+    return f"{len(lacking)} poses left out: others have a time stamp and {names} none" if lacking else ""
 
 
 def write_trajectories(
@@ -68,6 +92,16 @@ def write_trajectories(
         file.write_text(text(rows), encoding="ascii")
         files.append(file)
     return files
+
+
+def _stamps(group: Variables) -> I64:
+    return group.keys * 0 + NO_STAMP if group.stamps is None else group.stamps
+
+
+def _in_order(rows: list[Stamped]) -> list[Stamped]:
+    if any(row.stamp is None for row in rows):
+        return sorted(rows, key=lambda row: row.number)
+    return sorted(rows, key=lambda row: (row.stamp, row.number))
 
 
 def _lifted(pose: list[float]) -> list[float]:

@@ -14,6 +14,7 @@ from factorbus.formats.numbering import numbered
 from factorbus.formats.records import G2O, Edge
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 _VERTEX_NAMES = {record.kind: name for name, record in G2O.vertices.items()}
@@ -54,10 +55,10 @@ def g2o_text(batch: Batch, strict: bool = False, ids: str = "auto") -> str:
 def as_g2o(batch: Batch, strict: bool = False, ids: str = "auto") -> Written:
     """`batch` as g2o text: parameters, vertices, FIX, edges, each in the order of the batch.
 
-    What g2o has no record for is left out and said: losses (the edge stays, without), factors and variables of other
-    kinds, variables without a value that no edge names.  With `strict` it is refused instead.  Variables without a
-    value get no vertex line.  ids: how keys become ids (`numbering.numbered`).  Raises FormatError, before anything is
-    written.
+    What g2o has no record for is left out and said: losses (the edge stays, without), time stamps, factors and
+    variables of other kinds, variables without a value that no edge names.  With `strict` it is refused instead.
+    Variables without a value get no vertex line.  ids: how keys become ids (`numbering.numbered`).  Raises FormatError,
+    before anything is written.
     """
     left = LeftOut("g2o", strict)
     kept = _writable(batch, left)
@@ -107,6 +108,8 @@ def _writable(batch: Batch, left: LeftOut) -> Batch:
             variables.append(group)
         else:
             left.drop(group.kind, len(group.keys), "g2o has no record for such variables")
+        stamps = 0 if group.stamps is None else int((group.stamps != NO_STAMP).sum())
+        left.drop("time stamps", stamps, f"g2o has no record for when a {group.kind} was")
     gone = np.concatenate(
         [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in _VERTEX_NAMES)]
     )

@@ -23,7 +23,7 @@ def kitti_text(batch: Batch, robot: str | None = None) -> str:
 
 
 def _text(rows: list[Stamped]) -> str:
-    return "".join(f"{' '.join(map(repr, _matrix(pose)))}\n" for _, pose in rows)
+    return "".join(f"{' '.join(map(repr, _matrix(pose)))}\n" for *_, pose in rows)
 
 
 def _matrix(pose: Sequence[float]) -> list[float]:

@@ -22,4 +22,6 @@ def follow(chain: bytes, delta: bytes) -> bytes:
         digest.update(group.keys.tobytes())
         if group.values is not None:
             digest.update(group.values.tobytes())
+        if group.stamps is not None:
+            digest.update(group.stamps.tobytes())
     return digest.digest()

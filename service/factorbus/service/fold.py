@@ -226,7 +226,7 @@ class Folder(Holding):
             account["converging"] = solver.unfinished or not report.converged
             answer, delta = write_messages(
                 insert.sequence, self._epoch, self._revision + 1, first_factor, self._pack(account), changed,
-                graph.var, graph.keys, graph.values, WORDS, LETTERS, self._out,
+                graph.var, graph.keys, graph.values, graph.stamps, WORDS, LETTERS, self._out,
             )  # fmt: skip
         except Exception:
             log.exception("the messages of a step could not be written in one piece")

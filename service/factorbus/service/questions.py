@@ -19,6 +19,7 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import BadOption, Problem, UnknownQuestion
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
+from factorbus.proto.stamps import NO_STAMP
 from factorbus.service.lacking import NotInMap
 from factorbus.service.room import COPIES, Room
 from factorbus.service.uncertain import DECODE, Uncertain, check_keys, is_near
@@ -185,7 +186,7 @@ def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
 
 def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
     """The solver's groups as what the codec takes."""
-    return tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in groups)
+    return tuple(Variables(g.kind, g.keys, g.values, g.fixed, g.stamps) for g in groups)
 
 
 def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
@@ -265,7 +266,10 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
     for group in groups:
         rows = np.isin(group.keys, keys)
         if rows.any() and group.values is not None:
-            chosen.append(Variables(group.kind, group.keys[rows], group.values[rows], group.fixed))
+            stamps = None if group.stamps is None else group.stamps[rows]
+            told = stamps is not None and (stamps != NO_STAMP).any()
+            columns = group.keys[rows], group.values[rows]
+            chosen.append(Variables(group.kind, *columns, group.fixed, stamps if told else None))
             missing = np.setdiff1d(missing, group.keys[rows])
     if missing.size:
         raise NotInMap(missing)
@@ -274,9 +278,11 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
 
 def _text(question: Question, batch: Batch) -> tuple[str, list[str]]:
     """(the file, what was left out of it).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import as_g2o, kitti_text, tum_text  # only who asks for an export pays for it
+    from factorbus.formats import as_g2o, kitti_text, tum_notes, tum_text  # only who asks for an export pays for it
 
     if question.format == "g2o":
         written = as_g2o(batch, question.strict, question.ids)
         return written.text, list(written.notes)
-    return {"tum": tum_text, "kitti": kitti_text}[question.format](batch, question.robot), []
+    if question.format == "tum":
+        return tum_text(batch, question.robot), list(tum_notes(batch, question.robot))
+    return kitti_text(batch, question.robot), []

@@ -80,6 +80,8 @@ def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
     )  # fmt: skip
     if wrong != at.GOOD:
         raise _bad_variable(kind.name, wrong, int(keys[row]), values[row] if len(values) else None)
+    stamps = None if group.stamps is None else _column(group.stamps, _I64, (keys.size,), group.kind, "stamps")
+    graph.stamp_last(keys.size, stamps)
     return keys.size, group.values is not None
 
 

@@ -24,6 +24,7 @@ def edited(graph: Graph, edits: Edits) -> Graph:
     stays, kept = np.flatnonzero(edits.stays), np.flatnonzero(edits.kept)
     made = Graph()
     made.keys, made.var, made.fac = graph.keys[stays], graph.var[stays], graph.fac[kept]
+    made.stamps = graph.stamps[stays]
     _pack_values(edits.values, made)
     columns = _number_columns(made, edits.free[stays])
     _pack_payload(graph, made, edits.loss[kept], edits.scale[kept], edits.weight[kept])
@@ -32,6 +33,7 @@ def edited(graph: Graph, edits: Edits) -> Graph:
     enter_keys(stays.size, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = stays.size, kept.size, made.values.size
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = made.payload.size, columns, made.dims[:columns].sum()
+    made.counts[at.STAMPED] = np.count_nonzero(made.stamps != at.NO_STAMP)
     made.name_factors(graph.ids_of(kept), graph.next_id)
     return made
 

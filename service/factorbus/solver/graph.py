@@ -41,6 +41,7 @@ class Graph(Arenas):
         self.keys: I64 = np.empty(256, np.int64)
         self.var: I64 = lines((256, at.V_WIDTH), np.int64)
         self.dims: I64 = np.empty(256, np.int64)
+        self.stamps: I64 = np.empty(256, np.int64)
         self.values: F64 = np.zeros(1024)
         self.fac: I64 = lines((512, at.F_WIDTH), np.int64)
         self.payload: F64 = np.empty(8192)
@@ -65,13 +66,15 @@ class Graph(Arenas):
         remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
         self.counts[:] = mark
         if self._rows.forget(mark[at.VARIABLES]):
-            self.keys = self.keys.copy()  # somebody may have an estimate of what is gone, and its keys
+            # Somebody may have an estimate of what is gone, its keys and stamps.
+            self.keys, self.stamps = self.keys.copy(), self.stamps.copy()
 
     def copied(self) -> "Graph":
         """The same graph with arrays of its own, as large as what is in use."""
-        variables, factors, values, payload, columns, _ = self.counts.tolist()
+        variables, factors, values, payload, columns, *_ = self.counts.tolist()
         other = Graph()
         other.keys, other.var = self.keys[:variables].copy(), self.var[:variables].copy()
+        other.stamps = self.stamps[:variables].copy()
         other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
         other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
         other.fac = self.fac[:factors].copy()
@@ -82,7 +85,8 @@ class Graph(Arenas):
         """Make room for `more` variables of `size` numbers each."""
         counts = self.counts.tolist()
         if (need := counts[at.VARIABLES] + more) > self.keys.size:
-            self.keys, self.var, self.dims = (grown(a, need) for a in (self.keys, self.var, self.dims))
+            together = self.keys, self.var, self.dims, self.stamps
+            self.keys, self.var, self.dims, self.stamps = (grown(array, need) for array in together)
         if (need := counts[at.VALUES] + more * size) > self.values.size:
             self.values = grown(self.values, need)
         if 2 * (counts[at.VARIABLES] + more) > self.table.size:
@@ -104,8 +108,22 @@ class Graph(Arenas):
 
     def memory_bytes(self) -> int:
         """Bytes in use of all arenas."""
-        variables, factors, values, payload, columns, _ = self.counts.tolist()
-        return 8 * (variables * (at.V_WIDTH + 1) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
+        variables, factors, values, payload, columns, *_ = self.counts.tolist()
+        return 8 * (variables * (at.V_WIDTH + 2) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
+
+    def stamp_last(self, count: int, stamps: I64 | None) -> None:
+        """The last `count` variables, which are new, have these time stamps; None: none."""
+        variables = int(self.counts[at.VARIABLES])
+        self.stamps[variables - count : variables] = at.NO_STAMP if stamps is None else stamps
+        if stamps is not None:
+            self.counts[at.STAMPED] += np.count_nonzero(stamps != at.NO_STAMP)
+
+    def stamps_of(self, rows: I64) -> I64 | None:
+        """The time stamps of the variables at these indices, NO_STAMP of one without; None: none of them has one."""
+        if not self.counts[at.STAMPED]:
+            return None
+        stamps = self.stamps[rows]
+        return stamps if (stamps != at.NO_STAMP).any() else None
 
     @property
     def next_id(self) -> int:
@@ -140,12 +158,12 @@ class Graph(Arenas):
     def variables(self, picked: I64 | None = None) -> list[Group]:
         """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness.
 
-        Of all variables, keys and the values of fixed ones are read-only: they may have been given before.
+        Of all variables, keys, stamps and the values of fixed ones are read-only: they may have been given before.
         """
         if picked is None:
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
-            keys, values = self.keys, self.values
-            return [span.group(keys, values) if span.together else self._scattered(span) for span in spans]
+            keys, values, stamps = self.keys, self.values, self.stamps if self.counts.item(at.STAMPED) else None
+            return [span.group(keys, values, stamps) if span.together else self._scattered(span) for span in spans]
         if (label := label_of(picked, self.places)) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
@@ -153,16 +171,19 @@ class Graph(Arenas):
         return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
 
     def _scattered(self, span: Span) -> Group:
-        values = np.empty((span.count, span.size))
-        gather(span.rows(), self.places, _NO_KEYS, values)
+        values, rows = np.empty((span.count, span.size)), span.rows()
+        gather(rows, self.places, _NO_KEYS, values)
         values.flags.writeable = not span.fixed  # as where they are together
-        return Group(span.kind, span.keys_apart(self.keys), values, span.fixed)
+        stamps = self.stamps_of(rows)
+        if stamps is not None:
+            stamps.flags.writeable = False
+        return Group(span.kind, span.keys_apart(self.keys), values, span.fixed, stamps)
 
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
         keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
         gather(rows, self.places, keys, values)
-        return Group(kind.name, keys, values, fixed=bool(label % 2))
+        return Group(kind.name, keys, values, bool(label % 2), self.stamps_of(rows))
 
     def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:
         """All factors, or the first `most`: a copy, a group for each kind and loss.
@@ -202,9 +223,9 @@ class Graph(Arenas):
         return int(np.count_nonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)))
 
     def columns_bytes(self) -> tuple[int, int]:
-        """Bytes of all variables, and of all factors, as columns: keys, and values or measurement and information."""
-        variables, factors, values, payload, *_ = self.counts.tolist()
-        return 8 * (variables + values), 8 * (2 * factors + payload)
+        """Bytes of all variables, and of all factors, as columns, keys and stamps included."""
+        variables, factors, values, payload, *_, stamped = self.counts.tolist()
+        return 8 * (variables * (2 if stamped else 1) + values), 8 * (2 * factors + payload)
 
     def describe(self, row: I64) -> str:
         """One row of `fac`, for a person."""

@@ -8,7 +8,10 @@ from factorbus.solver.kernels._jit import F64, I64
 
 
 class VariablesLike(Protocol):
-    """Variables of one kind that come in: keys (n,), values (n, size) or None, fixed: not estimated."""
+    """Variables of one kind that come in: keys (n,), values (n, size) or None, fixed: not estimated.
+
+    stamps (n,): time stamps, carried and given back; `layout.NO_STAMP` of one without, None of all.
+    """
 
     @property
     def kind(self) -> str: ...
@@ -18,6 +21,8 @@ class VariablesLike(Protocol):
     def values(self) -> F64 | None: ...
     @property
     def fixed(self) -> bool: ...
+    @property
+    def stamps(self) -> I64 | None: ...
 
 
 class FactorsLike(Protocol):
@@ -50,7 +55,7 @@ class BatchLike(Protocol):
 
 
 class Group(NamedTuple):
-    """Variables of one kind with their values: keys (n,), values (n, size).
+    """Variables of one kind with their values: keys (n,), values (n, size); stamps (n,) where any of them has one.
 
     A named tuple, since an estimate after every step makes them, and a frozen dataclass takes three times as long.
     """
@@ -59,6 +64,7 @@ class Group(NamedTuple):
     keys: I64
     values: F64
     fixed: bool = False
+    stamps: I64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

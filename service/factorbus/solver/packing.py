@@ -49,6 +49,14 @@ class Packing:
                 shape += (group.kind, group.fixed, keys.shape, values.shape)
             else:
                 return None
+            stamps = group.stamps
+            if stamps is None:
+                shape.append(None)
+            elif type(stamps) is ndarray and (stamps.dtype is _I64 or stamps.dtype == _I64):
+                raw.append(stamps)
+                shape.append(stamps.shape)
+            else:
+                return None
         shape.append(_FACTORS)
         for group in batch.factors:
             keys, measured, information = group.keys, group.measured, group.information
@@ -81,17 +89,19 @@ class Packing:
 
 
 def _laid_out(shape: tuple) -> I64 | None:
-    """shape: four entries for each group of variables, the word _FACTORS, four for each group of factors."""
-    end = next(k for k in range(0, len(shape), 4) if shape[k] is _FACTORS)
+    """shape: five entries for each group of variables, the word _FACTORS, four for each group of factors."""
+    end = next(k for k in range(0, len(shape), 5) if shape[k] is _FACTORS)
     rows, offset = [], 0
-    for k in range(0, end, 4):
-        name, fixed, keys, values = shape[k : k + 4]
+    for k in range(0, end, 5):
+        name, fixed, keys, values, stamps = shape[k : k + 5]
         kind = VARIABLE_KINDS.get(name)
-        if kind is None or len(keys) != 1 or values not in (None, (keys[0], kind.size)):
+        if kind is None or len(keys) != 1 or values not in (None, (keys[0], kind.size)) or stamps not in (None, keys):
             return None
         numbers = offset + 8 * keys[0]
-        rows.append((kind.code, 0, keys[0], fixed, 1, kind.size, 0, offset, -1 if values is None else numbers, -1))
-        offset = numbers + (0 if values is None else 8 * keys[0] * kind.size)
+        behind = numbers + (0 if values is None else 8 * keys[0] * kind.size)
+        where = (-1 if values is None else numbers, -1, -1 if stamps is None else behind)
+        rows.append((kind.code, 0, keys[0], fixed, 1, kind.size, 0, offset, *where))
+        offset = behind + (0 if stamps is None else 8 * keys[0])
     for k in range(end + 1, len(shape), 4):
         name, keys, measured, information = shape[k : k + 4]
         kind = FACTOR_KINDS.get(name)
@@ -102,7 +112,7 @@ def _laid_out(shape: tuple) -> I64 | None:
             return None
         numbers = offset + 8 * count * arity
         behind = numbers + 8 * count * kind.size
-        rows.append((kind.code, 1, count, 0, arity, kind.size, kind.triangle, offset, numbers, behind))
+        rows.append((kind.code, 1, count, 0, arity, kind.size, kind.triangle, offset, numbers, behind, -1))
         offset = behind + 8 * count * kind.triangle
     if sum(row[at.G_COUNT] for row in rows) > _FEW:
         return None

@@ -70,6 +70,7 @@ def with_points(graph: Graph, features: I64) -> Graph:
     enter_keys(variables, made.table, made.keys)
     made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = variables, factors, values.size
     made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = payload.size, np.count_nonzero(free), dims[free].sum()
+    made.stamps, made.counts[at.STAMPED] = graph.stamps[:variables].copy(), graph.counts[at.STAMPED]
     made.ids, made.id_shift = graph.ids, graph.id_shift
     return made
 

@@ -25,7 +25,7 @@ class Span:
     """
 
     __slots__ = (
-        "_apart", "_held", "_keys", "_keys_seen", "_known", "_rows", "_values", "_values_seen",
+        "_apart", "_held", "_keys", "_keys_seen", "_known", "_rows", "_stamped", "_values", "_values_seen",
         "behind", "count", "first", "fixed", "kind", "label", "size", "start", "together",
     )  # fmt: skip
 
@@ -38,16 +38,18 @@ class Span:
         self._values, self._values_seen = _NO_VALUES, _NO_VALUES
         self._held: Group | None = None  # of fixed ones, whose values stay
         self._apart, self._known = _NO_KEYS, 0  # keys of the first so many, of those that are not together
+        self._stamped = False  # whether any of them is known to have a time stamp
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
         """For copies: their arenas are others."""
         own = {name: getattr(self, name) for name in self.__slots__}
         return None, own | {"_keys_seen": _NO_KEYS, "_values_seen": _NO_VALUES, "_held": None}
 
-    def group(self, keys: I64, values: F64) -> Group:
+    def group(self, keys: I64, values: F64, stamps: I64 | None) -> Group:
         """Their keys and a copy of their values, while they are together: then no others are between them.
 
-        What never changes, keys and the values of fixed variables, may have been given before, and is read-only.
+        stamps: of all variables; None: none has one.  What never changes, keys, stamps and the values of fixed
+        variables, may have been given before, and is read-only.
         """
         if self._keys_seen is not keys or self._values_seen is not values:
             self._look_at(keys, values)
@@ -55,11 +57,21 @@ class Span:
             return self._held
         count = self.count
         # By no call that Python would have to bind the fields for: a robot asks for this after every step.
-        group = _new(Group, (self.kind, self._keys[:count], self._values[:count].copy(), self.fixed))
+        own = None if stamps is None else self._stamps(stamps)
+        group = _new(Group, (self.kind, self._keys[:count], self._values[:count].copy(), self.fixed, own))
         if self.fixed:
             group.values.flags.writeable = False
             self._held = group
         return group
+
+    def _stamps(self, stamps: I64) -> I64 | None:
+        """Their time stamps; None: none of them has one."""
+        own = stamps[self.first : self.behind]
+        self._stamped = self._stamped or bool((own != at.NO_STAMP).any())
+        if not self._stamped:
+            return None
+        own.flags.writeable = False
+        return own
 
     def keys_apart(self, keys: I64) -> I64:
         """Their keys where they are not together, read-only."""
@@ -97,7 +109,7 @@ class Span:
     def forget(self, variables: int) -> None:
         """Only those below `variables` are left."""
         if variables < self.behind:
-            self._held = None
+            self._held, self._stamped = None, False
             left = self.rows()
             self.count = int(np.searchsorted(left, variables))
             if self._known > self.count:  # what is behind them may have been given to somebody

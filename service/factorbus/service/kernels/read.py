@@ -58,6 +58,7 @@ def read_group(raw: bytes, here: int, factors: int, words: I64, letters: U8, gro
     """Read one group of variables or factors into its row; gives where to read on."""
     kind, seen, fixed = -1, 0, 0
     keys, keys_size, numbers, numbers_size, information, information_size = -1, 0, -1, 0, -1, 0
+    stamps, stamps_size = -1, 0
     fields, here = read_head(raw, here, _MAP)
     for _ in range(fields):
         row, here = read_word(raw, here, w.IN_GROUP, words, letters)
@@ -70,14 +71,13 @@ def read_group(raw: bytes, here: int, factors: int, words: I64, letters: U8, gro
         elif field == w.KEYS:
             keys, keys_size, here = read_bin(raw, here)
         elif field == (w.MEASURED if factors else w.VALUES):
-            if not factors and here < len(raw) and np.int64(raw[here]) == _NIL:
-                here += 1
-            else:
-                numbers, numbers_size, here = read_bin(raw, here)
+            numbers, numbers_size, here = read_bin(raw, here) if factors else read_bin_or_nil(raw, here)
         elif factors and field == w.INFORMATION:
             information, information_size, here = read_bin(raw, here)
         elif not factors and field == w.FIXED:
             fixed, here = read_flag(raw, here)
+        elif not factors and field == w.STAMPS:
+            stamps, stamps_size, here = read_bin_or_nil(raw, here)
         else:
             return _LOST
         if here < 0:
@@ -90,11 +90,14 @@ def read_group(raw: bytes, here: int, factors: int, words: I64, letters: U8, gro
         return _LOST
     if (factors or numbers >= 0) and numbers_size != 8 * count * size:
         return _LOST
+    if stamps >= 0 and stamps_size != 8 * count:
+        return _LOST
     if factors and (numbers < 0 or information < 0 or information_size != 8 * count * triangle):
         return _LOST
     group[at.G_KIND], group[at.G_FACTORS], group[at.G_COUNT] = words[kind, w.W_CODE], factors, count
     group[at.G_FIXED], group[at.G_ARITY], group[at.G_SIZE], group[at.G_TRIANGLE] = fixed, arity, size, triangle
     group[at.G_KEYS], group[at.G_NUMBERS], group[at.G_INFORMATION] = keys, numbers, information
+    group[at.G_STAMPS] = stamps
     return here
 
 
@@ -156,6 +159,14 @@ def read_bin(raw: bytes, here: int) -> tuple:
     if start < 0 or start + size > len(raw):
         return -1, 0, _LOST
     return start, size, start + size
+
+
+@inline_kernel
+def read_bin_or_nil(raw: bytes, here: int) -> tuple:
+    """The same; of nil, which is the same as no such field, there is no content."""
+    if 0 <= here < len(raw) and np.int64(raw[here]) == _NIL:
+        return -1, 0, here + 1
+    return read_bin(raw, here)
 
 
 @inline_kernel

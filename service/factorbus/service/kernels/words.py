@@ -29,7 +29,7 @@ FACTOR_KIND = 4
 
 # Codes of the fields of an insert, and of those of a group.
 SEQUENCE, EPOCH, SETTLE, VARIABLES, FACTORS = range(5)
-KIND, KEYS, VALUES, FIXED, MEASURED, INFORMATION = range(6)
+KIND, KEYS, VALUES, FIXED, MEASURED, INFORMATION, STAMPS = range(7)
 
 # What stands between the numbers of the messages that are written; a piece's code is its row.
 _PIECES = (
@@ -46,10 +46,11 @@ _PIECES = (
     b"\xa4keys",
     b"\xa6values",
     b"\xa5fixed\xc3",
+    b"\xa6stamps",
 )
 (
     P_SEQUENCE, P_EPOCH, P_REVISION, P_FIRST_FACTOR, P_FOLDED, P_REPORT, P_DELTA, P_PREVIOUS, P_VARIABLES, P_KIND,
-    P_KEYS, P_VALUES, P_FIXED,
+    P_KEYS, P_VALUES, P_FIXED, P_STAMPS,
 ) = range(len(_PIECES))  # fmt: skip
 
 # The longest string that MessagePack gives a head of one byte; others are no words.
@@ -58,7 +59,7 @@ LONGEST = 31
 
 def _table() -> tuple[I64, U8]:
     insert = (b"sequence", b"epoch", b"settle", b"variables", b"factors")
-    group = (b"kind", b"keys", b"values", b"fixed", b"measured", b"information")
+    group = (b"kind", b"keys", b"values", b"fixed", b"measured", b"information", b"stamps")
     rows = [(piece, PIECE, code, 0, 0, 0) for code, piece in enumerate(_PIECES)]
     rows += [(name, IN_INSERT, code, 0, 0, 0) for code, name in enumerate(insert)]
     rows += [(name, IN_GROUP, code, 0, 0, 0) for code, name in enumerate(group)]

@@ -7,12 +7,12 @@ from factorbus.service.kernels.compile import F64, I64, U8, inline_kernel, kerne
 from factorbus.solver.kernels import layout as at
 
 # No message is longer than this but for its columns and its report; nor is what a group adds to its columns.
-_MOST_HEAD, _MOST_GROUP = 128, 80
+_MOST_HEAD, _MOST_GROUP = 128, 96
 
 
 @kernel(
     "UniTuple(int64, 2)(int64, int64, int64, int64, Bytes(uint8, 1, 'C', readonly=True), int64[::1], int64[:,::1],"
-    " int64[::1], float64[::1], int64[:,::1], uint8[::1], uint8[::1])"
+    " int64[::1], float64[::1], int64[::1], int64[:,::1], uint8[::1], uint8[::1])"
 )
 def write_messages(
     sequence: int,
@@ -24,6 +24,7 @@ def write_messages(
     var: I64,
     keys: I64,
     values: F64,
+    stamps: I64,
     words: I64,
     letters: U8,
     out: U8,
@@ -32,7 +33,7 @@ def write_messages(
 
     report: encoded, in both.  changed: the variables that the delta tells of, ascending.
     """
-    groups, columns = count_groups(changed, var, words)
+    groups, stamped, columns = count_groups(changed, var, stamps, words)
     size = 2 * (_MOST_HEAD + len(report)) + columns
     for label in range(groups.size):
         if groups[label] > 0:
@@ -48,32 +49,37 @@ def write_messages(
     here = write_integer(out, write_piece(out, answer, w.P_DELTA, words, letters), epoch)
     here = write_integer(out, write_piece(out, here, w.P_REVISION, words, letters), revision)
     here = write_integer(out, write_piece(out, here, w.P_PREVIOUS, words, letters), revision - 1)
-    here = write_variables(out, write_piece(out, here, w.P_VARIABLES, words, letters), groups, changed, var, keys,
-                           values, words, letters)  # fmt: skip
+    here = write_variables(out, write_piece(out, here, w.P_VARIABLES, words, letters), groups, stamped, changed, var,
+                           keys, values, stamps, words, letters)  # fmt: skip
     here = write_bytes(out, write_piece(out, here, w.P_REPORT, words, letters), report, 0, len(report))
     return answer, here - answer
 
 
 @part
-def count_groups(changed: I64, var: I64, words: I64) -> tuple:
-    """(how many there are of each kind, those that are not fixed before those that are; bytes of their columns)."""
+def count_groups(changed: I64, var: I64, stamps: I64, words: I64) -> tuple:
+    """(how many there are of each kind, those that are not fixed before those that are; how many of them have a time
+    stamp; bytes of their columns)."""
     kinds = 0
     for row in range(words.shape[0]):
         if words[row, w.W_ROLE] == w.VARIABLE_KIND:
             kinds = max(kinds, words[row, w.W_CODE] + 1)
-    groups, size = np.zeros(2 * kinds, np.int64), 0
+    groups, stamped, size = np.zeros(2 * kinds, np.int64), np.zeros(2 * kinds, np.int64), 0
     for n in range(changed.size):
-        groups[label_of(changed[n], var)] += 1
+        label = label_of(changed[n], var)
+        groups[label] += 1
+        stamped[label] += 1 if stamps[changed[n]] != at.NO_STAMP else 0
     for label in range(groups.size):
         if groups[label] > 0:
-            size += 8 * groups[label] * (1 + words[w.row_of_variables(label // 2, words), w.W_SIZE])
-    return groups, size
+            columns = 1 + words[w.row_of_variables(label // 2, words), w.W_SIZE] + (1 if stamped[label] > 0 else 0)
+            size += 8 * groups[label] * columns
+    return groups, stamped, size
 
 
 @part
 def write_variables(
-    out: U8, here: int, groups: I64, changed: I64, var: I64, keys: I64, values: F64, words: I64, letters: U8
-) -> int:
+    out: U8, here: int, groups: I64, stamped: I64, changed: I64, var: I64, keys: I64, values: F64, stamps: I64,
+    words: I64, letters: U8,
+) -> int:  # fmt: skip
     """The field `variables` of a delta; gives where to write on."""
     here = write_count(out, here, 0x90, np.count_nonzero(groups))
     for label in range(groups.size):
@@ -82,7 +88,7 @@ def write_variables(
             continue
         row = w.row_of_variables(label // 2, words)
         size, fixed = words[row, w.W_SIZE], label % 2
-        out[here] = 0x83 + fixed
+        out[here] = 0x83 + fixed + (1 if stamped[label] > 0 else 0)
         here = write_piece(out, here + 1, w.P_KIND, words, letters)
         out[here] = 0xA0 + words[row, w.W_LENGTH]
         here = write_piece(out, here + 1, row, words, letters)
@@ -97,6 +103,11 @@ def write_variables(
                     here = write_word(out, here, np.float64(values[var[changed[n], at.V_AT] + c]).view(np.int64))
         if fixed:
             here = write_piece(out, here, w.P_FIXED, words, letters)
+        if stamped[label] > 0:
+            here = write_bin_head(out, write_piece(out, here, w.P_STAMPS, words, letters), 8 * count)
+            for n in range(changed.size):
+                if label_of(changed[n], var) == label:
+                    here = write_word(out, here, stamps[changed[n]])
     return here
 
 

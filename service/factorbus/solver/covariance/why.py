@@ -62,6 +62,7 @@ class VariableAccount:
     over the diagonal of Λ there, 1: no other variable takes anything from it, near 0: almost nothing holds it
     linearised_step, changed_step, seen_step: the steps that moved its linearisation point last, changed its estimate,
     brought a factor of it; −1: none, or the solver's mode keeps no such record
+    stamp: its time stamp; None: it has none
     """
 
     key: int
@@ -76,11 +77,14 @@ class VariableAccount:
     changed_step: int
     seen_step: int
     factors: list[FactorAccount] = field(default_factory=list)
+    stamp: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
         plain = {name: getattr(self, name) for name in self.__slots__}
         arrays = {name: plain[name].tolist() for name in ("value", "sigmas", "covariance")}
+        if self.stamp is None:
+            del plain["stamp"]
         return plain | arrays | {"factors": [each.as_dict() for each in self.factors]}
 
 
@@ -108,9 +112,10 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
     linearised_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
     value = graph.values[row[at.V_AT] : row[at.V_AT] + kind.size].copy()
     sigmas = np.sqrt(np.diag(covariance))
+    stamps = graph.stamps_of(np.array([variable]))
     return VariableAccount(
         int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearised_step,
-        changed, seen, factors,
+        changed, seen, factors, None if stamps is None else int(stamps[0]),
     )  # fmt: skip
 
 

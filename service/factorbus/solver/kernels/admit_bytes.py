@@ -30,10 +30,10 @@ def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
     """
     table, keys, var = ints(graph, at.T_TABLE), ints(graph, at.T_KEYS), int_rows(graph, at.T_VAR)
     values, dims, fac = floats(graph, at.T_VALUES), ints(graph, at.T_DIMS), int_rows(graph, at.T_FAC)
-    payload, counts = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS)
+    payload, counts, stamps = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS), ints(graph, at.T_STAMPS)
     before = counts.copy()
     v0, f0 = before[at.VARIABLES], before[at.FACTORS]
-    if take_groups(raw, groups, table, keys, var, values, dims, fac, payload, counts):
+    if take_groups(raw, groups, table, keys, var, values, dims, stamps, fac, payload, counts):
         if count_missing(groups) == 0:
             return f0
         reached = list_given(groups, counts[at.VARIABLES] - v0)
@@ -55,6 +55,7 @@ def take_groups(
     var: I64,
     values: F64,
     dims: I64,
+    stamps: I64,
     fac: I64,
     payload: F64,
     counts: I64,
@@ -71,7 +72,7 @@ def take_groups(
             if entries > keys.size or 2 * entries > table.size or counts[at.VALUES] + count * size > values.size:
                 return False
             for n in range(count):
-                if not take_variable(raw, groups[g], n, table, keys, var, values, dims, counts):
+                if not take_variable(raw, groups[g], n, table, keys, var, values, dims, stamps, counts):
                     return False
     for g in range(end):
         if groups[g, at.G_FACTORS] != 0:
@@ -87,7 +88,7 @@ def take_groups(
 
 @part
 def take_variable(
-    raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
+    raw: bytes, group: I64, n: int, table: I64, keys: I64, var: I64, values: F64, dims: I64, stamps: I64, counts: I64
 ) -> bool:
     """Append the n-th variable of a group, if it is in order."""
     kind, size, x = group[at.G_KIND], group[at.G_SIZE], counts[at.VALUES]
@@ -99,6 +100,9 @@ def take_variable(
         copy_numbers(raw, group[at.G_NUMBERS] + 8 * n * size, size, values, x)
         if check_value(kind, x, size, values) != at.GOOD:
             return False
+    stamp = word(raw, group[at.G_STAMPS] + 8 * n) if group[at.G_STAMPS] >= 0 else at.NO_STAMP
+    stamps[counts[at.VARIABLES]] = stamp
+    counts[at.STAMPED] += 1 if stamp != at.NO_STAMP else 0
     append_variable(kind, group[at.G_FIXED] != 0, key, slot, size, table, keys, var, dims, counts)
     return True
 

@@ -5,15 +5,16 @@ The arenas are:
     fac      (m, 8) int64    one row per factor, in insertion order
     values   float64         the variables' values, packed one after the other
     payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
-    counts   (6,)   int64    how much of each arena is in use
+    counts   (7,)   int64    how much of each arena is in use
     keys     (n,)   int64    the variables' keys
     table    int64           where a key is found (`admit`)
     dims     (c,)   int64    scalars of each block column of Λ
+    stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
 """
 
 # These in a graph's table (`places`).
-ARENAS = ("var", "fac", "values", "payload", "counts", "keys", "table", "dims")
-T_VAR, T_FAC, T_VALUES, T_PAYLOAD, T_COUNTS, T_KEYS, T_TABLE, T_DIMS = range(len(ARENAS))
+ARENAS = ("var", "fac", "values", "payload", "counts", "keys", "table", "dims", "stamps")
+T_VAR, T_FAC, T_VALUES, T_PAYLOAD, T_COUNTS, T_KEYS, T_TABLE, T_DIMS, T_STAMPS = range(len(ARENAS))
 
 # Columns of `var`.
 V_KIND = 0
@@ -45,7 +46,10 @@ VALUES = 2
 PAYLOAD = 3
 COLUMNS = 4
 SCALARS = 5
-COUNTS = 6
+STAMPED = 6  # variables that have a time stamp
+COUNTS = 7
+
+NO_STAMP = -(2**63)
 
 # Codes of the kinds of variables.
 SE2 = 0
@@ -129,5 +133,6 @@ G_TRIANGLE = 6  # numbers of an information matrix; 0 for variables
 G_KEYS = 7  # offset of the keys
 G_NUMBERS = 8  # offset of the values, -1: they come without; or of the measurements
 G_INFORMATION = 9  # offset of the information matrices; -1 for variables
-G_WIDTH = 10
+G_STAMPS = 10  # offset of the time stamps; -1: they have none, and factors have none
+G_WIDTH = 11
 END = -1
