@@ -30,9 +30,9 @@ from factorbus.solver.kernels.tree_take_in import next_incidence
 LEAST_BURDEN = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 MUCH = 8  # where more than one variable in so many has moved, all factors are gone through
-# The running sums are summed anew once what was added and taken away is so many times what is left.
+# The running sums are summed anew once what was added to them and taken away is so many times χ².
 CANCELLED = 1e5
-NOTHING = 1e-6  # χ², or Σ error²
+NOTHING = 1e-6  # χ²
 # In full the error of a factor with a loss counts so many times: Gauss-Newton with weights leaves up to seven times as
 # much of χ² as its next step takes off.
 ROBUST = 3.0
@@ -110,10 +110,8 @@ def evaluate_moved(
                     most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                     full, counted = full + more_full, counted + more_counted
                 slot = next_incidence(slot, link)
-    full, counted = max(full, 0.0), max(counted, 0.0)
-    lost = max(account[tl.A_ERROR] - CANCELLED * full, account[tl.A_COUNTED] - CANCELLED * counted)
-    account[tl.A_ADDED_UP] = math.inf if lost > CANCELLED * NOTHING else sizes
-    account[tl.A_CHI2], account[tl.A_ERROR], account[tl.A_COUNTED] = chi2, full, counted
+    account[tl.A_CHI2], account[tl.A_ADDED_UP] = chi2, sizes
+    account[tl.A_ERROR], account[tl.A_COUNTED] = max(full, 0.0), max(counted, 0.0)
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = STAYED
     state[tl.S_MOVED] = 0
@@ -136,7 +134,8 @@ def evaluate_factor(
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
     """χ² of factor f, whose first variable is v, and its linearization error, where more of it than its place moved.
 
-    Gives the error; by what χ² is more than before, and the sum of both; by what error² in full and as it counts is.
+    Gives the error; by what χ² is more than before; the sum of both, and of error² now and before; by what error² in
+    full and as it counts is more.
     """
     error = full = 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
@@ -162,7 +161,8 @@ def evaluate_factor(
     full, counted = full * full, error * error if error > bent else 0.0
     full_before, counted_before = stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED]
     stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED] = full, counted
-    return error, chi2 - was, chi2 + was, full - full_before, counted - counted_before
+    size = chi2 + was + full + full_before
+    return error, chi2 - was, size, full - full_before, counted - counted_before
 
 
 @inline_kernel
