@@ -171,7 +171,10 @@ S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of f
 S_RISES = 53  # 1: the last round of the step raised χ²
 S_ONCE = 54  # 1: the step under way has one round
 S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
-S_FREE = 56  # heads of free lists: numbers, then lists
+S_EDITED = 56  # so many in `moved` are variables of factors that were edited since the last step
+S_EDITED_AT = 57  # the last step that such factors went before
+S_HOLES = 58  # doubles of `hessian` that no factor has any more
+S_FREE = 59  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 
