@@ -91,8 +91,8 @@ class TreeSteps:
             before = self._graph.values.copy()
             if not worse:
                 tree.exchange()
-            course = self._batch(before, settle)
             because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if tree.rises else _GOES_ON
+            course = self._batch(before, settle)
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and account[tl.A_BEFORE] - course.chi2 <= FINISHED * (course.chi2 + LEAST_CHI2):
                 course.converged = True
