@@ -8,10 +8,12 @@ MATH §11.5.
 Until the step is made all of it can be undone, bit for bit.  What cannot be done so is left to `with_changes`.
 """
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 
+from factorbus.solver.anchors import find_unheld
 from factorbus.solver.changes import Edits
 from factorbus.solver.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph import Graph
@@ -19,7 +21,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.kernels.tree_edit import LOG_WIDTH, MOST_LINKS, edit_factors, relink
-from factorbus.solver.kernels.tree_gaps import close_gaps, find_adrift, open_gaps
+from factorbus.solver.kernels.tree_gaps import close_gaps, open_gaps
 from factorbus.solver.kernels.tree_hessian import hessian_size
 from factorbus.solver.tree import Tree
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
@@ -76,7 +78,7 @@ class FactorEdit:
         hollow = state[tl.S_HOLES] > _MOST_HOLES * state[tl.S_HESSIAN]
         if hollow or graph.holes > _MOST_HOLES * graph.counts[at.PAYLOAD]:
             return False
-        return not self.gone.size or int(find_adrift(self.gone, graph.places, self._tree.places)) < 0
+        return not self.gone.size or self._are_held()
 
     def make(self) -> bool:
         """Change graph and tree, ahead of a step; False: a χ² is beyond numbers, `undo` it."""
@@ -120,6 +122,18 @@ class FactorEdit:
         tree.node[tree.moved[: tree.state[tl.S_MOVED]], tl.N_LISTED] = 0
         tree.state[[tl.S_MOVED, tl.S_EDITED]] = 0
         self._before = None
+
+    def _are_held(self) -> bool:
+        """Whether the factors that stay hold what the others were on, by the rules for what is new (MATH §7).
+
+        What of the map is held by its numbers alone is then still held: a direction in which it could move would have
+        to leave these variables where they are, and no factor on any other one goes.
+        """
+        graph, kept = self._graph, copy.copy(self._graph)
+        kept.fac, kept.counts = graph.fac[: self._edits.kept.size][self._edits.kept], graph.counts.copy()
+        kept.counts[at.FACTORS] = len(kept.fac)
+        ends = graph.fac[self.gone, at.F_I : at.F_J + 1]
+        return not np.isin(ends, find_unheld(kept, (0,) * at.COUNTS)).any()
 
     def _remember(self) -> _Before:
         graph, tree = self._graph, self._tree

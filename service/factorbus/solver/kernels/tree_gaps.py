@@ -1,4 +1,4 @@
-"""Rows of factors that go: is everything held without them, the rows behind them moved up, and back.  MATH §11.5.
+"""Rows of factors that go: the rows behind them moved up, and back.  MATH §11.5.
 
 Factors are looked up by their rows in many places, in the order of which they came.  So none is left empty: what is
 behind a row that goes moves up by one, in the graph and in the tree, and what tells of a row is renumbered.
@@ -10,70 +10,6 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels._jit import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.places import float_rows, int_rows, ints
-from factorbus.solver.kernels.tree_take_in import next_incidence
-
-
-@kernel("int64(int64[::1], int64[::1], int64[::1])")
-def find_adrift(gone: I64, graph: I64, tree: I64) -> int:
-    """A variable of the factors `gone` (rows, ascending) that without them nothing joins, however indirectly, to one
-    that is fixed or has a factor by itself; or −1.  graph, tree: tables of their arenas (`places`)
-    """
-    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    node, link, count = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), ints(tree, tl.T_STATE)[tl.S_VARIABLES]
-    seen, queue = np.zeros(count, np.int64), np.empty(count, np.int64)
-    for k in range(gone.size):
-        for end in range(2):
-            v = fac[gone[k], at.F_I + end]
-            if v < 0 or seen[v] != 0:
-                continue
-            if not is_joined(v, 1 + 2 * k + end, gone, var, fac, node, link, seen, queue):
-                return v
-    return -1
-
-
-@part
-def is_joined(
-    start: int, turn: int, gone: I64, var: I64, fac: I64, node: I64, link: I64, seen: I64, queue: I64
-) -> bool:
-    """Whether anything holds the variable `start`; what an earlier turn has seen is held."""
-    if var[start, at.V_COLUMN] < 0:
-        return True
-    queue[0], done, todo = start, 0, 1
-    seen[start] = turn
-    while done < todo:
-        slot = node[queue[done], tl.N_ADJ]
-        done += 1
-        while slot >= 0:
-            f = slot // 2
-            if not is_among(f, gone):
-                other = fac[f, at.F_J - slot % 2]
-                if other < 0 or var[other, at.V_COLUMN] < 0 or (seen[other] != 0 and seen[other] != turn):
-                    return True
-                if seen[other] == 0:
-                    queue[todo], seen[other] = other, turn
-                    todo += 1
-            slot = next_incidence(slot, link)
-    return False
-
-
-@inline_kernel
-def is_among(f: int, rows: I64) -> bool:
-    """Whether f is one of `rows`, which ascend."""
-    low = count_below(f, rows)
-    return low < rows.size and rows[low] == f
-
-
-@inline_kernel
-def count_below(f: int, rows: I64) -> int:
-    """How many of `rows`, which ascend, are less than f."""
-    low, high = 0, rows.size
-    while low < high:
-        middle = (low + high) // 2
-        if rows[middle] < f:
-            low = middle + 1
-        else:
-            high = middle
-    return low
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1])")
