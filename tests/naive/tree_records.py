@@ -9,7 +9,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.tree import Tree
 
-_DIM = {at.SE2: 3, at.SE3: 6, at.POINT2: 2, at.POINT3: 3}
+_DIM = {at.SE2: 3, at.SE3: 6, at.POINT2: 2, at.POINT3: 3, at.IDP: 6}
 
 
 @dataclass(frozen=True)

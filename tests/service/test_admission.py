@@ -7,7 +7,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from factorbus.proto.messages import Batch, Insert
+from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import ShuttingDown, UnknownMap
 from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
@@ -20,6 +20,10 @@ def arrived(client: str, sequence: int, asker: Any = None, **changed: Any) -> Ar
     fields: dict[str, Any] = {"epoch": EPOCH, "size": 100, "digest": sequence, "now": 0.0} | changed
     content = Insert(sequence, Batch())
     return Arrived([asker or f"{client}{sequence}"], client, sequence, content=content, **fields)
+
+
+def changing(client: str, sequence: int, **changed: Any) -> Arrived:
+    return arrived(client, sequence, **changed)._replace(content=Insert(sequence, Batch(), changes=(Change("fix"),)))
 
 
 def codes(effects: list[Effect]) -> list[str]:
@@ -229,3 +233,33 @@ def test_whatever_comes_everybody_is_answered_once_and_order_holds(operations: l
     assert sorted(answered) == asked
     for client, sequences in solved.items():
         assert sequences == list(range(1, len(sequences) + 1)), client
+
+
+def test_a_change_goes_alone_and_counts_for_a_whole_step_in_the_order_of_turns() -> None:
+    admission = Admission(EPOCH, Limits(waiting=200, clients=3))
+    for sequence in (1, 2, 3):
+        admission.admit(changing("a", sequence))
+    assert taken(admission) == ["a1"]
+    for sequence in range(1, 61):
+        admission.admit(arrived("b", sequence))
+    admission.admit(arrived("b", 61, size=40_000))
+    assert taken(admission) == [f"b{n}" for n in range(1, 60)], "the second change does not begin before these"
+    assert taken(admission) == ["a2"]
+    assert taken(admission) == ["b60", "b61"]
+    assert taken(admission) == ["a3"]
+
+
+def test_of_one_client_so_many_changes_are_under_way_and_more_are_busy() -> None:
+    admission = Admission(EPOCH, Limits(waiting=20, clients=3, changes=3))
+    assert [admission.admit(changing("a", s)) for s in (1, 2, 4)] == [[], [], []]
+    (effect,) = admission.admit(changing("a", 3))
+    assert isinstance(effect, Refuse)
+    assert (effect.problem.code, effect.following) == ("busy", 3), "not used up"
+    assert 0 < effect.problem.detail["retry_after_s"] <= 2
+    assert "3 changes of this client" in str(effect.problem)
+    assert admission.admit(changing("b", 1)) == [], "another one's are its own"
+    assert admission.admit(arrived("a", 3)) == [], "an insert that only adds is no change"
+    (first,) = admission.take(9)
+    assert codes(admission.admit(changing("a", 5))) == ["busy"], "the solver has one, which is not answered"
+    admission.answer(first, b"")
+    assert admission.admit(changing("a", 5)) == []

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Batch, Insert
+from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Internal, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core import MapCore
@@ -246,3 +246,18 @@ def test_a_gap_ends_with_time(core: MapCore) -> None:
     (effect,) = core.tick(60.0)
     assert isinstance(effect, Refuse)
     assert effect.problem.code == "bad_sequence"
+
+
+def test_an_insert_waits_for_no_more_than_the_change_under_way() -> None:
+    core = MapCore("m", "auto", 5, Limits(), now=0.0)
+    changes = [insert("a", n)._replace(content=Insert(n, Batch(), changes=(Change("weigh"),))) for n in range(1, 11)]
+    run = run_of(core.insert(changes[0]))
+    for change in changes[1:]:
+        core.insert(change)
+    for n in (1, 2, 3):
+        assert [i.client for i in run.inserts] == ["a"]
+        assert not run.short
+        core.insert(insert("b", n))
+        run = run_of(solved(core, run))
+        assert [f"{i.client}{i.sequence}" for i in run.inserts] == [f"b{n}"]
+        run = run_of(solved(core, run))

@@ -46,6 +46,22 @@ class Broken(Solver):
         raise ZeroDivisionError("a fault of the solver")
 
 
+class BrokenInPlace(Solver):
+    """One that fails in a change of factors, when that is half made."""
+
+    def try_change(self, *arguments: object, **more: object) -> object:  # type: ignore[override]
+        raise ZeroDivisionError("a fault of the solver")
+
+
+def weighed(factor: int, weight: float) -> Change:
+    return Change("weigh", np.array([factor]), weight=np.array([weight]))
+
+
+def loop(i: int, j: int, x: float) -> Batch:
+    keys, information = np.array([[symbol("x", i), symbol("x", j)]]), np.array([[100.0, 0, 0, 100, 0, 400]])
+    return Batch(factors=(Factors("between_se2", keys, np.array([[x, 0.0, 0.3]]), information),))
+
+
 def make(folder: Folder | None = None, solver: type[Solver] = Solver) -> Folder:
     folder = folder or Folder(lambda: solver(Options()), EPOCH, Limits())
     for n in range(5):
@@ -145,3 +161,69 @@ def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> N
         assert codec.decode_accepted(outcomes(judged)[0].answer).first_factor == 4
     one, other = (each.snapshot([Question("estimate")]).variables for each in (folder, again))
     assert [g.values.tobytes() for g in one] == [g.values.tobytes() for g in other]
+
+
+def test_a_change_of_factors_is_a_step_whose_delta_has_what_moved() -> None:
+    folder = make()
+    judged, steps = came(folder, waiting(loop(1, 3, 2.5), 6), waiting((weighed(4, 0.5),), 7), waiting(pose(5), 8))
+    answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
+    assert [(a.sequence, a.revision, a.folded) for a in answers] == [(6, 6, 1), (7, 7, 1), (8, 8, 1)]
+    deltas = [codec.decode_delta(step.delta) for step in steps]
+    assert [(delta.previous, delta.revision) for delta in deltas] == [(5, 6), (6, 7), (7, 8)]
+    report = answers[1].report
+    assert (report["edited_factors"], report["removed_factors"], report["new_factors"]) == (1, 0, 0)
+    assert "another weight or loss" in str(report["because"])
+    told = {
+        int(k): row.tobytes()
+        for delta in deltas
+        for g in delta.variables
+        for k, row in zip(g.keys, g.values, strict=True)
+    }
+    held = {
+        int(k): row.tobytes()
+        for g in folder.snapshot([Question("estimate")]).variables
+        for k, row in zip(g.keys, g.values, strict=True)
+    }
+    assert {key: held[key] for key in told} == told
+    _, steps = came(folder, waiting((Change("remove_factors", np.array([4])),), 9))
+    assert codec.decode_delta(steps[0].delta).previous == 8
+    assert folder.size == (6, 5)
+
+
+def test_a_fault_in_a_change_of_factors_has_the_solver_replaced() -> None:
+    folder = make(solver=BrokenInPlace)
+    judged, steps = came(folder, waiting((weighed(1, 0.5),), 6))
+    assert [o.answer.code for o in outcomes(judged)] == ["internal"]
+    assert [step.rebuilt for step in steps] == [True]
+    assert folder.size == (5, 4)
+
+
+def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_snapshot() -> None:
+    """Those that are refused among them: they leave no trace either."""
+    folds = [[waiting(pose(n), n + 1)] for n in range(5)]
+    folds += [[waiting(loop(0, 4, 3.5), 6)], [waiting(loop(1, 4, 2.5), 7)]]
+    folds += [
+        [waiting((weighed(4, 0.5), weighed(2, 3.0)), 8)],
+        [waiting((Change("remove_factors", np.array([1])),), 9)],
+    ]
+    folds += [[waiting((Change("remove_factors", np.array([0, 2, 3])),), 10), waiting(pose(5), 11)]]
+    folds += [[waiting((Change("loss", np.array([5]), loss="huber", scale=np.ones(1)),), 12)], [waiting(pose(6), 13)]]
+    first, second = (Folder(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
+    third = Folder(lambda: Solver(Options()), EPOCH, Limits())
+    codes = []
+    for n, inserts in enumerate(folds):
+        judged, steps = came(first, *inserts)
+        codes += [getattr(o.answer, "code", "") for o in outcomes(judged)]
+        again = [i._replace(content=read_again(i.message)[1]) for i in inserts]
+        others = [list(second.fold_again(again))]
+        if n == 8:
+            third.load(first.dump())
+        if n > 8:
+            others.append(list(third.fold_again(again)))
+        for events in others:
+            for one, other in zip(steps, [e for e in events if isinstance(e, Stepped)], strict=True):
+                a, b = codec.decode_delta(one.delta), codec.decode_delta(other.delta)
+                assert (a.previous, a.revision, a.report["chi2"]) == (b.previous, b.revision, b.report["chi2"])
+                assert [g.values.tobytes() for g in a.variables] == [g.values.tobytes() for g in b.variables]
+    assert codes.count("underconstrained") == 1
+    assert first.revision == second.revision == third.revision

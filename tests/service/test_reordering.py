@@ -260,16 +260,35 @@ def test_a_map_to_which_nothing_comes_any_more_has_it_with_the_next_tick() -> No
         host.end()
 
 
-def test_a_change_of_the_map_lets_it_go() -> None:
+def test_a_change_that_is_made_anew_lets_it_go() -> None:
+    driven = begun()
+    driven.wait()
+    driven.insert((Change("fix", keys=np.array([int(driven.folder.solver._graph.keys[5])])),))
+    assert not driven.beside.busy
+    assert not driven.replaced
+
+
+def test_a_change_of_factors_is_given_to_the_other_one_as_well() -> None:
+    driven = begun()
+    driven.wait()
+    driven.insert((Change("weigh", np.array([0]), weight=np.array([0.5])),))
+    driven.insert((Change("loss", np.array([1]), loss="huber", scale=np.ones(1)),))
+    while not driven.replaced:
+        assert driven.beside.busy
+        driven.insert((Change("weigh", np.array([0]), weight=np.array([1.5])),))
+    graph = driven.folder.solver.graph()[1]
+    assert [group.ids.tolist() for group in graph if group.loss] == [[1]]
+
+
+def begun() -> Driven:
+    """A drive until the other solver is under way."""
     driven = Driven(ALWAYS)
     for step in manhattan(150, 1):
         driven.insert(step.batch)
         if driven.beside.busy:
             break
-    driven.wait()
-    driven.insert((Change("weigh", np.array([0]), weight=np.array([0.5])),))
-    assert not driven.beside.busy
-    assert not driven.replaced
+    assert driven.beside.busy
+    return driven
 
 
 def test_what_was_refused_for_a_limit_is_not_given_to_the_other(leave: threading.Event) -> None:

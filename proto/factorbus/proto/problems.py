@@ -200,11 +200,10 @@ class SeveralRobots(Problem):
 class Busy(Problem):
     code = "busy"
 
-    def __init__(self, waiting: int, retry_after_s: float) -> None:
-        super().__init__(
-            f"{waiting} inserts are waiting and the inbox is full; send again in {retry_after_s:g} s",
-            retry_after_s=retry_after_s,
-        )
+    def __init__(
+        self, waiting: int, retry_after_s: float, of: str = "inserts are waiting and the inbox is full"
+    ) -> None:
+        super().__init__(f"{waiting} {of}; send again in {retry_after_s:g} s", retry_after_s=retry_after_s)
 
 
 class ShuttingDown(Problem):

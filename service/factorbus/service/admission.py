@@ -21,6 +21,10 @@ Nobody stands in another's way by sending much.  Who has nothing waiting finds r
 full inbox, too.  The order is that of a fair queue (start-time fair queueing, Goyal and others, 1996): each client's
 inserts are laid end to end by their sizes on a time line of its own, which begins where the others are; the insert that
 begins first goes first.  So a small one overtakes large ones of others, and equal ones take turns.
+
+An insert that changes what the map has is a step by itself, so it goes to the solver by itself: what comes meanwhile
+waits for no other.  On the time line it is as long as all the small inserts that one step takes in, and of one client
+only so many may be without an answer: more are refused as busy, not used up.
 """
 
 from collections import OrderedDict, deque
@@ -38,6 +42,8 @@ _ASKERS = 8
 _RETRY_S = (0.02, 2.0)
 # What an insert counts for besides its bytes: a step has its price, however small.
 _INSERT_COST = 1024
+_CHANGE_COST = 64 * _INSERT_COST
+_CHANGES_WAIT = "changes of this client are under way, and no more may be"
 # One sender (all clients of one name before its suffix) has at most this share of the names that are remembered.
 _NAMES_OF_ONE = 4
 _NAME_IDLE_S = 10.0
@@ -119,20 +125,23 @@ class Admission:
         return True
 
     def take(self, most: int) -> tuple[Arrived, ...]:
-        """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first."""
+        """Up to `most` inserts for the next step, and no more than a step's bytes: who had least goes first.
+
+        A change comes alone.
+        """
         taken: list[Arrived] = []
         room = self._limits.fold_bytes
         while self._turns and len(taken) < most:
             begin, _, name = self._turns[0]
             client = self._clients[name]
             insert = client.ready[0]
-            if taken and insert.size > room:
+            if taken and (insert.size > room or insert.is_change or taken[0].is_change):
                 break
             heappop(self._turns)
             room -= insert.size
             taken.append(client.ready.popleft())
             self._clock = begin
-            client.served = begin + insert.size + _INSERT_COST
+            client.served = begin + insert.size + (_CHANGE_COST if insert.is_change else _INSERT_COST)
             if client.ready:
                 heappush(self._turns, (client.served, next(self._order), name))
         self._ready -= len(taken)
@@ -223,6 +232,8 @@ class Admission:
             raise self._closing
         if self._blocked is not None:
             raise self._blocked
+        if arrived.is_change:
+            self._check_changes(client)
         if arrived.sequence == client.next:
             self._admit_next(client, arrived)
         else:
@@ -264,6 +275,13 @@ class Admission:
         if len(insert.askers) <= _ASKERS:
             return []
         return [Refuse(insert.askers.pop(0), self._busy(), min(following, insert.sequence))]
+
+    def _check_changes(self, client: _Client) -> None:
+        """Raises Busy where a client has as many changes under way as it may."""
+        if len(client.open) >= self._limits.changes:
+            under_way = sum(insert.is_change for insert in client.open.values())
+            if under_way >= self._limits.changes:
+                raise Busy(under_way, self._busy().detail["retry_after_s"], _CHANGES_WAIT)
 
     def _admit_next(self, client: _Client, arrived: Arrived) -> None:
         """Into the inbox, and with it whatever waited for just this one."""

@@ -35,6 +35,7 @@ class Limits:
     client_idle_s: float = 600.0  # ... unless one has been silent for so long: it makes room for a new one
     waiting: int = 256  # inserts admitted and not yet in a step; as many again may be parked
     waiting_bytes: int = 256 << 20
+    changes: int = 64  # inserts with changes of one client, admitted or parked, that have no answer yet
     questions: int = 256  # waiting for the solver to come to a revision
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
     fold: int = 64  # inserts that one step takes in ...

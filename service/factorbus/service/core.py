@@ -367,7 +367,7 @@ class MapCore:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        if isinstance(content, Insert) and (content.points_below or content.changes):
+        if inserts[0].is_change or (isinstance(content, Insert) and content.points_below):
             return False
         return isinstance(content, Problem) or not content.settle
 

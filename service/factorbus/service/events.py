@@ -47,6 +47,11 @@ class Arrived(NamedTuple):
     now: float
     message: bytes = b""
 
+    @property
+    def is_change(self) -> bool:
+        """Whether it changes what the map has, which is a step of its own."""
+        return isinstance(self.content, Insert) and bool(self.content.changes)
+
 
 @dataclass(frozen=True, slots=True)
 class Asked:

@@ -6,8 +6,9 @@
        tried again one at a time, so that only the guilty are refused
     4  a step that left anything that is not finite, or beyond its bounds, has failed as well (`divergence`)
 
-An insert that changes what the map has, rather than only adding to it, is a step by itself: another solver is made with
-the change in it, and takes the place of the old one if all went well.  Its delta has the whole estimate.
+An insert that changes what the map has, rather than only adding to it, is a step by itself.  Changes of factors are a
+step of the solver as it is, if it can make them (`Solver.try_change`); for all others another solver is made with the
+change in it, and takes the place of the old one if all went well.  The delta of that has the whole estimate.
 
 Where the map is not at its optimum and nothing waits, a further step goes on, with nothing staged.
 
@@ -152,7 +153,7 @@ class Folder(Holding):
         the end.
         """
         cpu_s = time.thread_time()
-        for changing, group in groupby(inserts, _is_change):
+        for changing, group in groupby(inserts, lambda insert: insert.is_change):
             if changing:
                 for insert in group:
                     yield from self._change(insert)
@@ -169,12 +170,33 @@ class Folder(Holding):
                 yield from self._together([insert])
 
     def _change(self, insert: Arrived) -> Iterator[Judged | Stepped]:
-        """One that changes what the map has: in a new solver, so that the map is as it was wherever that fails."""
+        """One that changes what the map has: in place, or in a new solver; the map is as it was where that fails."""
         content, started = cast(Insert, insert.content), time.perf_counter()
         try:
             if self._broken:
                 raise Broken(self._broken)
             self._check_room(insert.size, content.batch)
+            # Numbers of unusual sizes are tried on another solver, as they are by inserts.
+            came = None if self._wary else self._solver.try_change(content.changes, content.batch, content.settle)
+        except (Problem, SolverError) as problem:
+            yield Judged((Outcome(insert, problem),))
+            return
+        except Exception:
+            reference = self._fault()
+            yield Judged((Outcome(insert, Internal(reference)),))
+            yield from self._replace_solver(reference)
+            return
+        if came is None:
+            yield from self._change_anew(insert, started)
+            return
+        first_factor, report, counted = came
+        self._wary = not is_usual(self._solver)
+        yield from self._changed(insert, first_factor, report, started, counted, None)
+
+    def _change_anew(self, insert: Arrived, started: float) -> Iterator[Judged | Stepped]:
+        """The same in a new solver."""
+        content = cast(Insert, insert.content)
+        try:
             solver, first_factor, report, counted = self._solver.with_changes(
                 content.changes, content.batch, content.settle
             )
@@ -188,8 +210,16 @@ class Folder(Holding):
             yield Judged((Outcome(insert, Internal(reference)),))
             return
         self._solver, self._wary = solver, not is_usual(solver)
+        yield from self._changed(insert, first_factor, report, started, counted, 0)
+
+    def _changed(
+        self, insert: Arrived, first_factor: int, report: Any, started: float, counted: Mapping[str, int],
+        previous: int | None,
+    ) -> Iterator[Judged | Stepped]:  # fmt: skip
+        """The step went well; previous: 0 where its delta is to have everything."""
+        content = cast(Insert, insert.content)
         staged = _Staged(insert, first_factor, content.settle, content.points_below)
-        yield from self._stepped([staged], [], report, started, counted)
+        yield from self._stepped([staged], [], report, started, counted, previous)
         if content.points_below:
             yield from self._ripen(content.points_below)
 
@@ -363,8 +393,9 @@ class Folder(Holding):
         report: Any,
         started: float,
         changed: Mapping[str, int] | None = None,
+        previous: int | None = None,
     ) -> Iterator[Judged | Stepped]:
-        """The step went well: the answers, then the delta; after a change that has everything."""
+        """The step went well: the answers, then the delta; previous: 0 where that has everything."""
         account = report.as_dict() | (changed or {})
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
@@ -381,7 +412,7 @@ class Folder(Holding):
         self._held = self._solver.variable_count, self._solver.factor_count
         yield Judged((*accepted, *refused), self._revision, len(staged))
         try:
-            told = self._told(account, None if changed is None else 0)
+            told = self._told(account, previous)
         except Exception:
             # The step is done and answered; who misses its delta sees the gap.
             yield from self._replace_solver(self._fault())
@@ -411,7 +442,3 @@ class Folder(Holding):
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
         yield self._told(account, previous=0)
-
-
-def _is_change(insert: Arrived) -> bool:
-    return isinstance(insert.content, Insert) and bool(insert.content.changes)

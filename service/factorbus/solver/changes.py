@@ -37,6 +37,8 @@ from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
 CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalise")
 _NONE = np.empty(0, np.int64)
+# Numbers of a measurement and its information, by the code of the kind.
+_WIDTH = np.array([k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())], np.int64)
 _QUATERNION_TOLERANCE = 1e-3
 _WEIGHTS = (1e-12, 1e12)  # beyond, a factor holds nothing, or nothing else does
 
@@ -73,6 +75,7 @@ class Edits:
     stays, kept: whether it is there afterwards   free: whether a variable is estimated
     loss, scale: code of the loss and its scale   weight: what Ω is multiplied by   values: as in the graph
     placed (n,): whether a variable was given a value; carry: whether others go along with such
+    touched (m,): whether a factor was given a loss or a weight
     added: factors that take the place of some   counted: what is to be told of it
     """
 
@@ -84,6 +87,7 @@ class Edits:
     weight: F64
     values: F64
     placed: np.ndarray
+    touched: np.ndarray
     carry: bool = False
     added: list[FactorGroup] = field(default_factory=list)
     counted: dict[str, int] = field(default_factory=dict)
@@ -97,19 +101,18 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     """
     edits = unchanged(graph)
     before = edits.free.copy()
-    touched = np.zeros(edits.kept.size, bool)
     for change in changes:
         make = _MAKE.get(change.change)
         if make is None:
             raise errors.UnknownKind("change", change.change, CHANGES)
-        make(graph, edits, change, touched)
+        make(graph, edits, change)
     if edits.carry:
         edits.values = carry_along(graph, edits.values, edits.placed, edits.stays, edits.kept)
     check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
     edits.counted = {
         "removed_variables": int(np.count_nonzero(~edits.stays)),
         "removed_factors": int(np.count_nonzero(~edits.kept)),
-        "edited_factors": int(np.count_nonzero(touched & edits.kept)),
+        "edited_factors": int(np.count_nonzero(edits.touched & edits.kept)),
         "fixed_variables": int(np.count_nonzero(edits.stays & before & ~edits.free)),
         "freed_variables": int(np.count_nonzero(edits.stays & ~before & edits.free)),
         "placed_variables": int(np.count_nonzero(edits.placed)),
@@ -125,9 +128,7 @@ def unchanged(graph: Graph) -> Edits:
     loss = fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
     scale = np.zeros(factors)
     robust = np.flatnonzero(loss != at.NO_LOSS)
-    kinds = fac[robust, at.F_KIND].tolist()
-    widths = [FACTOR_KIND_OF_CODE[code].size + FACTOR_KIND_OF_CODE[code].triangle for code in kinds]
-    scale[robust] = graph.payload[fac[robust, at.F_AT] + np.array(widths, np.int64)]
+    scale[robust] = graph.payload[fac[robust, at.F_AT] + _WIDTH[fac[robust, at.F_KIND]]]
     return Edits(
         np.ones(variables, bool),
         var[:, at.V_COLUMN] >= 0,
@@ -137,14 +138,15 @@ def unchanged(graph: Graph) -> Edits:
         np.ones(factors),
         graph.values[: graph.counts[at.VALUES]],
         np.zeros(variables, bool),
+        np.zeros(factors, bool),
     )
 
 
-def _remove_factors(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+def _remove_factors(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.kept[_factors(graph, edits, change)] = False
 
 
-def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     gone = _variables(graph, edits, change)
     edits.stays[gone] = False
     fac = graph.fac[: edits.kept.size]
@@ -157,7 +159,7 @@ def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndar
     edits.kept &= left
 
 
-def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+def _set_loss(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     rows = _factors(graph, edits, change)
     code = at.NO_LOSS
     if change.loss:
@@ -169,10 +171,10 @@ def _set_loss(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarra
             raise errors.BadLoss(f"change loss of factor {_id(graph, rows, bad)}", f"{scale[bad[0]]:g}", wanted)
         code, edits.scale[rows] = LOSSES[change.loss], scale
     edits.loss[rows] = code
-    touched[rows] = True
+    edits.touched[rows] = True
 
 
-def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+def _weigh(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     rows = _factors(graph, edits, change)
     weight = _numbers("weigh", "weight", change.weight, rows.size)
     least, most = _WEIGHTS
@@ -180,7 +182,7 @@ def _weigh(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) 
         raise errors.BadWeight(_id(graph, rows, bad), float(weight[bad[0]]), f"from {least:g} to {most:g}")
     np.multiply.at(edits.weight, rows, weight)
     _check_weighed(graph, edits, rows)
-    touched[rows] = True
+    edits.touched[rows] = True
 
 
 def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
@@ -198,15 +200,15 @@ def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
             raise errors.BadWeight(_id(graph, of, bad), seen, wanted)
 
 
-def _fix(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+def _fix(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.free[_variables(graph, edits, change)] = False
 
 
-def _free(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+def _free(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.free[_variables(graph, edits, change)] = True
 
 
-def _place(graph: Graph, edits: Edits, change: ChangeLike, _: np.ndarray) -> None:
+def _place(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     picked, kind = _variables(graph, edits, change), VARIABLE_KINDS.get(change.kind)
     if kind is None:
         raise errors.UnknownKind("variable", change.kind, tuple(VARIABLE_KINDS))
@@ -238,10 +240,10 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
     return values
 
 
-def _marginalise(graph: Graph, edits: Edits, change: ChangeLike, touched: np.ndarray) -> None:
+def _marginalise(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     gone = np.unique(_variables(graph, edits, change))
     held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
-    if edits.added or edits.placed.any() or touched.any() or held:
+    if edits.added or edits.placed.any() or edits.touched.any() or held:
         raise errors.BadOrder("marginalise", "before any loss, weigh, fix, free, place or marginalise")
     check_kept(graph, edits.kept, all_or_none=True)
     made, replaced = marginals(graph, gone, edits.kept)

@@ -49,6 +49,7 @@ class Graph(Arenas):
         self.table: I64 = np.zeros(1024, np.int64)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
+        self.holes = 0  # numbers of the payload that no factor has any more
         self._rows = Rows()
 
     @property
@@ -78,7 +79,7 @@ class Graph(Arenas):
         other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
         other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
         other.fac = self.fac[:factors].copy()
-        other.ids, other.id_shift = self.ids.copy(), self.id_shift
+        other.ids, other.id_shift, other.holes = self.ids.copy(), self.id_shift, self.holes
         return other
 
     def reserve_variables(self, more: int, size: int) -> None:
@@ -225,7 +226,7 @@ class Graph(Arenas):
     def columns_bytes(self) -> tuple[int, int]:
         """Bytes of all variables, and of all factors, as columns, keys and stamps included."""
         variables, factors, values, payload, *_, stamped = self.counts.tolist()
-        return 8 * (variables * (2 if stamped else 1) + values), 8 * (2 * factors + payload)
+        return 8 * (variables * (2 if stamped else 1) + values), 8 * (2 * factors + payload - self.holes)
 
     def describe(self, row: I64) -> str:
         """One row of `fac`, for a person."""

@@ -11,6 +11,7 @@ from factorbus.solver import errors, sights
 from factorbus.solver.admission import admit
 from factorbus.solver.anchors import find_unanchored, find_unheld
 from factorbus.solver.changes import ChangeLike, collect, unchanged
+from factorbus.solver.changing import try_in_place
 from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
 from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.upkeep import Upkeep
@@ -219,6 +220,24 @@ class Solver:
         new = made.variable_count - variables, made.factor_count - factors
         report = made.step(settle)._replace(new_variables=new[0], new_factors=new[1])
         return made, first, report, edits.counted
+
+    def try_change(
+        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
+    ) -> tuple[int, StepReport, dict[str, int]] | None:
+        """Make `changes` of factors, add `batch`, and step, in this solver: it eliminates what they touch, no more.
+
+        Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
+        it is where they remove, fix, free, place or marginalise variables, where linear factors are among them, where
+        something would be free to move, with `settle`, and in modes other than "tree".  Nothing may be staged.
+        Raises as `changes.collect` and `stage` do.
+        """
+        if self._tree is None or settle:
+            return None
+        edits = collect(self._graph, changes)
+        came = try_in_place(
+            self._graph, self._tree, edits, lambda: self._graph.next_id if batch is None else self.stage(batch)
+        )
+        return None if came is None else (*came, edits.counted)
 
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
         """Take over the first so many variables and factors of `other`, as they are; the first step of a new solver."""

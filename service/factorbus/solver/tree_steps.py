@@ -90,6 +90,20 @@ class TreeSteps:
         course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._account(started, compiled, course, because)
 
+    def rebase(self, fewer: int) -> None:
+        """So many of the factors that were there after the last step are gone."""
+        mark = list(self._mark)
+        mark[at.FACTORS] -= fewer
+        self._mark = tuple(mark)
+
+    def forget(self) -> None:
+        """What came since the last step was never there."""
+        self._graph.forget(self._mark)
+
+    def start_over(self) -> None:
+        """A new tree for the graph as it is, which leaves the estimate where it is."""
+        self._begin_anew(self._graph.values)
+
     def changed(self) -> I64:
         """The variables whose values have other bits than before the last step, new ones included."""
         if self._batched:

@@ -62,7 +62,8 @@ class Upkeep:
         step = int(state[tl.S_STEP])
         follows = step == self._step + 1 and self._age < _REFRESH
         self._take_in()
-        loops = self._loops(old, first_factor) if follows and not state[tl.S_RELINEARISED] else None
+        adds_only = not state[tl.S_RELINEARISED] and state[tl.S_EDITED_AT] <= self._step
+        loops = self._loops(old, first_factor) if follows and adds_only else None
         self._age = self._age + 1 if follows else 0
         if loops is None or not self._work_in(loops, old, first_factor, step):
             self._compute(self._stamp if follows else -1, step)

@@ -173,7 +173,10 @@ S_RISES = 53  # 1: the last round of the step raised χ²
 S_ONCE = 54  # 1: the step under way has one round
 S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
 S_AFTER = 56  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
-S_FREE = 57  # heads of free lists: numbers, then lists
+S_EDITED = 57  # so many in `moved` are variables of factors that were edited since the last step
+S_EDITED_AT = 58  # the last step that such factors went before
+S_HOLES = 59  # doubles of `hessian` that no factor has any more
+S_FREE = 60  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

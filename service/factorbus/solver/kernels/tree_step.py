@@ -101,7 +101,8 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         account[tl.A_STIFFEST_BEFORE] = account[tl.A_STIFFEST]
         account[tl.A_UNIT], account[tl.A_BEFORE] = residual_unit(f1, account), account[tl.A_CHI2]
         state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
-        state[tl.S_CONTINUES] = 1 if v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] else 0
+        nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
+        state[tl.S_CONTINUES] = 1 if nothing_new else 0
     unit = account[tl.A_UNIT]
     scaled = settings.copy()
     scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
@@ -148,7 +149,7 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
             undo(v0, var, fac, node, link, scalars, turns, moved, saved, state, account)
             return tl.FAILED
         v0 = v1
-        state[tl.S_TAKEN], state[tl.S_FIRST_NEW] = f1, v1
+        state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
         chi2 = account[tl.A_CHI2]
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_TRUST]) * before + LEAST_CHI2:
@@ -200,6 +201,28 @@ def note_after(settings: F64, state: I64, account: F64) -> None:
 def residual_unit(factors: int, account: F64) -> float:
     """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
     return math.sqrt((max(account[tl.A_MODEL], 0.0) + LEAST_CHI2) / max(factors, 1))
+
+
+@part
+def rescale(factors: int, settings: F64, account: F64) -> None:
+    """The thresholds in what a residual is like without the factors that were taken out, or with their new weights."""
+    unit = residual_unit(factors, account)
+    times = unit / account[tl.A_UNIT]
+    account[tl.A_UNIT] = unit
+    for each in (tl.P_RIPPLE, tl.P_BENT, tl.P_MOST):
+        settings[each] *= times
+    for each in (tl.P_BENT_NOW, tl.P_SOON):
+        settings[each] *= times * times
+
+
+@inline_kernel
+def find_loose_end(var: I64, moved: I64, state: I64) -> int:
+    """A variable of an edited factor, in a step that raised a pivot: what was held before may not be any more."""
+    for k in range(state[tl.S_EDITED]):
+        if var[moved[k], at.V_COLUMN] >= 0:
+            state[tl.S_RAISED] = 0
+            return int(moved[k])
+    return -1
 
 
 @inline_kernel
@@ -258,6 +281,8 @@ def eliminate_again(
     now = cycles()
     state[tl.S_STAMP] += 1
     count = 0
+    for k in range(state[tl.S_EDITED]):
+        count = touch(moved[k], node, clique, state, marked, count)
     for f in range(state[tl.S_TAKEN], f1):
         count = touch_ends(f, fac, node, clique, state, marked, count)
     renewed = mark_renewed(moving, fac, node, link, clique, state, marked)
@@ -325,7 +350,7 @@ def eliminate_again(
         lowest = find_lowest(place, orphans, node, clique, lists, state)
     else:
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
-        drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0
+        drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0 and state[tl.S_EDITED] == 0
         last = find_newest(v1, var) if drives_on else -1
         recent = int(settings[tl.P_RECENT])
         if n <= MOST:
@@ -359,6 +384,8 @@ def eliminate_again(
     failed = eliminate_fronts(
         ids, records, order.size, home, place, factors, orphans, lowest, update, graph, tree, board
     )
+    if failed < 0 and state[tl.S_EDITED] != 0 and state[tl.S_RAISED] != 0:
+        failed = find_loose_end(var, moved, state)
     if failed >= 0:
         state[tl.S_FAILED] = failed
         give_back_fronts(ids, clique, lists, numbers, state)
@@ -374,6 +401,8 @@ def eliminate_again(
     )  # fmt: skip
     tops = commit_renewed(renewed, old, clique, numbers, state, account)
     add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
+    if state[tl.S_EDITED] != 0:
+        rescale(f1, settings, account)
     for k in range(moving.size):
         v = moving[k]
         node[v, tl.N_FLAGS], node[v, tl.N_LINEARISED] = FREE, state[tl.S_STEP]
