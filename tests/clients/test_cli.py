@@ -185,6 +185,7 @@ def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
     assert checks["kernel cache"]["mend"] == "factorbus warm compiles ahead"
     assert "CHOLMOD" in checks["cholmod"]["seen"]
     assert "answers on loopback" in checks["bus"]["seen"]
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()], "it has compiled nothing"
 
 
 def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
