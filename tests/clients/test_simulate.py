@@ -220,7 +220,9 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("world", "parameters", "words"), WRONG, ids=lambda part: str(part)[:40])
+@pytest.mark.parametrize(
+    ("world", "parameters", "words"), WRONG, ids=lambda part: getattr(part, "__name__", str(part))[:40]
+)
 def test_parameters_are_checked_before_the_first_step(world, parameters: dict, words: str) -> None:
     with pytest.raises(BadParameter) as caught:
         world(**parameters)

@@ -61,7 +61,7 @@ def test_a_stopped_viewer_slows_nobody_and_catches_up(endpoint: str, spawn: Spaw
         last = driven.insert(Draft().between_se2("x1", "x3", (2, 0, 0), sigmas=(1, 1, 1)), timeout_s=30).revision
         watching.signal(signal.SIGCONT)
         (seen,) = shown([watching], last)
-    assert int(seen[0]) == last
+    assert int(seen[0]) >= last, "it has the last insert, or a further step after it"
 
 
 def digest(estimate: Estimate) -> str:
