@@ -3,6 +3,8 @@
 VENV ?= .venv
 BIN := $(VENV)/bin
 export PYTHON
+# Tests start hundreds of processes; without its bytecode on disk each would compile what it imports, a service for 0.3 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 SETUP := deploy/setup/environment.sh deploy/setup/system.sh deploy/setup/browser.sh
 # Stamps: what is installed follows from pyproject.toml and the set-up scripts; only their change runs pip again.
@@ -32,13 +34,13 @@ demo: $(READY) ## a simulated robot drives: solver, workers, robot and viewer as
 live: $(READY) ## a graph file of yours, FILE=my.g2o, as a live map in the browser
 	@$(BIN)/factorbus replay $(FILE) --live $(ARGS)
 
-# What starts no processes runs side by side; all else one by one, so that it has the machine to itself.
-IN_PROCESS := tests/solver tests/proto
+# Side by side, the tests of one file in one process, which share what it has started; then, one by one, those that want
+# the machine to themselves.  `tests/test_side_by_side.py` holds that each runs in one of the two.
 test: $(READY_DEV) ## the tests
 	@$(BIN)/factorbus warm
 ifeq ($(strip $(ARGS)),)
-	$(BIN)/python -m pytest -m "not data" -n auto --maxprocesses 4 --dist worksteal $(IN_PROCESS)
-	$(BIN)/python -m pytest -m "not data" $(IN_PROCESS:%=--ignore %)
+	$(BIN)/python -m pytest -m "not data and not alone" -n auto --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -m "not data and alone"
 else
 	$(BIN)/python -m pytest -m "not data" $(ARGS)
 endif

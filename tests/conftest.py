@@ -1,11 +1,18 @@
-"""What all tests share: where the public data sets are, and how hypothesis behaves."""
+"""What all tests share: where the public data sets are, how hypothesis behaves, a process that stays as it was."""
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from process_state import as_it_was
+
+# Read when NumPy is loaded, here and in every process that a test starts.  By its own way a library of linear algebra
+# has a thread for each core, and those of two processes side by side wait for each other in loops: solving the dense
+# twins of `tests/solver/test_tree.py` took four times as long with two threads as with one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Started in the background of a script, a process ignores SIGINT, and so do all it starts: those tests that interrupt
 # processes would wait for ever.
@@ -20,6 +27,13 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 settings.load_profile("factorbus")
+
+
+@pytest.fixture(autouse=True)
+def process_stays_as_it_was() -> Iterator[None]:
+    """Of all that tests of one process share, none changes anything for the next."""
+    with as_it_was():
+        yield
 
 
 @pytest.fixture(scope="session")

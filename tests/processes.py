@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,20 @@ class Process:
 
     def _said(self) -> str:
         return f"its log ends: {self._log.read_text()[-2000:]}"
+
+
+def within_patience(run: Callable[[], Any]) -> Any:
+    """What `run` gives.  Raises TimeoutError when it takes longer than one event is waited for."""
+    done: Future[Any] = Future()
+
+    def go() -> None:
+        try:
+            done.set_result(run())
+        except BaseException as problem:
+            done.set_exception(problem)
+
+    threading.Thread(target=go, daemon=True).start()
+    return done.result(PATIENCE_S)
 
 
 @contextlib.contextmanager

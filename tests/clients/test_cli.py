@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -40,16 +39,6 @@ def test_help_names_every_command_without_importing_any() -> None:
         assert (f"  {name} " in ran.stdout) == bool(line)
         assert f"factorbus.cli.{module}" not in ran.stderr.split()
     assert not {"numpy", "zenoh", "rich", "numba", "msgpack", "scipy"} & set(ran.stderr.split())
-
-
-def test_help_is_there_in_less_than_0_4_seconds_of_cpu() -> None:
-    def once() -> float:
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        assert factorbus("--help").returncode == OK
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-    assert min(once() for _ in range(5)) < 0.4
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -185,6 +174,7 @@ def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
     assert checks["kernel cache"]["mend"] == "factorbus warm compiles ahead"
     assert "CHOLMOD" in checks["cholmod"]["seen"]
     assert "answers on loopback" in checks["bus"]["seen"]
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()], "it has compiled nothing"
 
 
 def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,11 +43,10 @@ ASKS: dict[str, Callable[[Bus], object]] = {
 @pytest.mark.parametrize("ask", ASKS)
 @pytest.mark.parametrize("version", ["v2", "v0", "v1.1"])
 def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, version: str) -> None:
-    with someone_of(version, tmp_path), connect(endpoint_in(tmp_path), timeout_s=50) as bus:
-        started = time.monotonic()
+    for_ever_s = 10 * 60  # in this file a test that waits is ended after a minute
+    with someone_of(version, tmp_path), connect(endpoint_in(tmp_path), timeout_s=for_ever_s) as bus:
         with pytest.raises(OtherProtocol) as refused:
             ASKS[ask](bus)
-        assert time.monotonic() - started < 25, "long before it gives up on silence"
         assert refused.value.detail == {"versions": [version], "wanted": "v1"}
         assert f"speak version {version} of the protocol, this client v1" in refused.value.message
 

@@ -8,7 +8,9 @@ import pytest
 
 from factorbus.service import control_groups, cores
 from factorbus.service.cores import LentCores
-from factorbus.solver.lending import count_free
+from factorbus.solver.kernels.tree_step import tree_step
+from factorbus.solver.lending import can_lend, count_free
+from factorbus.solver.warm import iter_compile
 
 pytestmark = pytest.mark.skipif(
     count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"
@@ -54,6 +56,7 @@ def test_no_more_than_told_and_than_there_are(
     monkeypatch: pytest.MonkeyPatch, told: int, there: int, used: int
 ) -> None:
     monkeypatch.setattr(cores, "core_count", lambda: there)
+    assert list(iter_compile(tree_step))
     free, lent = count_free(), LentCores(told)
     assert lent.account() == {"used": used, "pieces": 0}
     assert lending() == used - 1
@@ -61,3 +64,20 @@ def test_no_more_than_told_and_than_there_are(
     lent.close()
     assert lending() == 0
     assert count_free() == free
+
+
+def test_no_thread_compiles_what_nobody_has_asked_for_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cores, "core_count", lambda: 2)
+    monkeypatch.setattr(cores, "can_lend", lambda: False)
+    free, lent = count_free(), LentCores(2)
+    lent.tick()
+    assert lent.account() == {"used": 1, "pieces": 0}
+    assert (lending(), count_free()) == (0, free)
+    assert list(iter_compile(tree_step))
+    monkeypatch.setattr(cores, "can_lend", can_lend)
+    for _ in range(2):
+        lent.tick()
+        assert lent.account() == {"used": 2, "pieces": 0}
+        assert lending() == 1
+    lent.close()
+    assert (lending(), count_free()) == (0, free)

@@ -1,6 +1,5 @@
 """The public data sets: every count of their table, their order, and what GTSAM's reader makes of them."""
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +30,9 @@ TABLE = {
 @pytest.mark.parametrize("name", TABLE)
 def test_counts_and_order(datasets: Path, name: str) -> None:
     poses, landmarks, edges, sightings, vertices = TABLE[name]
-    began = time.process_time()
     graph = read(datasets / f"{name}.g2o")
-    loaded = time.process_time()
     steps = list(graph.steps())
-    print(f"{name}: read in {loaded - began:.3f} s, {len(steps)} steps in {time.process_time() - loaded:.3f} s of CPU")
-    assert loaded - began < 5
+    assert sum(step.factor_count for step in steps) == graph.batch.factor_count
     counts = {group.kind: len(group.keys) for group in graph.batch.factors}
     between = "between_se3" if name in ("sphere2500", "parking_garage") else "between_se2"
     assert (graph.poses, graph.landmarks) == (poses, landmarks)

@@ -81,9 +81,9 @@ def test_the_size_of_an_answer_is_known_before_it_is_computed(form: str) -> None
 
 def test_this_machine_is_measured() -> None:
     rates = measured()
-    assert 0.0 < rates.fixed_s < 0.1
-    assert 0.0 <= rates.feature_s < 1e-4
-    assert 0.0 < rates.number_s < 1e-5
+    assert rates.fixed_s > 0.0
+    assert rates.feature_s >= 0.0
+    assert rates.number_s > 0.0
     few, many = (seconds(work_of(example("half", n)), rates) for n in (2, 2000))
     assert many > 10 * few
 

@@ -1,6 +1,5 @@
-"""What a stuck or hostile client costs the others: inserts of an honest one are timed before and while it is there."""
+"""What a stuck or hostile client costs the others: an honest one drives on while it is there."""
 
-import json
 import socket
 import statistics
 import time
@@ -9,17 +8,19 @@ from pathlib import Path
 
 import pytest
 from bare import bare
-from processes import Process
+from processes import PATIENCE_S, Process, within_patience
 
 from factorbus.client import Draft, connect
 from factorbus.client.map import Map
 
+# Floods as fast as the machine can keep up, which tests beside them would pay for.
+pytestmark = pytest.mark.alone
+
 Spawn = Callable[..., Process]
 HOSTILE = str(Path(__file__).parent / "hostile.py")
-INSERTS = 150
-# The machine that runs this may be busy with other things; what it must not be is a second per insert, which is what
-# one full queue to somebody who does not read would cost whoever shared a thread with it.
-SLOWER, BESIDES_S, LONGEST_S = 5.0, 0.02, 0.9
+# Many enough that the patience ends before they have come if each takes a second, which is what one full queue to
+# somebody who does not read costs whoever shares a thread with it.
+INSERTS = 2 * int(PATIENCE_S)
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def times(driven: Map, first: int, count: int = INSERTS) -> list[float]:
     for n in range(first, first + count):
         draft = Draft().se2(f"x{n}").between_se2(f"x{n - 1}", f"x{n}", (1, 0, 0.1), sigmas=(0.1, 0.1, 0.02))
         begun = time.perf_counter()
-        driven.insert(draft, timeout_s=30)
+        assert driven.insert(draft, timeout_s=30).sequence == n + 1
         seconds.append(time.perf_counter() - begun)
         time.sleep(0.005)  # a robot that inserts at a pace, not as fast as it can
     return seconds
@@ -49,32 +50,24 @@ def test_it_costs_the_others_nothing(service: str, spawn: Spawn, way: str) -> No
     with connect(service, client="honest", timeout_s=30) as bus, bus.map("shared", mirror=False) as driven:
         driven.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
         times(driven, 1, 30)
-        before = times(driven, 31)
+        before = within_patience(lambda: times(driven, 31))
         hostile = spawn(HOSTILE, service, "shared", way)
         hostile.ready()
-        during = times(driven, 31 + INSERTS)
+        during = within_patience(lambda: times(driven, 31 + INSERTS))
         hostile.tell("stop")
         sent = int(hostile.line("sent")[0])
-        report = {
-            "way": way,
-            "sent": sent,
-            "before_ms": [round(1e3 * q, 2) for q in (statistics.median(before), max(before))],
-            "during_ms": [round(1e3 * q, 2) for q in (statistics.median(during), sorted(during)[-2], max(during))],
-        }
-        print(json.dumps(report))
+        for name, each in (("before", before), ("during", during)):
+            print(f"{way}, {name}: {1e3 * statistics.median(each):.2f} ms median, {1e3 * max(each):.2f} ms at most")
         assert sent > 50, "it was hostile"
-        assert statistics.median(during) < SLOWER * statistics.median(before) + BESIDES_S, report
-        assert max(during) < LONGEST_S, report
 
 
 def test_connections_that_say_nothing_do_not_keep_others_out(service: str) -> None:
     host, port = service.partition("/")[2].split(":")
     silent = [socket.create_connection((host, int(port)), timeout=30) for _ in range(150)]
     try:
-        begun = time.perf_counter()
-        with connect(service, client="late", timeout_s=30) as bus:
+        # Half of what it takes where Zenoh's own limits let a hundred of them keep the others out.
+        with connect(service, client="late", timeout_s=10) as bus:
             bus.maps()
-        assert time.perf_counter() - begun < 5.0
     finally:
         for each in silent:
             each.close()

@@ -2,14 +2,12 @@
 
 import hashlib
 import signal
-import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from bare import bare
-from processes import Process
+from processes import PATIENCE_S, Process, within_patience
 
 from factorbus.client import Draft, connect
 from factorbus.proto import codec
@@ -56,16 +54,14 @@ def test_a_stopped_viewer_slows_nobody_and_catches_up(endpoint: str, spawn: Spaw
     with connect(endpoint, client="robot") as bus, bus.map("busy", mirror=False) as driven:
         ring(driven, 1500)
         watching = viewer(spawn, endpoint, "busy")
-        before = paces(driven, 60)
         watching.signal(signal.SIGSTOP)
         # Enough deltas of the whole map (48 kB each) to fill every buffer on the way to the stopped one.
-        during = paces(driven, 300)
+        # A blocking publication would wait a second for it, five times as long as the patience for all.
+        within_patience(lambda: move(driven, int(5 * PATIENCE_S)))
         last = driven.insert(Draft().between_se2("x1", "x3", (2, 0, 0), sigmas=(1, 1, 1)), timeout_s=30).revision
         watching.signal(signal.SIGCONT)
         (seen,) = shown([watching], last)
-    assert statistics.median(during) < 3 * statistics.median(before) + 0.005
-    assert max(during) < 0.6, "no insert waits for the stopped viewer (a blocking publication would wait a second)"
-    assert int(seen[0]) >= last, "or further steps later"
+    assert int(seen[0]) >= last, "it has the last insert, or a further step after it"
 
 
 def digest(estimate: Estimate) -> str:
@@ -84,15 +80,11 @@ def ring(driven: object, poses: int) -> None:
     driven.insert(draft, timeout_s=60)  # type: ignore[attr-defined]
 
 
-def paces(driven: object, inserts: int) -> list[float]:
-    """Seconds from sending to answer of edges that move the whole map."""
-    seconds = []
+def move(driven: object, inserts: int) -> None:
+    """Edges that move the whole map, each sent when the one before is answered."""
     for n in range(inserts):
         off = (2, 0.001 * (n % 7 - 3), 0.02)
         draft = Draft().between_se2("x1497", "x1499", off, sigmas=(0.1, 0.1, 0.1)).between_se2(
             "x0", "x1499", (300, 900 + 0.01 * (n % 5), 3), sigmas=(50, 50, 1)
         )  # fmt: skip
-        begun = time.perf_counter()
         driven.insert(draft, timeout_s=30)  # type: ignore[attr-defined]
-        seconds.append(time.perf_counter() - begun)
-    return seconds

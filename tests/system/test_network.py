@@ -15,7 +15,6 @@ from wire import SERVICE, Relay, Wire
 STREAMER = str(Path(__file__).parent.parent / "streamer.py")
 COUNT = 900
 PARTITION_S = 10.0
-BACK_S = 12.0  # a connection that is made while the network is cut is tried again after 1, 2, 4, ... s, by the kernel
 
 
 @pytest.fixture
@@ -68,7 +67,6 @@ def test_loss_delay_and_a_partition_between_two_namespaces(
     client.tell("end")
     done = client.line("done")
     print(f"{told}; back {back_s:.2f} s after the partition; {wire.dropped} packets lost, {wire.carried} carried")
-    assert back_s < BACK_S
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
     check(tmp_path / "journal", done)

@@ -19,6 +19,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 from factorbus.proto import codec, keys
@@ -43,7 +44,7 @@ from factorbus.service.optima import Optima
 from factorbus.service.questions import Question, Snapshot
 from factorbus.service.room import Room
 from factorbus.service.senders import Senders
-from factorbus.service.start import get_ready_to_compute
+from factorbus.service.start import ready_to_compute
 from factorbus.service.trips import Trips
 from factorbus.service.vitals import Vitals
 
@@ -70,15 +71,12 @@ def serve(
     # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.
     library = open_library(config, log_owner, stop) if config.journal and not config.standby else None
     try:
-        get_ready_to_compute(config.warm)
-        if config.standby:
-            library = open_library(config, log_owner, stop)
-        if not stop.is_set():
-            cores = LentCores(config.cores)
-            try:
-                _serve(config, library, cores, on_ready, stop, on_look)
-            finally:
-                cores.close()
+        with ready_to_compute(config.warm):
+            if config.standby:
+                library = open_library(config, log_owner, stop)
+            if not stop.is_set():
+                with closing(LentCores(config.cores)) as cores:
+                    _serve(config, library, cores, on_ready, stop, on_look)
     finally:
         if library is not None:
             library.close()
@@ -106,6 +104,7 @@ def _serve(
             on_ready(endpoints)
             while not stop.wait(_TICK_S):
                 shell.tick()
+                cores.tick()
                 on_look(shell.vitals.health)
         finally:
             shell.close()

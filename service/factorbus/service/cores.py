@@ -5,7 +5,7 @@ import threading
 from typing import Any
 
 from factorbus.service.control_groups import limit_files
-from factorbus.solver.lending import Lender, count_free
+from factorbus.solver.lending import Lender, can_lend, count_free
 
 
 def core_count() -> int:
@@ -26,11 +26,23 @@ def core_count() -> int:
 
 
 class LentCores:
-    """From now on, until it is closed, an elimination may be at work on `cores` of those that there are at once."""
+    """Until it is closed, an elimination may be at work on `cores` of those that there are at once.
+
+    From when the kernel that eliminates is at hand: threads that asked for it before would compile it, for nobody yet,
+    and whoever closes this would have to wait for them.
+    """
 
     def __init__(self, cores: int) -> None:
-        more = min(cores, core_count()) - 1
-        self._lenders = [Lender() for _ in range(min(more, count_free()))]
+        self._more = min(cores, core_count()) - 1
+        self._lenders: list[Lender] = []
+        self._threads: list[threading.Thread] = []
+        self.tick()
+
+    def tick(self) -> None:
+        """Time went by: somebody may have compiled or loaded the kernel."""
+        if self._threads or not can_lend():
+            return
+        self._lenders = [Lender() for _ in range(min(self._more, count_free()))]
         self._threads = [
             threading.Thread(target=lender.lend, name=f"core {n}", daemon=True)
             for n, lender in enumerate(self._lenders, 1)

@@ -26,6 +26,11 @@ def count_free() -> int:
     return len(_free)
 
 
+def can_lend() -> bool:
+    """Whether the kernel that lenders run is compiled or loaded: called before, `lend` has to do that first."""
+    return CAN_SLEEP and bool(tree_step.signatures)
+
+
 class Lender:
     """One thread that lends its core.  Raises ValueError when there are as many as there may be.
 

@@ -6,7 +6,6 @@ What it finds goes to standard output as lines of JSON, {"done": steps} now and 
 whatever libraries print there goes to standard error.
 """
 
-import gc
 import json
 import os
 import sys
@@ -23,6 +22,7 @@ from factorbus.proto.messages import Batch
 from . import contestants
 from .chi2 import chi2_at
 from .clock import Clock
+from .collector import no_collection
 from .columns import columns_of
 from .contestants import Contestant, Rehearsing, Settling
 from .memory import peak_mb, reset_peak_mb
@@ -60,25 +60,23 @@ def replay(job: dict[str, Any], problem: Problem, tell: Tell) -> dict[str, Any]:
         contestant.rehearse(steps, samples, lambda k: tell({"done": k + 1, "cpu_s": 0.0}))
     clock = Clock(len(steps))
     load_before, compiled = os.getloadavg()[0], _compiled_s(name)
-    gc.collect()
-    gc.freeze()
-    gc.disable()  # a collection would fall on some step by chance
-    base_mb = reset_peak_mb()
-    status, reason, chi2 = "done", "", []
-    for k, batch in enumerate(steps):
-        try:
-            contestant.prepare(batch)
-            clock.run(k, contestant)
-        except contestants.Failed as failed:
-            status, reason = "failed", f"step {k}: {failed}"
-            break
-        if k in samples:
-            chi2.append((k, chi2_at(columns, contestant.values(), k)))
-        if clock.cpu_s > limit_s and k < len(steps) - 1:
-            status, reason = "limit", f"more than {limit_s:g} s of solver time after step {k}"
-            break
-        tell({"done": k + 1, "cpu_s": round(clock.cpu_s, 2)})
-    largest_mb = peak_mb()
+    with no_collection():
+        base_mb = reset_peak_mb()
+        status, reason, chi2 = "done", "", []
+        for k, batch in enumerate(steps):
+            try:
+                contestant.prepare(batch)
+                clock.run(k, contestant)
+            except contestants.Failed as failed:
+                status, reason = "failed", f"step {k}: {failed}"
+                break
+            if k in samples:
+                chi2.append((k, chi2_at(columns, contestant.values(), k)))
+            if clock.cpu_s > limit_s and k < len(steps) - 1:
+                status, reason = "limit", f"more than {limit_s:g} s of solver time after step {k}"
+                break
+            tell({"done": k + 1, "cpu_s": round(clock.cpu_s, 2)})
+        largest_mb = peak_mb()
     facts = contestant.facts() if status == "done" else {}
     settled = None
     if status == "done" and isinstance(contestant, Settling):

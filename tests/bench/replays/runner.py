@@ -23,7 +23,7 @@ from .samples import Sampling
 
 _HERE = Path(__file__).parent
 # What a run's numbers depend on in this package.
-_MACHINERY = ("child", "chi2", "clock", "columns", "compose", "contestants", "samples")
+_MACHINERY = ("child", "chi2", "clock", "collector", "columns", "compose", "contestants", "samples")
 _REFERENCE = ("reference", "chi2", "columns", "samples")
 _FILL = ("fill", "columns")
 _MEASURES = {
