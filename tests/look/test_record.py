@@ -105,7 +105,7 @@ def test_a_recording_has_every_estimate_and_every_factor(
         assert [row for each in mine for row in each["information"]] == group.information.tolist()
     assert sum(len(group.keys) for group in graph.factors) == merged(step.batch for step in steps).factor_count
     chi2 = [step["chi2"] for step in found["/map/step"] if "chi2" in step]
-    assert len(chi2) == 80
+    assert len(chi2) >= 80, "of each insert, and of further steps"
     # What is drawn is what is so.
     scene = {entity.id: entity for entity in found["/map/scene"][-1].entities}
     line = np.array([(p.x, p.y) for p in scene["trajectory x"].lines[0].points])

@@ -35,7 +35,7 @@ def check(journal: Path, done: list[str]) -> None:
     whole = uninterrupted("inc-l", batches, check_journal(journal / "m2", COUNT))
     content = hashlib.sha256()
     order = sorted(whole)
-    content.update(np.array(order, np.int64).tobytes() + b"".join(whole[key] for key in order))
+    content.update(np.array(order, np.int64).tobytes() + b"".join(whole[key][0] for key in order))
     assert done[1] == content.hexdigest()
 
 
