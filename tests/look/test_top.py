@@ -30,6 +30,7 @@ class Terminal:
         self._ours, theirs = pty.openpty()
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 30, 130, 0, 0))
         environment = os.environ | {"TERM": "xterm-256color"}
+        environment.pop("COLUMNS", None)  # tests side by side are told of a terminal that is not this one
         self.process = subprocess.Popen(
             [*COMMAND, *arguments], stdin=theirs, stdout=theirs, stderr=theirs, env=environment, start_new_session=True
         )

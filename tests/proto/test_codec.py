@@ -307,6 +307,7 @@ EDGE = {"kind": "between_se2", "keys": b"\0" * 16, "measured": b"\0" * 24, "info
         ({"sequence": 1, "factors": [EDGE | {"measured": b"0" * 16}]}, "factors[0].measured: 16 bytes; wanted 24"),
         ({"sequence": 1, "factors": [EDGE | {"information": b""}]}, "factors[0].information: 0 bytes; wanted 48"),
         ({"sequence": 1, "factors": [{"kind": "between_se2", "keys": b""}]}, "factors[0].measured: missing"),
+        ({"sequence": 1, "factors": [EDGE | {"scale": b"\0" * 8}]}, "factors[0].scale: a scale without a loss"),
     ],
 )
 def test_what_is_wrong_is_named_by_its_place(content: dict[str, Any], text: str) -> None:

@@ -67,6 +67,8 @@ WRONG = {
     "offset missing": ("EDGE_SE3_TRACKXYZ 0 1 3 1 2 3 1 0 0 1 0 1\n", 1, "parameter 3, which no line declares"),
     "sigma": ("BR 0 1 0.1 4 0 1\n", 1, "standard deviations"),
     "range": ("BR 0 1 0.1 -4 1 1\n", 1, "range -4"),
+    "records of TORO and g2o": (f"EQUIV 0 1\n{GOOD}", 2, "EDGE_SE2, a record of g2o, in what is read as toro text"),
+    "records of g2o and iSAM": (f"{GOOD}ODOMETRY 0 1 1 0 0 1 0 0 1 0 1\n", 1, "--dialect g2o to read its alone"),
     "zero byte": (f"{GOOD}EDGE_SE2 0 1 1 0 0 1\x00\n", 2, "a zero byte"),
 }
 
@@ -123,3 +125,10 @@ def test_unknown_dialect(tmp_path: Path) -> None:
     path.write_text(GOOD)
     with pytest.raises(FormatError, match=r"dialect 'g3o'; wanted one of g2o, toro, isam, slam\+\+"):
         read(path, "g3o")
+
+
+def test_a_named_dialect_reads_its_own_records(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.g2o"
+    path.write_text(f"EQUIV 0 1\n{GOOD}")
+    graph = read(path, "g2o")
+    assert (graph.poses, graph.batch.factor_count, graph.left_out) == (2, 1, {"EQUIV": 1})

@@ -1,6 +1,8 @@
 """`factorbus ros2`: a robot that speaks ROS 2 over Zenoh, on a map."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import click
@@ -104,8 +106,8 @@ def command(
 
     begin(log_form, quiet)
     settings = from_options(**given)
-    sys.setswitchinterval(_SWITCH_S)
     with (
+        _switching_often(),
         stop_on_signals(until_eof) as stop,
         open_bus(endpoint, "ros2", zenoh) as bus,
         bus.map(map_name) as joined,
@@ -117,3 +119,14 @@ def command(
         click.echo(f"{READY}{ros or endpoint}")
         bridge.run(stop)
         click.echo(" ".join(f"{name}={count}" for name, count in sorted(bridge.counts.items())), err=True)
+
+
+@contextmanager
+def _switching_often() -> Iterator[None]:
+    """Threads take turns after _SWITCH_S."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)

@@ -64,6 +64,8 @@ def _read(index: int, content: Map) -> Change:
         return Change(name, named, weight=fields.rows(place, content, "weight", named.size, 1).reshape(-1))
     loss = fields.text(place(), content, "loss", default="") if of.numbers else ""
     if not loss:
+        if of.numbers and content.get("scale") is not None:
+            raise BadMessage(f"{place()}.scale", "a scale without a loss", f"loss: one of {', '.join(LOSSES)}")
         return Change(name, named)
     if loss not in LOSSES:
         raise BadLoss(f"{place()}.loss", repr(loss[:64]), f"one of {', '.join(LOSSES)}, or no such field")

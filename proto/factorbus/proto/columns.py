@@ -114,6 +114,8 @@ def _read_factors(index: int, content: Map) -> Factors:
     ids = _read_numbers(place, content, "ids", len(keys)) if "ids" in content else None
     loss = content.get("loss")
     if loss is None:
+        if content.get("scale") is not None:
+            raise BadMessage(f"{place()}.scale", "a scale without a loss", f"loss: one of {', '.join(LOSSES)}")
         return Factors(known.name, keys, measured, information, ids=ids)
     if type(loss) is not str or loss not in LOSSES:
         if type(loss) is not str:

@@ -10,7 +10,7 @@ _COUNTS = (
     "points", "removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables",
     "placed_variables", "added_factors",
 )  # fmt: skip
-_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms")
+_NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms", "compiled_ms")
 
 
 class Report(dict[str, Any]):

@@ -61,6 +61,8 @@ def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     ]
     edges = _edges(file, chosen, buckets, vertices, left)
     fixes = _fixes(file, buckets["FIX"]) if chosen is G2O and "FIX" in buckets else None
+    if dialect is None:
+        _refuse_mixed(file, chosen, buckets)
     _leave_foreign(file, chosen, buckets, left)
     are_keys = any((columns.ids > MAX_INDEX).any() for columns in (*vertices, *edges))
     apart = chosen.one_numbering and not are_keys and numbered_apart(vertices)
@@ -90,6 +92,20 @@ def _edges(
             ]
     leave_cameras(offsets, reading.named, left)
     return _priors_of_poses(columns, vertices) if is_g2o else columns
+
+
+def _refuse_mixed(file: str, dialect: Dialect, buckets: Mapping[str, Bucket]) -> None:
+    """Refuse a file of no named dialect that has vertices or edges of two.  Raises FormatError."""
+    for name in sorted(buckets, key=lambda name: buckets[name].numbers[0]):
+        others = [other.name for other in DIALECTS.values() if name in other.vertices or name in other.edges]
+        if others and name not in dialect.names and name not in dialect.refused:
+            seen = f"{name}, a record of {' and '.join(others)}, in what is read as {dialect.name} text"
+            raise FormatError(
+                file,
+                buckets[name].numbers[0],
+                seen,
+                f"records of one dialect, or --dialect {others[0]} to read its alone",
+            )
 
 
 def _leave_foreign(file: str, dialect: Dialect, buckets: Mapping[str, Bucket], left: LeftOut) -> None:

@@ -115,7 +115,11 @@ def _export(content: dict[str, Any]) -> Question:
         raise BadOption("question.robot", f"is {robot[:40]!r}", "one ASCII letter, or an empty string")
     if robot is not None and format == "g2o":
         raise BadOption("question.robot", f"is {robot!r}", "none with g2o, which has the whole map")
-    return Question("export", format=format, robot=robot, strict=fields.flag("question", content, "strict"), ids=ids)
+    strict = fields.flag("question", content, "strict")
+    if format != "g2o" and (strict or ids != "auto"):
+        where, seen = ("strict", "is true") if strict else ("ids", f"is {ids!r}")
+        raise BadOption(f"question.{where}", seen, f"none with {format}, which is a trajectory alone")
+    return Question("export", format=format, robot=robot, strict=strict, ids=ids)
 
 
 def snapshot(
