@@ -32,7 +32,7 @@ from factorbus.proto.messages import (
     Optimum,
     Variables,
 )
-from factorbus.proto.problems import BadMessage, Problem, Refused, TooLarge, UnknownKind, UnknownMap
+from factorbus.proto.problems import BadMessage, BadStamp, Problem, Refused, TooLarge, UnknownKind, UnknownMap
 from factorbus.proto.stamps import NO_STAMP
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
@@ -480,3 +480,26 @@ def test_a_documented_field_of_a_report_can_always_be_asked_for() -> None:
         assert name not in accepted.report
     with pytest.raises(KeyError):
         accepted.report["chi"]
+
+
+@pytest.mark.parametrize(
+    "column",
+    [[1.5], [float("nan")], ["abc"], [True], np.array([2**63], np.uint64), [2**64], np.array(["2026"], "M8[ns]")],
+)
+def test_what_is_no_whole_number_is_refused_and_not_cut_to_one(column: Any) -> None:
+    stamped = Variables("se2", np.array([7]), None, False, column)
+    with pytest.raises(BadStamp, match="stamps"):
+        codec.encode_insert(Insert(1, Batch((stamped,))))
+    with pytest.raises(BadMessage, match=r"variables\.keys"):
+        codec.encode_insert(Insert(1, Batch((Variables("se2", column),))))
+    factors = Factors("prior_se2", column, np.zeros((1, 3)), np.ones((1, 6)))
+    with pytest.raises(BadMessage, match=r"factors\.keys"):
+        codec.encode_insert(Insert(1, Batch((), (factors,))))
+
+
+def test_whole_numbers_of_other_types_are_taken() -> None:
+    for column in ([7], (7,), np.array([7], np.uint8), np.array([7], np.int32)):
+        read = codec.decode_insert(
+            codec.encode_insert(Insert(1, Batch((Variables("se2", column, None, False, column),))))
+        )
+        assert read.batch.variables[0].keys.tolist() == read.batch.variables[0].stamps.tolist() == [7]

@@ -123,7 +123,8 @@ def _table(first: str, *columns: str) -> Any:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column(first, style="bold", no_wrap=True)
+    # In a narrow terminal a cell goes on in the next line: a number without its last digits is another one.
+    table.add_column(first, style="bold", overflow="fold")
     for column in columns:
-        table.add_column(column, justify="left" if column in ("map", "mode") else "right", no_wrap=True)
+        table.add_column(column, justify="left" if column in ("map", "mode") else "right", overflow="fold")
     return table

@@ -11,7 +11,7 @@ from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.proto.problems import BadLoss, BadMessage, TooLarge, UnknownKind
+from factorbus.proto.problems import BadLoss, BadMessage, BadStamp, TooLarge, UnknownKind
 
 
 def variables_to_maps(groups: Sequence[Variables]) -> list[dict[str, Any]]:
@@ -51,28 +51,42 @@ def _check_count(what: str, groups: Sequence[Variables] | Sequence[Factors], lim
 
 
 def _variables_map(group: Variables) -> dict[str, Any]:
-    content: dict[str, Any] = {"kind": group.kind, "keys": _bytes(group.keys, I8)}
+    content: dict[str, Any] = {"kind": group.kind, "keys": _whole("variables", "keys", group.keys)}
     if group.values is not None:
         content["values"] = _bytes(group.values, F8)
     if group.fixed:
         content["fixed"] = True
     if group.stamps is not None:
-        content["stamps"] = _bytes(group.stamps, I8)
+        content["stamps"] = _whole("variables", "stamps", group.stamps)
     return content
 
 
 def _factors_map(group: Factors) -> dict[str, Any]:
     content: dict[str, Any] = {
         "kind": group.kind,
-        "keys": _bytes(group.keys, I8),
+        "keys": _whole("factors", "keys", group.keys),
         "measured": _bytes(group.measured, F8),
         "information": _bytes(group.information, F8),
     }
     if group.loss:
         content |= {"loss": group.loss, "scale": _bytes(group.scale, F8)}
     if group.ids is not None:
-        content["ids"] = _bytes(group.ids, I8)
+        content["ids"] = _whole("factors", "ids", group.ids)
     return content
+
+
+def _whole(groups: str, name: str, column: Any) -> bytes:
+    """A column of int64.  Raises BadStamp, BadMessage for what NumPy would cut to whole numbers."""
+    if type(column) is np.ndarray and column.dtype == I8:
+        return column.tobytes()
+    numbers = np.asarray(column)
+    wide = numbers.dtype.kind == "u" and numbers.size and numbers.max() > np.iinfo(np.int64).max
+    if numbers.size and (numbers.dtype.kind not in "iu" or wide):
+        seen = f"of {numbers.dtype}, {column!r:.60}"
+        if name == "stamps":
+            raise BadStamp(f"{groups}.{name}", seen)
+        raise BadMessage(f"{groups}.{name}", seen, "integers from -2^63 to 2^63 - 1")
+    return numbers.astype(I8).tobytes()
 
 
 def _bytes(column: Any, dtype: np.dtype) -> bytes:
