@@ -104,6 +104,10 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     assert "there is keys without a letter, a, b" in capsys.readouterr().err
     assert main(["save", "yard", str(tmp_path / "a.xyz"), "--connect", endpoint]) == USAGE
     assert main(["save", "yard", str(whole), "--robot", "a", "--connect", endpoint]) == USAGE
+    assert save(str(tmp_path / "counted.g2o"), "--ids", "counted") == [str(tmp_path / "counted.g2o")]
+    counted = [int(line.split()[1]) for line in (tmp_path / "counted.g2o").read_text().splitlines() if "VERTEX" in line]
+    assert sorted(counted) == list(range(12))
+    assert main(["save", "yard", str(way), "--ids", "keys", "--connect", endpoint]) == USAGE
 
 
 def test_why_of_a_number_is_of_the_factor_and_of_the_variable_without_a_letter(
