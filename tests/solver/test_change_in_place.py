@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from naive.dense_least_squares import DenseGraph, distance
+from naive.dense_least_squares import DenseGraph
+from naive.estimates import apart, values
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_others import other_steps
 from naive.tree_records import tree_of
@@ -38,20 +39,6 @@ def rows_of(solver: Solver) -> dict[int, tuple[Any, ...]]:
             numbers = g.keys[n].tobytes(), g.measured[n].tobytes(), g.information[n].tobytes()
             rows[each] = (g.kind, *numbers, g.loss, scale)
     return rows
-
-
-def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
-    return {
-        key: (group.kind, row)
-        for group in solver.estimate()
-        for key, row in zip(group.keys.tolist(), group.values, strict=True)
-    }
-
-
-def apart(one: Solver, other: Solver) -> float:
-    a, b = values(one), values(other)
-    assert a.keys() == b.keys()
-    return max((distance(kind, row, b[key][1]) for key, (kind, row) in a.items()), default=0.0)
 
 
 def bits(solver: Solver) -> dict[int, bytes]:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from naive.dense_least_squares import DenseGraph, distance
+from naive.estimates import apart, values
 from naive.random_graphs import camera_steps, random_steps
 
 from factorbus.proto.kinds import CHANGES as WIRE_CHANGES
@@ -26,21 +27,6 @@ def fed(batches: list[Batch], mode: str = "tree") -> tuple[Solver, list[int]]:
         firsts.append(solver.stage(batch))
         solver.step()
     return solver, firsts
-
-
-def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
-    return {
-        key: (group.kind, row)
-        for group in solver.estimate()
-        for key, row in zip(group.keys.tolist(), group.values, strict=True)
-    }
-
-
-def apart(one: Solver, other: Solver) -> float:
-    """How far two estimates of the same variables are from each other."""
-    a, b = values(one), values(other)
-    assert a.keys() == b.keys()
-    return max((distance(kind, row, b[key][1]) for key, (kind, row) in a.items()), default=0.0)
 
 
 def undone(batch: Batch, first: int) -> list[Change]:

@@ -33,8 +33,8 @@ class Options:
     negligible      a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A step whose new
                     factors add less solves nothing, and no step goes on for less
     max_iterations  maxIT: at most this many tries (accepted or not) in an ordinary step; the next step goes on
-    nonmonotone_steps   where an undamped step would raise χ², so many in a row may, until it is lower than before them;
-                    else they are taken back, and Levenberg-Marquardt's damping follows.  0: it is damped at once
+    nonmonotone_steps   where an undamped step would raise χ², at most this many in a row may, until it is lower than
+                    before; else they are taken back, and Levenberg-Marquardt's damping follows.  0: it is damped at once
     settle_tolerance, settle_iterations   the same for a step that is to converge
     last_pose_last  constrain the ordering: the last pose last, the landmarks seen lately right before it
     recent_poses    "lately": from the last so many poses

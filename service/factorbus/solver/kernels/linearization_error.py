@@ -30,11 +30,11 @@ from factorbus.solver.kernels.tree_take_in import next_incidence
 LEAST_BURDEN = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 MUCH = 8  # where more than one variable in so many has moved, all factors are gone through
-# The running sums are summed anew once what was added to them and taken away is so many times χ².
+# The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
-# In full the error of a factor with a loss counts so many times: Gauss-Newton with weights leaves up to seven times as
-# much of χ² as its next step takes off.
+# Factor on the error of a factor with a loss in the bound: Gauss-Newton with weights leaves up to seven times as much
+# of χ² as its next step takes off.
 ROBUST = 3.0
 FORCE = 0.5  # of φ |√Ω r|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number

@@ -27,7 +27,7 @@ def close_gaps(gone: I64, graph: I64, tree: I64) -> None:
         rows[f - first] = f - k
         if k < gone.size and gone[k] == f:
             k += 1
-    renumber(first, rows, tree)
+    renumber(first, rows, fac, tree)
     k = 0
     for f in range(first, count):
         if k < gone.size and gone[k] == f:
@@ -47,7 +47,7 @@ def close_gaps(gone: I64, graph: I64, tree: I64) -> None:
 
 @kernel("void(int64[::1], int64[::1], int64[::1])")
 def open_gaps(gone: I64, graph: I64, tree: I64) -> None:
-    """Undo `close_gaps`: the rows `gone` are there again, for whoever fills them and links them."""
+    """Undo `close_gaps`: the rows `gone` are there again, to be filled and linked by the caller."""
     fac, counts = int_rows(graph, at.T_FAC), ints(graph, at.T_COUNTS)
     link, stiff, state = int_rows(tree, tl.T_LINK), float_rows(tree, tl.T_STIFF), ints(tree, tl.T_STATE)
     first, count, taken = gone[0], counts[at.FACTORS], state[tl.S_FACTORS]
@@ -57,7 +57,7 @@ def open_gaps(gone: I64, graph: I64, tree: I64) -> None:
         while k < gone.size and gone[k] <= f + k:
             k += 1
         rows[f - first] = f + k
-    renumber(first, rows, tree)
+    renumber(first, rows, fac, tree)
     for f in range(count - 1, first - 1, -1):
         to = rows[f - first]
         for c in range(at.F_WIDTH):
@@ -73,8 +73,8 @@ def open_gaps(gone: I64, graph: I64, tree: I64) -> None:
 
 
 @part
-def renumber(first: int, rows: I64, tree: I64) -> None:
-    """What tells of factor f ≥ first tells of rows[f − first]."""
+def renumber(first: int, rows: I64, fac: I64, tree: I64) -> None:
+    """Lists that name factor f ≥ first name rows[f − first] instead; fac: rows as they were."""
     node, link, state = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), ints(tree, tl.T_STATE)
     for v in range(state[tl.S_VARIABLES]):
         node[v, tl.N_OWN] = renumbered(node[v, tl.N_OWN], first, rows)
@@ -82,7 +82,7 @@ def renumber(first: int, rows: I64, tree: I64) -> None:
     for f in range(state[tl.S_FACTORS]):
         link[f, tl.L_OWN] = renumbered(link[f, tl.L_OWN], first, rows)
         link[f, tl.L_I] = renumbered_slot(link[f, tl.L_I], first, rows)
-        if link[f, tl.L_SECOND] >= 0:
+        if fac[f, at.F_J] >= 0:
             link[f, tl.L_J] = renumbered_slot(link[f, tl.L_J], first, rows)
 
 

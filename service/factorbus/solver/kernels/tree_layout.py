@@ -78,9 +78,7 @@ L_J = 2  # next incidence of the second one
 L_AT = 3  # where its Hessian starts
 L_STAMP = 4  # the last sweep that linearised it
 L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
-L_FAR = 6  # the second variable's place in the graph's values; -1: none
-L_SECOND = 7  # the second variable; -1: none
-L_WIDTH = 8
+L_WIDTH = 8  # a cache line
 
 # In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
 EXACT, ASLEEP = 1000, 1001
@@ -173,7 +171,7 @@ S_RISES = 53  # 1: the last round of the step raised χ²
 S_ONCE = 54  # 1: the step under way has one round
 S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
 S_AFTER = 56  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
-S_EDITED = 57  # so many in `moved` are variables of factors that were edited since the last step
+S_EDITED = 57  # variables in `moved` whose factors were edited since the last step; they come first
 S_EDITED_AT = 58  # the last step that such factors went before
 S_HOLES = 59  # doubles of `hessian` that no factor has any more
 S_FREE = 60  # heads of free lists: numbers, then lists

@@ -62,11 +62,10 @@ def take_in_factors(
     for f in range(f0, f1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
-        link[f, tl.L_KIND], link[f, tl.L_SECOND] = fac[f, at.F_KIND], j
+        link[f, tl.L_KIND] = fac[f, at.F_KIND]
         if fac[f, at.F_KIND] >= at.IDP_FIRST or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
             link[f, tl.L_KIND] = tl.EXACT
             state[tl.S_EXACT] += 1
-        link[f, tl.L_FAR] = var[j, at.V_AT] if j >= 0 else -1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
         linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
