@@ -59,9 +59,12 @@ class RosNode:
         self._kept.append(self._bus.declare_subscriber(key, Callback(hear, indirect=False)))
 
     def tokens(self) -> list[str]:
-        """Who is there, as `ros2 topic list` finds out."""
-        replies = self._bus.liveliness().get(f"@ros2_lv/{self._domain}/**", timeout=5)
-        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+        """Who is there, as `ros2 topic list` finds out; where no token comes in time, it is asked again."""
+        for _ in range(6):
+            replies = self._bus.liveliness().get(f"@ros2_lv/{self._domain}/**", timeout=5)
+            if tokens := sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None):
+                return tokens
+        return []
 
     def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> list[str]:
         """The tokens of nodes, publishers and subscriptions, once a node and so many others are seen.

@@ -65,8 +65,8 @@ class Rule:
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
     polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
-    nonmonotone: where the first undamped step would raise χ², at most this many in a row are made all the same, until χ²
-    is lower than before them; if it never is, they are taken back.
+    nonmonotone: where the first undamped step would raise χ², at most this many in a row are made all the same, until
+    χ² is lower than before them; if it never is, they are taken back.
     """
 
     tolerance: float

@@ -34,7 +34,8 @@ class Options:
                     factors add less solves nothing, and no step goes on for less
     max_iterations  maxIT: at most this many tries (accepted or not) in an ordinary step; the next step goes on
     nonmonotone_steps   where an undamped step would raise χ², at most this many in a row may, until it is lower than
-                    before; else they are taken back, and Levenberg-Marquardt's damping follows.  0: it is damped at once
+                    before; else they are taken back, and Levenberg-Marquardt's damping follows.  0: it is damped at
+                    once
     settle_tolerance, settle_iterations   the same for a step that is to converge
     last_pose_last  constrain the ordering: the last pose last, the landmarks seen lately right before it
     recent_poses    "lately": from the last so many poses
