@@ -31,7 +31,7 @@ from factorbus.solver import Group, Options, Solver, StepReport
 DRAWN = [name for name, world in WORLDS.items() if world.is_drawn]
 SMALL = 60
 LOOPING = {"manhattan": 150, "outliers": 250}  # poses until loops have closed
-SLOPPY = ("bent", "bent_soon", "bent_now", "bent_most", "trust", "converged_share")  # at 1e9: nothing is relinearised
+SLOPPY = ("bent", "bent_soon", "bent_now", "bent_most", "converged_share")  # at 1e9: nothing is relinearised
 
 
 def steps_of(name: str, poses: int = SMALL, seed: int = 3) -> list[Batch]:

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.tree_move import MODEL
 from factorbus.solver.tree import Tree
 
 # Nothing is relinearised, so a lot is bent.
-NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, trust=1e9, converged_share=1e9)
+NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, converged_share=1e9)
 
 
 @pytest.mark.parametrize(("world", "poses"), [("manhattan", 300), ("city_trees", 120), ("sphere", 150)])

@@ -23,7 +23,6 @@ LINEAR = {
     "bent_now": math.inf,
     "bent_most": math.inf,
     "converged_share": math.inf,
-    "trust": math.inf,
 }  # little is relinearised
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
 

@@ -37,7 +37,7 @@ def kept(before: dict[int, Clique], solver: Solver) -> list[int]:
 @pytest.mark.parametrize("world", sorted(WORLDS))
 @pytest.mark.parametrize("rounds", [{}, {"bent_now": 1e-9}])
 def test_renewed_cliques_have_the_numbers_of_the_new_points(world: str, rounds: dict[str, float]) -> None:
-    solver, renewed = Solver(Options(**{**OFTEN, **rounds}, ripple=0.0, split_pivots=6, trust=1e9)), 0
+    solver, renewed = Solver(Options(**{**OFTEN, **rounds}, ripple=0.0, split_pivots=6)), 0
     for batch in steps(world, 130):
         before = cliques(solver)
         solver.stage(batch)

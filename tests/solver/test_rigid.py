@@ -15,7 +15,7 @@ from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
-FAR = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "trust": np.inf, "converged_share": np.inf}
+FAR = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "converged_share": np.inf}
 WORLDS: dict[str, Callable[[], Iterator[Batch]]] = {
     "poses": lambda: (step.batch for step in manhattan(500, 5)),
     "landmarks": lambda: (step.batch for step in city_trees(500, seed=5)),

@@ -40,7 +40,7 @@ def replay(path: Path) -> tuple[Solver, float]:
         solver.stage(batch)
         report = solver.step()
         assert (
-            report.chi2 <= (1 + Options().trust) * report.chi2_before + LEAST_CHI2
+            report.chi2 <= (1 + Options().converged_share) * report.chi2_before + LEAST_CHI2
         )  # else it would have been replaced
         chi2 = report.chi2
     solver.step(settle=True)

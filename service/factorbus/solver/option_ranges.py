@@ -63,7 +63,6 @@ RANGES = types.MappingProxyType(
         "rest": _count(0),
         "reluctance": _AMOUNT,
         "dear": _FACTOR,
-        "trust": _AMOUNT,
         "rounds": _count(1),
         "converged_share": _AMOUNT,
         "ripple": _AMOUNT,

@@ -34,11 +34,7 @@ class Tree(Arenas):
         self.settings: F64 = np.empty(tl.P_SIZE)
         self.settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
         self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
-        self.settings[[tl.P_CONVERGED, tl.P_TRUST, tl.P_RECENT]] = (
-            options.converged_share,
-            options.trust,
-            options.recent_steps,
-        )
+        self.settings[[tl.P_CONVERGED, tl.P_RECENT]] = options.converged_share, options.recent_steps
         self.settings[[tl.P_SOON, tl.P_PATIENCE, tl.P_MOST]] = (
             options.bent_soon,
             options.patience,

@@ -24,7 +24,7 @@ SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact t
 def factor_chi2(
     f: int, kind: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, stiff: F64
 ) -> tuple[float, float]:
-    """rᵀΩr, or ρ of it, of factor f at `values`, and between poses the length of the translation in r; kind: its
+    """rᵀΩr, or ρ of it, of factor f at `values`, and between poses the square of the translation in r; kind: its
     `L_KIND`; c, s: cosine and sine of its first, plane pose.
     """
     if kind == at.BETWEEN_SE2:
@@ -47,12 +47,12 @@ def between_se2_chi2(
     turn = wrap(load(values, y + 2) - load(values, x + 2) - load(payload, k + 2))
     gap = ex * ex + ey * ey
     if stiff[f, tl.B_ROUND] != 0.0:
-        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, math.sqrt(gap)
+        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap
     cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex
     cross = load(payload, k + 4) * rx * ry + (load(payload, k + 5) * rx + load(payload, k + 7) * ry) * turn
     square = load(payload, k + 3) * rx * rx + load(payload, k + 6) * ry * ry + load(payload, k + 8) * turn * turn
-    return square + 2.0 * cross, math.sqrt(gap)
+    return square + 2.0 * cross, gap
 
 
 @inline_kernel
@@ -80,7 +80,7 @@ def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float,
     if w < 0.0:
         r3, r4, r5 = -r3, -r4, -r5
     k += 7
-    gap = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
+    gap = r0 * r0 + r1 * r1 + r2 * r2
     total = r0 * (p[k] * r0 + 2.0 * (p[k + 1] * r1 + p[k + 2] * r2 + p[k + 3] * r3 + p[k + 4] * r4 + p[k + 5] * r5))
     total += r1 * (p[k + 6] * r1 + 2.0 * (p[k + 7] * r2 + p[k + 8] * r3 + p[k + 9] * r4 + p[k + 10] * r5))
     total += r2 * (p[k + 11] * r2 + 2.0 * (p[k + 12] * r3 + p[k + 13] * r4 + p[k + 14] * r5))

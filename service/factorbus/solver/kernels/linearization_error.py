@@ -15,9 +15,9 @@ from factorbus.solver.kernels.factor_chi2 import any_chi2, factor_chi2, heading_
 from factorbus.solver.kernels.tree_bend import (
     LINKS,
     SEEN,
+    add_sighting,
     bend_of,
     shift_between,
-    slip_of,
     turn_error,
     turn_of,
 )
@@ -33,9 +33,7 @@ MUCH = 8  # where more than one variable in so many has moved, all factors are g
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
-# Factor on the error of a factor with a loss in the bound: Gauss-Newton with weights leaves up to seven times as much
-# of χ² as its next step takes off.
-ROBUST = 3.0
+ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
 FORCE = 0.5  # of φ |√Ω r|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
 
@@ -143,16 +141,17 @@ def evaluate_factor(
         if how < MODEL:
             chi2 = any_chi2(f, var, fac, values, payload)
         else:
-            error, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
+            error, force, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
             error = min(error, MOST_ERROR)
-            full = ROBUST * error if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else error
+            full = min(error + force, MOST_ERROR)
+            full = ROBUST * full if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else full
             if error > bent:
                 await_ends(f, fac, var, node, pending, state)
     else:
-        chi2, residual = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
+        chi2, gap = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
         if second >= 0 and how == MODEL:
             error, full = error_of(
-                f, v, kind, second, bent, residual, chi2, var, node, stiff, lin, delta, values, pending, state
+                f, v, kind, second, bent, gap, chi2, var, node, stiff, lin, delta, values, pending, state
             )
     was = stiff[f, tl.B_CHI2]
     stiff[f, tl.B_CHI2] = chi2
@@ -167,7 +166,7 @@ def evaluate_factor(
 
 @inline_kernel
 def error_of(
-    f: int, v: int, kind: int, second: int, bent: float, residual: float, chi2: float, var: I64, node: I64, stiff: F64,
+    f: int, v: int, kind: int, second: int, bent: float, gap: float, chi2: float, var: I64, node: I64, stiff: F64,
     lin: F64, delta: F64, values: F64, pending: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """How far factor f from v to `second` is from its linear model, as it counts and in full.  Where that is more than
@@ -175,18 +174,17 @@ def error_of(
     """
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
     phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
-    d, root, between = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3
-    shift = shift_between(planar, x, y, values, lin)
-    bend = bend_of(kind, root, d, phi, shift)
-    if kind == at.BETWEEN_SE3 and phi > 0.0:
-        bend += turn_error(phi, x, y, values, lin, stiff[f, tl.B_TURN])
-    force = FORCE * phi * math.sqrt(chi2) if kind == at.BETWEEN_SE3 else 0.0
-    if between:
-        slip = stiff[f, tl.B_PULL] * residual * shift
+    d, root, shift = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], shift_between(planar, x, y, values, lin)
+    bend = bend_of(root, d, phi, shift)
+    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        slip, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
+        if kind == at.BETWEEN_SE3 and phi > 0.0:
+            bend += turn_error(phi, x, y, values, lin, stiff[f, tl.B_TURN])
+            force = FORCE * phi * math.sqrt(chi2)
         full, error = min(bend + slip + force, MOST_ERROR), min(bend + LINKS * slip, MOST_ERROR)
         both = LINKS * slip > bend
     else:
-        slip = slip_of(kind, root, d, shift, stiff[f, tl.B_PULL])
+        bend, slip = add_sighting(kind, bend, root, d, shift, stiff[f, tl.B_PULL])
         full = error = min(SEEN * (bend + slip), MOST_ERROR)
         both = kind == at.BEARING_RANGE_SE2 or slip > bend
     if error > bent:

@@ -39,13 +39,13 @@ standard deviations,
 
     bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
 
-and both ends move.
+and both ends move.  As a bound the force counts as well, (9.31) in `tree_exact`.
 """
 
 import math
 
 from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, inline_kernel
+from factorbus.solver.kernels._jit import F64, inline_kernel, part
 from factorbus.solver.kernels.se3 import quat_product
 from factorbus.solver.kernels.simd import at as load
 from factorbus.solver.lenses.layout import FU
@@ -78,20 +78,24 @@ def shift_between(planar: bool, x: int, y: int, values: F64, lin: F64) -> float:
 
 
 @inline_kernel
-def bend_of(kind: int, root: float, d: float, phi: float, shift: float) -> float:
+def bend_of(root: float, d: float, phi: float, shift: float) -> float:
     """(9.4)"""
-    bend = root * (0.5 * d * phi * phi + phi * shift)
-    if kind == at.BEARING_RANGE_SE2 and d > 0.0:
-        bend += root * shift * shift / d
-    return bend
+    return root * (0.5 * d * phi * phi + phi * shift)
 
 
-@inline_kernel
-def slip_of(kind: int, root: float, d: float, shift: float, pull: float) -> float:
-    """(9.12) of what sees a landmark, √ω |r| as |Ω r| / √ω; pull is |Ω r|.  0 of all else."""
-    if d > 0.0 and (kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3):
-        return (pull / root + root * shift) * shift / d
-    return 0.0
+@part
+def add_sighting(
+    kind: int, bend: float, root: float, d: float, shift: float, pull: float
+) -> tuple[float, float]:  # fmt: skip
+    """The bend, with what (9.5) has beside (9.4), and the slip (9.12) of what sees a landmark, √ω |r| as |Ω r| / √ω;
+    pull is |Ω r|.  Of all other kinds the bend, and 0.
+    """
+    if d > 0.0:
+        if kind == at.BEARING_RANGE_SE2:
+            return bend + root * shift * shift / d, 0.0
+        if kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3:
+            return bend, (pull / root + root * shift) * shift / d
+    return bend, 0.0
 
 
 @inline_kernel

@@ -1,4 +1,6 @@
-"""The linearization error of a factor, computed: sights, and factors with a loss.  MATH (9.11)."""
+"""The linearization error of a factor, computed: of sights, of factors with a loss, and of kinds that no closed form
+bounds.  MATH (9.11), (9.31)
+"""
 
 import math
 
@@ -16,12 +18,13 @@ SWITCHED = 30.0  # of a sight that has lost its pixel or found it again: by whic
 @part
 def exact_error(
     f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
-) -> tuple[float, float]:  # fmt: skip
-    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations; and its χ²
-    there.
+) -> tuple[float, float, float]:  # fmt: skip
+    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
+    residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ² there.
     """
     r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
-    chi2 = evaluate_apart(f, var, fac, values, payload, now, A, B)
+    A_now, B_now = np.zeros((6, 6)), np.zeros((6, 6))
+    chi2 = evaluate_apart(f, var, fac, values, payload, now, A_now, B_now)
     evaluate_apart(f, var, fac, lin, payload, r, A, B)
     kind = fac[f, at.F_KIND]
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
@@ -30,6 +33,9 @@ def exact_error(
     add_slope(fac[f, at.F_I], dim, var, delta, A, r)
     if fac[f, at.F_J] >= 0:
         add_slope(fac[f, at.F_J], dim, var, delta, B, r)
+    force = force_of(fac[f, at.F_I], dim, p, var, payload, now, A, A_now)
+    if fac[f, at.F_J] >= 0:
+        force += force_of(fac[f, at.F_J], dim, p, var, payload, now, B, B_now)
     total = 0.0
     for a in range(dim):
         gap = now[a] - r[a]
@@ -40,7 +46,30 @@ def exact_error(
             total += 2.0 * gap * payload[p] * (now[b] - r[b])
             chi2 += 2.0 * now[a] * payload[p] * now[b]
             p += 1
-    return SWITCHED if switched else math.sqrt(max(total, 0.0)), chi2
+    return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
+
+
+@part
+def force_of(v: int, dim: int, p: int, var: I64, payload: F64, r: F64, J: F64, J_now: F64) -> float:
+    """The square of (9.31), the share of variable v: Σ ((J_now − J)ᵀ Ω r)² / (J_nowᵀ Ω J_now) over its scalars."""
+    if var[v, at.V_SCALAR] < 0:
+        return 0.0
+    total = 0.0
+    for c in range(dim_of(var[v, at.V_KIND])):
+        turned = stiff = 0.0
+        q = p
+        for a in range(dim):
+            for b in range(a, dim):
+                w = payload[q]
+                q += 1
+                turned += (J_now[a, c] - J[a, c]) * w * r[b]
+                stiff += J_now[a, c] * w * J_now[b, c]
+                if b > a:
+                    turned += (J_now[b, c] - J[b, c]) * w * r[a]
+                    stiff += J_now[a, c] * w * J_now[b, c]
+        if stiff > 0.0:
+            total += turned * turned / stiff
+    return total
 
 
 @part

@@ -64,7 +64,6 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
-ENOUGH = 0.25  # of `converged_share`
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -152,7 +151,7 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
         chi2 = account[tl.A_CHI2]
-        if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_TRUST]) * before + LEAST_CHI2:
+        if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
         if state[tl.S_WAIT] != 0 or not goes_on(pull, scaled, state, account):
@@ -187,7 +186,7 @@ def note_after(settings: F64, state: I64, account: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = account[tl.A_CHI2]
     state[tl.S_AFTER] = 0
-    if not chi2 <= (1.0 + settings[tl.P_TRUST]) * account[tl.A_BEFORE] + LEAST_CHI2:
+    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * account[tl.A_BEFORE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE
     if state[tl.S_RISES] != 0:
         state[tl.S_AFTER] += tl.ROSE
@@ -238,8 +237,8 @@ def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
 
 @inline_kernel
 def allowed(settings: F64, state: I64, account: F64) -> float:
-    """The Σ error² with which a step ends: ENOUGH of what its report may call converged; FINISHED with nothing new."""
-    share = FINISHED if state[tl.S_CONTINUES] != 0 else ENOUGH * settings[tl.P_CONVERGED]
+    """The Σ error² with which a step ends: what its report calls converged; FINISHED with nothing new."""
+    share = FINISHED if state[tl.S_CONTINUES] != 0 else settings[tl.P_CONVERGED]
     return share * (account[tl.A_CHI2] + LEAST_CHI2)
 
 
