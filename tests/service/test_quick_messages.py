@@ -338,8 +338,8 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
         stage_both(quick, usual, batch)
     for solver in (quick, usual):
         # Room, so that it is not for want of it that nothing is taken.
-        solver._graph.reserve_variables(500, 7)
-        solver._graph.reserve_factors(500, 28)
+        solver._graph.reserve_variables(500, 3500)
+        solver._graph.reserve_factors(500, 14000)
     held = quick._graph.mark()
     for bad in damaged(last, np.random.default_rng(seed)):
         stage_both(quick, usual, bad)

@@ -85,8 +85,8 @@ def test_rows_begin_with_cache_lines() -> None:
 def test_what_grew_still_does(few: bool) -> None:
     solver = Solver()
     if not few:
-        solver._graph.reserve_variables(5000, 3)
-        solver._graph.reserve_factors(5000, 9)
+        solver._graph.reserve_variables(5000, 15000)
+        solver._graph.reserve_factors(5000, 45000)
     graph = solver._graph
     assert graph.var.ctypes.data % 64 == 0
     assert graph.fac.ctypes.data % 64 == 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from naive.random_graphs import random_steps
 
+from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
 from factorbus.solver.graph import Graph, roomy
 from factorbus.solver.kernels import layout as at
@@ -66,7 +67,7 @@ def test_what_is_small_grows_by_more() -> None:
 def test_what_has_a_row_for_each_of_the_same_things_grows_alike() -> None:
     graph = Graph()
     for _ in range(40):
-        graph.reserve_variables(1000, 3)
+        graph.reserve_variables(1000, 3000)
         graph.counts[at.VARIABLES] += 1000
         assert graph.keys.size == len(graph.var) == graph.dims.size >= graph.counts[at.VARIABLES]
         graph.keys[graph.counts[at.VARIABLES] - 1000 : graph.counts[at.VARIABLES]] = -1 - graph.counts[at.VARIABLES]
@@ -104,3 +105,21 @@ def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None
     assert bits(solver.estimate()) == before
     with pytest.raises(errors.DuplicateVariable):
         solver.stage(first)
+
+
+def test_a_step_that_finds_no_room_is_admitted_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The usual way of admission, which loads kernels of its own, is for what has to be looked at."""
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a batch in order")
+
+    monkeypatch.setattr("factorbus.solver.solver.admit", refuse)
+    solver, rooms = Solver(), set()
+    for step in manhattan(700, 3):
+        solver.stage(step.batch)
+        graph = solver._graph
+        rooms.add((graph.keys.size, graph.table.size, graph.values.size, len(graph.fac), graph.payload.size))
+    assert solver.variable_count == 700
+    assert len(rooms) > 3
+    for v in range(700):
+        assert graph.find(int(graph.keys[v])) == v

@@ -73,7 +73,7 @@ def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
         values = _NO_VALUES[kind.size]
     else:
         values = _column(group.values, _F64, (keys.size, kind.size), group.kind, "values")
-    graph.reserve_variables(keys.size, kind.size)
+    graph.reserve_variables(keys.size, keys.size * kind.size)
     row, wrong = admit_variables(
         kind.code, bool(group.fixed), keys, values, graph.table, graph.keys, graph.var, graph.values, graph.dims,
         graph.counts,
@@ -104,7 +104,7 @@ def _admit_factors(graph: Graph, group: FactorsLike, whole: bool) -> bool:
         if negative.size:
             information = information.copy()
             information[negative] *= -1.0
-    graph.reserve_factors(len(ends), kind.size + kind.triangle + 1)
+    graph.reserve_factors(len(ends), len(ends) * (kind.size + kind.triangle + 1))
     first = int(graph.counts[at.FACTORS])
     row, wrong = admit_factors(
         kind.code, loss, ends, measured, information, scale, graph.table, graph.keys, graph.var, graph.fac,

@@ -47,6 +47,9 @@ class Graph(Arenas):
         self.payload: F64 = np.empty(8192)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(1024, np.int64)
+        enter_keys(
+            0, self.table, self.keys
+        )  # none yet; but now it is loaded, and not in the step that needs a larger one
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
         self.holes = 0  # numbers of the payload that no factor has any more
@@ -82,24 +85,32 @@ class Graph(Arenas):
         other.ids, other.id_shift, other.holes = self.ids.copy(), self.id_shift, self.holes
         return other
 
-    def reserve_variables(self, more: int, size: int) -> None:
-        """Make room for `more` variables of `size` numbers each."""
+    def make_room(self, groups: I64) -> None:
+        """For groups of variables and factors as `kernels/layout.py` has them."""
+        groups = groups[: int(np.argmax(groups[:, at.G_KIND] == at.END))]
+        of_factors, rows = groups[:, at.G_FACTORS] != 0, groups[:, at.G_COUNT]
+        numbers = rows * (groups[:, at.G_SIZE] + groups[:, at.G_TRIANGLE])
+        self.reserve_variables(int(rows[~of_factors].sum()), int(numbers[~of_factors].sum()))
+        self.reserve_factors(int(rows[of_factors].sum()), int(numbers[of_factors].sum()))
+
+    def reserve_variables(self, more: int, numbers: int) -> None:
+        """Make room for `more` variables, whose values have so many numbers together."""
         counts = self.counts.tolist()
         if (need := counts[at.VARIABLES] + more) > self.keys.size:
             together = self.keys, self.var, self.dims, self.stamps
             self.keys, self.var, self.dims, self.stamps = (grown(array, need) for array in together)
-        if (need := counts[at.VALUES] + more * size) > self.values.size:
+        if (need := counts[at.VALUES] + numbers) > self.values.size:
             self.values = grown(self.values, need)
         if 2 * (counts[at.VARIABLES] + more) > self.table.size:
             self.table = np.zeros(table_size(counts[at.VARIABLES] + more), np.int64)
             enter_keys(counts[at.VARIABLES], self.table, self.keys)
 
-    def reserve_factors(self, more: int, size: int) -> None:
-        """Make room for `more` factors of `size` numbers each (measurement, information, scale of a loss)."""
+    def reserve_factors(self, more: int, numbers: int) -> None:
+        """Make room for `more` factors with so many numbers together (measurement, information, scale of a loss)."""
         counts = self.counts.tolist()
         if (need := counts[at.FACTORS] + more) > len(self.fac):
             self.fac = grown(self.fac, need)
-        if (need := counts[at.PAYLOAD] + more * size) > self.payload.size:
+        if (need := counts[at.PAYLOAD] + numbers) > self.payload.size:
             self.payload = grown(self.payload, need)
 
     def take(self, other: "Graph") -> None:

@@ -119,6 +119,9 @@ class Solver:
         caller's word: they are not checked again.
         """
         first = admit_bytes(raw, groups, self._graph.places)
+        if first == at.NO_ROOM:
+            self._graph.make_room(groups)
+            first = admit_bytes(raw, groups, self._graph.places)
         return None if first < 0 else first + self._graph.id_shift
 
     def step(self, settle: bool = False) -> StepReport:

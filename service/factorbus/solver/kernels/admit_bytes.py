@@ -1,7 +1,7 @@
 """Admission of columns that lie in the bytes of a message: one call for all of a small batch.
 
-It takes what is in order and fits into the room there is.  Anything else it leaves as it was: the usual way of
-admission then says what is wrong, or makes room.
+It takes what is in order and fits into the room there is.  Anything else it leaves as it was: the caller makes room, or
+the usual way of admission says what is wrong.
 """
 
 import numpy as np
@@ -26,11 +26,14 @@ from factorbus.solver.kernels.reach import reach
 def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
     """Append the groups of variables and factors in `raw`, and give values to the variables that come without.
 
-    graph: the table of its arenas (`places`).  Gives the number of the first factor, or −1: nothing changed.
+    graph: the table of its arenas (`places`).  Gives the number of the first factor; or NO_ROOM or NOT_IN_ORDER, and
+    nothing changed.
     """
     table, keys, var = ints(graph, at.T_TABLE), ints(graph, at.T_KEYS), int_rows(graph, at.T_VAR)
     values, dims, fac = floats(graph, at.T_VALUES), ints(graph, at.T_DIMS), int_rows(graph, at.T_FAC)
     payload, counts, stamps = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS), ints(graph, at.T_STAMPS)
+    if not has_room(groups, table, keys, values, fac, payload, counts):
+        return at.NO_ROOM
     before = counts.copy()
     v0, f0 = before[at.VARIABLES], before[at.FACTORS]
     if take_groups(raw, groups, table, keys, var, values, dims, stamps, fac, payload, counts):
@@ -43,7 +46,29 @@ def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
     remove_keys(v0, counts[at.VARIABLES], table, keys)
     for k in range(counts.size):
         counts[k] = before[k]
-    return -1
+    return at.NOT_IN_ORDER
+
+
+@inline_kernel
+def has_room(groups: I64, table: I64, keys: I64, values: F64, fac: I64, payload: F64, counts: I64) -> bool:
+    """Whether all groups fit behind what there is."""
+    variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
+    numbers, measured, g = counts[at.VALUES], counts[at.PAYLOAD], 0
+    while groups[g, at.G_KIND] != at.END:
+        count = groups[g, at.G_COUNT]
+        if groups[g, at.G_FACTORS] == 0:
+            variables, numbers = variables + count, numbers + count * groups[g, at.G_SIZE]
+        else:
+            factors += count
+            measured += count * (groups[g, at.G_SIZE] + groups[g, at.G_TRIANGLE])
+        g += 1
+    return (
+        variables <= keys.size
+        and 2 * variables <= table.size
+        and numbers <= values.size
+        and factors <= fac.shape[0]
+        and measured <= payload.size
+    )
 
 
 @inline_kernel
@@ -60,27 +85,19 @@ def take_groups(
     payload: F64,
     counts: I64,
 ) -> bool:
-    """Append group after group; False: one of them is not in order, or there is no room."""
+    """Append group after group; False: one of them is not in order."""
     scratch = np.empty((6, 6))
     end = 0
     while groups[end, at.G_KIND] != at.END:
         end += 1
     for g in range(end):
         if groups[g, at.G_FACTORS] == 0:
-            count, size = groups[g, at.G_COUNT], groups[g, at.G_SIZE]
-            entries = counts[at.VARIABLES] + count
-            if entries > keys.size or 2 * entries > table.size or counts[at.VALUES] + count * size > values.size:
-                return False
-            for n in range(count):
+            for n in range(groups[g, at.G_COUNT]):
                 if not take_variable(raw, groups[g], n, table, keys, var, values, dims, stamps, counts):
                     return False
     for g in range(end):
         if groups[g, at.G_FACTORS] != 0:
-            count = groups[g, at.G_COUNT]
-            numbers = count * (groups[g, at.G_SIZE] + groups[g, at.G_TRIANGLE])
-            if counts[at.FACTORS] + count > fac.shape[0] or counts[at.PAYLOAD] + numbers > payload.size:
-                return False
-            for n in range(count):
+            for n in range(groups[g, at.G_COUNT]):
                 if not take_factor(raw, groups[g], n, table, keys, var, fac, payload, counts, scratch):
                     return False
     return True

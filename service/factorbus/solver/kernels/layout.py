@@ -135,4 +135,8 @@ G_NUMBERS = 8  # offset of the values, -1: they come without; or of the measurem
 G_INFORMATION = 9  # offset of the information matrices; -1 for variables
 G_STAMPS = 10  # offset of the time stamps; -1: they have none, and factors have none
 G_WIDTH = 11
+
+# What `admit_bytes` gives beside the number of the first factor.
+NOT_IN_ORDER = -1
+NO_ROOM = -2
 END = -1
