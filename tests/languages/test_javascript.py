@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty.other_version import someone_of
+from faulty.service import endpoint_in
 from processes import Process, processes
 
 from factorbus.client import connect
@@ -92,3 +94,12 @@ def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) ->
     commands = re.findall(r"^```bash\n(.*?)^```$", (EXAMPLE / "README.md").read_text(), re.M | re.S)
     assert [line.split()[1] for line in commands] == ["vectors.mjs", "--experimental-websocket"]
     assert run(*commands[0].split()[1:]).returncode == 0
+
+
+def test_a_service_of_another_version_is_told_from_silence(spawn: Callable[..., Process], tmp_path: Path) -> None:
+    with someone_of("v2", endpoint_in(tmp_path)):
+        command = ("-m", "factorbus.cli", "gateway", "--connect", endpoint_in(tmp_path), "--port", "0")
+        ran = run("--experimental-websocket", "watch.mjs", spawn(*command).ready()[0], "warehouse")
+    assert (ran.returncode, ran.stdout) == (1, "")
+    assert "speak version v2 of the protocol, this client v1" in ran.stderr
+    assert ran.stderr.endswith(" [other_protocol]\n")
