@@ -57,7 +57,11 @@ def test_the_command_line_says_so_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ask", ["map", "maps", "features"])
 def test_silence_of_nobody_is_silence(tmp_path: Path, ask: str) -> None:
-    with zenoh.open(peer(endpoint_in(tmp_path))), connect(endpoint_in(tmp_path), timeout_s=1.5) as bus, pytest.raises(Unavailable):
+    with (
+        zenoh.open(peer(endpoint_in(tmp_path))),
+        connect(endpoint_in(tmp_path), timeout_s=1.5) as bus,
+        pytest.raises(Unavailable),
+    ):
         ASKS[ask](bus)
 
 
