@@ -136,7 +136,7 @@ def test_what_was_sent_is_waited_for_first(service: Service, kitchen: Map) -> No
     kitchen.insert(point(1))
     service.faults.append("hold")
     kitchen.send(point(2))
-    with pytest.raises(Unavailable, match="1 inserts are unanswered"):
+    with pytest.raises(Unavailable, match="1 insert without an answer"):
         kitchen.wait_converged(0.2)
     kitchen.wait_converged(50)
     assert kitchen.estimate.revision == 2

@@ -189,6 +189,6 @@ def test_a_trajectory_has_its_nanoseconds(
     joined.insert(drafts(4)[3])
     exported = joined.ask.export("tum", None).result()
     assert exported.text.splitlines()[-1].split()[0] == lines[-1].split()[0]
-    assert exported.notes == ("1 poses left out: others have a time stamp and x3 none",)
+    assert exported.notes == ("1 pose left out: x3 has no time stamp, and others have one",)
     g2o = joined.ask.export("g2o", None).result()
     assert any("time stamps left out" in note for note in g2o.notes)

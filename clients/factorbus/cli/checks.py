@@ -21,6 +21,7 @@ from factorbus.cli.version import LIBRARIES, installed
 from factorbus.ownership import UnsafeFolder, check_folder, make_private
 from factorbus.proto.problems import Problem
 from factorbus.proto.version import __version__
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ def cache() -> Finding:
     compiled = sum(1 for _ in folder.glob("kernels/*/*.nbc"))
     if not compiled:
         return Finding("kernel cache", "warn", f"{folder}: empty", "factorbus warm compiles ahead")
-    return Finding("kernel cache", "ok", f"{folder}: {compiled} compiled kernels, {free >> 30} GiB free")
+    return Finding("kernel cache", "ok", f"{folder}: {counted(compiled, 'compiled kernel')}, {free >> 30} GiB free")
 
 
 def port() -> Finding:
@@ -105,7 +106,9 @@ def port() -> Finding:
 
     try:
         with connect(USUAL_ENDPOINT, client="doctor", timeout_s=3) as bus:
-            return Finding("port", "ok", f"{number} is taken by a factorbus service with {len(bus.maps())} maps")
+            return Finding(
+                "port", "ok", f"{number} is taken by a factorbus service with {counted(len(bus.maps()), 'map')}"
+            )
     except Problem:
         mend = f"stop what listens there (ss -ltnp 'sport = :{number}'), or factorbus serve --listen tcp/127.0.0.1:7448"
         return Finding("port", "warn", f"{number} is taken by something that is no factorbus service", mend)
@@ -163,7 +166,7 @@ def machine() -> Finding:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     load = os.getloadavg()[0]
-    seen = f"{cores} cores, load {load:.1f}, {files} open files allowed"
+    seen = f"{counted(cores, 'core')}, load {load:.1f}, {counted(files, 'open file')} allowed"
     if cores < 2:
         return Finding("machine", "warn", seen, "one core is shared by solver and bus: expect jitter")
     if files < 1024:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.client.map import MapRow
@@ -37,4 +38,5 @@ def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
 
 
 def _told(row: "MapRow") -> str:
-    return f"{row.variables:,} variables, {row.factors:,} factors, revision {row.revision:,}, {row.mode}"
+    held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
+    return f"{held}, revision {row.revision:,}, mode {row.mode}"

@@ -9,6 +9,7 @@ import click
 from factorbus.cli.exits import require
 from factorbus.cli.options import ModeChoice, ellipses_option, out_option, zenoh_option
 from factorbus.cli.reading import reading_options
+from factorbus.wording import counted
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -112,7 +113,7 @@ def drive_command(
     reports = [step.report for step in driven.steps]
     name = Path(file.path).stem
     path = out or Path(f"{name}-drive.png")
-    about = f"{driven.poses:,} poses, {driven.factors:,} factors, mode {reports[-1]['mode']}"
+    about = f"{counted(driven.poses, 'pose')}, {counted(driven.factors, 'factor')}, mode {reports[-1]['mode']}"
     figure = drive_figure(
         course_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )

@@ -7,6 +7,7 @@ import click
 
 from factorbus.cli.exits import FAILED, OK
 from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.wording import counted
 
 
 @click.command()
@@ -57,11 +58,13 @@ def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _map(row: Mapping[str, Any]) -> str:
     inserts = row["inserts"]
     lines = [
-        f"{row['variables']} variables, {row['factors']} factors, revision {row['revision']}, {row['mode']}",
+        f"{counted(row['variables'], 'variable')}, {counted(row['factors'], 'factor')}, revision {row['revision']:,}, "
+        f"mode {row['mode']}",
         f"χ² {row['chi2']:.6g}, {_convergence(row)}; {_steps(row['strategies'])}",
         f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
-        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; {row['clients']} clients",
+        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
+        f"{counted(row['clients'], 'client')}",
         *(f"{name}: {value}" for name, value in row.get("journal", {}).items()),
     ]
     return "\n".join(lines)
@@ -69,7 +72,7 @@ def _map(row: Mapping[str, Any]) -> str:
 
 def _convergence(row: Mapping[str, Any]) -> str:
     state = "converged" if row["converged"] else "not converged"
-    so_far = f" after {row['further_steps']} further steps"
+    so_far = f" after {counted(row['further_steps'], 'further step')}"
     if row["converging"]:
         return f"{state}, converging,{so_far}"
     return f"{state}{so_far}: gave up, as {row['gave_up']}" if row["gave_up"] else state

@@ -28,6 +28,7 @@ from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Estimate, Graph, Insert
 from factorbus.proto.problems import NotSupported, Problem, Refused, TooLarge, Unavailable
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +206,7 @@ class Map:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
                 raise Unavailable(
-                    f"map {self.name!r}", timeout_s, f"{left} inserts are unanswered and still being sent"
+                    f"map {self.name!r}", timeout_s, f"{counted(left, 'insert')} without an answer, still being sent"
                 )
             refused = self._window.take_refused()
         for ticket, refusal in refused:
@@ -368,7 +369,7 @@ class Map:
         if self._closed:
             raise Unavailable(f"map {self.name!r}", 0.0, "it was closed here; open it again")
         if not room:
-            hint = f"{self._size} inserts are unanswered (window={self._size}); this one was not sent"
+            hint = f"{counted(self._size, 'insert')} without an answer (window={self._size}); this one was not sent"
             raise Unavailable(f"map {self.name!r}", timeout_s, hint)
 
     def _give_up(self, hint: str) -> None:

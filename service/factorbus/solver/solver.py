@@ -38,6 +38,7 @@ from factorbus.solver.symbolic import Symbolic
 from factorbus.solver.system import System
 from factorbus.solver.tree_steps import TreeSteps
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.wording import counted
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
@@ -356,7 +357,7 @@ class Solver:
         if settle:
             return "asked to settle"
         if suspects.size:
-            return f"{suspects.size} new variables are held only by several factors together"
+            return f"only several factors together hold {counted(suspects.size, 'new variable')}"
         if not np.isfinite(self._done.unsolved):
             return "the last step had not converged"
         if self._goes_on:

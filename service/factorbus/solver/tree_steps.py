@@ -26,6 +26,7 @@ from factorbus.solver.report import Shares, StepReport, Stopwatch
 from factorbus.solver.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
+from factorbus.wording import counted
 
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
@@ -143,7 +144,7 @@ class TreeSteps:
             )
         system.begin(suspects, Stopwatch(None))
         system.factorize(0.0)
-        return f"{suspects.size} new variables are held only by several factors together"
+        return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
     def _complete(self, settle: bool, because: str) -> tuple[Course | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
@@ -270,5 +271,5 @@ class TreeSteps:
 def _relinearized(count: int, rounds: int) -> str:
     """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
     if rounds > 1:
-        return f"{count} relinearizations in {rounds} rounds"
-    return f"{count} variable{'s' if count > 1 else ''} relinearized"
+        return f"{counted(count, 'relinearization')} in {rounds} rounds"
+    return f"{counted(count, 'variable')} relinearized"
