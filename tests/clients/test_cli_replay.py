@@ -58,7 +58,7 @@ def test_in_process(local: dict[str, Any], town: Path) -> None:
     assert local["steps"] == local["inserts"] == POSES
     assert local["revision"] == POSES + 1
     assert local["settled"]
-    assert local["mode"] == "tree"
+    assert local["mode"] == "bayes-tree"
     assert sum(local["strategies"].values()) == POSES
     assert local["strategies"]["tree"] > 10
     for name in ("p50", "p95", "p99", "max"):

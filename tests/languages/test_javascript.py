@@ -81,7 +81,7 @@ def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) ->
                 joined.insert(step.batch)
             said, errors = watch.communicate(timeout=60)
         assert watch.returncode == 0, errors
-        assert head[0].startswith("map warehouse: mode tree, ")
+        assert head[0].startswith("map warehouse: mode bayes-tree, ")
         assert re.match(rf"revision {last - len(steps) + 10}: (\d+) of \1 variables changed", head[1])
         told = json.loads(said.splitlines()[-1].removeprefix("estimate "))
         for keys, values in joined.estimate.snapshot().columns.values():

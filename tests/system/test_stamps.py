@@ -84,7 +84,7 @@ def test_many_in_one_insert_and_large_ones_are_as_small_ones(endpoint: str, join
     everywhere(endpoint, joined, {"x0": 0} | {f"x{n}": n * n for n in range(1, 1500, 2)})
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 def test_undone_marginalised_removed_and_brought_back(endpoint: str, mode: str) -> None:
     with (
         connect(endpoint, client="timed", timeout_s=PATIENCE_S) as bus,

@@ -48,7 +48,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         process.end()
 
 
-@pytest.fixture(params=["tree", "inc-l"])
+@pytest.fixture(params=["bayes-tree", "inc-l"])
 def square(endpoint: str, request: pytest.FixtureRequest) -> Iterator[tuple[Map, Solver]]:
     """A map on the bus, and a solver in the same mode with the same inserts."""
     twin = Solver(Options(mode=request.param))
@@ -150,7 +150,7 @@ def test_refusals_carry_their_codes(square: tuple[Map, Solver], named: list[str]
 
 
 def test_an_empty_map_has_no_last_pose(endpoint: str) -> None:
-    with connect(endpoint, client="asker") as bus, bus.map("empty", "tree") as empty:
+    with connect(endpoint, client="asker") as bus, bus.map("empty", "bayes-tree") as empty:
         with pytest.raises(Refused) as refused:
             empty.doubt.last()
         assert refused.value.code == "unknown_variable"

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
     """List the maps of the service at ENDPOINT; at a router, those of all services.
 
+    The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
+
     \b
     factorbus maps
     factorbus maps --connect tls/solver.local:7447 --zenoh ops.json5 --json

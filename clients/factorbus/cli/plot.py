@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import ModeChoice, ellipses_option, out_option, zenoh_option
+from factorbus.cli.options import ellipses_option, mode_option, out_option, zenoh_option
 from factorbus.cli.reading import reading_options
 from factorbus.wording import counted
 
@@ -79,7 +79,7 @@ def map_command(
 @command.command("drive")
 @click.argument("source")
 @reading_options
-@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
+@mode_option
 @click.option(
     "--every",
     type=click.IntRange(0),
@@ -93,7 +93,7 @@ def drive_command(
     """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
 
     \b
-    factorbus plot drive intel --mode tree --out intel-drive.svg
+    factorbus plot drive intel --mode bayes-tree --out intel-drive.svg
     """
     from factorbus.cli.plot_source import file_of
 

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import SECONDS, ModeChoice, Number, file_argument, json_option, out_option, zenoh_option
+from factorbus.cli.options import SECONDS, Number, file_argument, json_option, mode_option, out_option, zenoh_option
 from factorbus.cli.reading import read_graph, reading_options
 from factorbus.cli.starts import optimum_from
 from factorbus.wording import counted
@@ -69,7 +69,7 @@ class Request:
     help="Wait so long for a service to be there.  [default: 1 where nobody listens, else 10]",
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
-@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
+@mode_option
 @click.option(
     "--every",
     type=click.IntRange(0),

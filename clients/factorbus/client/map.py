@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -38,7 +39,8 @@ class MapRow:
     state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
     (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
-    list of maps.  converging: it takes further steps by itself, unless an insert comes.
+    list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
+    itself, unless an insert comes.
     """
 
     name: str
@@ -50,6 +52,7 @@ class MapRow:
     state: str = "open"
     problem: str = ""
     protocol: Mapping[str, Any] = field(default_factory=dict)
+    converged: bool | None = None
     converging: bool = False
 
 
@@ -267,6 +270,13 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return self.ask.stats(timeout_s).result()
 
+    def clients(self, timeout_s: float | None = None) -> set[str]:
+        """Names of the clients that have joined the map and not left it, of those that tell; this one is among them."""
+        came: SimpleQueue[set[str]] = SimpleQueue()
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        self._link.ask_tokens(keys.any_client_token(self.name), timeout_s, came.put)
+        return set(map(keys.client_of, came.get()))
+
     def export(
         self,
         format: str = "g2o",
@@ -299,6 +309,9 @@ class Map:
         """Start the live estimate and wait for it.  Raises Unavailable."""
         mirror = Mirror(self._link, self.name, self.timeout_s)
         self._mirror = mirror
+        row = self._row
+        if row.converged is not None:
+            mirror.expect_convergence(row.epoch, row.revision, row.converged, row.converging)
         mirror.start(self._stack)
 
     def watch_owner(self) -> None:
@@ -313,7 +326,7 @@ class Map:
         two processes that use the same name by mistake do not answer for each other.
         """
         self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
-        self._protocol = row.protocol
+        self._row, self._protocol = row, row.protocol
         self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)
         self._window: Window[Ticket] = Window(self._size)

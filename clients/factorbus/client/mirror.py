@@ -76,6 +76,7 @@ class Mirror:
         self._asking, self._probing, self._silences = False, False, 0
         self._ask_at = 0.0
         self._gave_up = ""  # why the map does not go on converging
+        self._foretold: tuple[int, int, dict[str, Any]] = (0, 0, {})  # epoch, revision, and how far it had converged
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
 
@@ -119,7 +120,11 @@ class Mirror:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the map had converged at `revision`; None: not known, until the next step or for a second."""
+        """Whether the map had converged at `revision`.
+
+        None: not known.  That is so where the whole estimate came of a revision that no report has told of, until the
+        service has answered, which it is asked at once.
+        """
         return self._following.converged
 
     @property
@@ -207,6 +212,10 @@ class Mirror:
         """`revision` exists: until it is here, the values are stale."""
         if epoch == self._following.epoch:
             self._expected = max(self._expected, revision)
+
+    def expect_convergence(self, epoch: int, revision: int, converged: bool, converging: bool) -> None:
+        """What the service has said of a revision, before `start`: an estimate message does not say it."""
+        self._foretold = (epoch, revision, {"converged": converged, "converging": converging})
 
     # From here on: callbacks of the bus, which only hand over, and the mirror's own thread.
 
@@ -303,8 +312,12 @@ class Mirror:
             if estimate.epoch != self._following.epoch:
                 self._expected = 0
             news = self._following.estimate(estimate, tables)
+            if self._foretold[:2] == (self.epoch, self.revision) and self.converged is None:
+                self._following.take_convergence(self._foretold[2])
             self._confirm()
         self._tell(news)
+        if self._following.live and self.converged is None:
+            self._probe()
 
     def _take_estimate(self, reply: Reply) -> None:
         self._asking = False

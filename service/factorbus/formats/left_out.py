@@ -10,7 +10,7 @@ from factorbus.wording import counted
 
 _SHOWN = 5
 # Names that are nouns have a singular; names of records and kinds do not.
-_ONE = {"vertices": "vertex", "points": "point", "variables": "variable"}
+_ONE = {"vertices": "vertex", "points": "point", "variables": "variable", "time stamps": "time stamp"}
 
 
 @dataclass(slots=True)

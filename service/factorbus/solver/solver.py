@@ -229,7 +229,7 @@ class Solver:
 
         Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
         it is where they remove, fix, free, place or marginalise variables, where linear factors are among them, where
-        something would be free to move, with `settle`, and in modes other than "tree".  Nothing may be staged.
+        something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.
         Raises as `changes.collect` and `stage` do.
         """
         if self._tree is None or settle:
@@ -299,7 +299,7 @@ class Solver:
     def factored(self) -> Factored:
         """A copy of R and of all that it is of, as of the last step: what covariances are computed from, elsewhere.
 
-        In the mode "tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        In the mode "bayes-tree" that is its R, linearised where it is; in the others one made here, at the estimate.
         """
         return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
 

@@ -1,4 +1,4 @@
-"""Steps in the mode "tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
+"""Steps in the mode "bayes-tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
 
 A step solves a linear problem, measures χ² at the estimate that it comes to, and relinearizes what is too far from its
 linear model (MATH §9.6).  One that raises χ² is replaced by Levenberg-Marquardt from where the estimate stood.
@@ -246,7 +246,7 @@ class TreeSteps:
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
-            "tree",
+            "bayes-tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
             because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
