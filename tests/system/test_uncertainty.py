@@ -210,6 +210,9 @@ def test_the_command_line_asks(endpoint: str, square: tuple[Map, Solver], tmp_pa
     assert ran.returncode == 0, ran.stderr
     assert "between_se2 (x2, x6)" in ran.stdout
     ran = ask("why", name, "x4", *at)
+    for term in ("smallest pivot of R", "smallest R²ᵢᵢ/Λᵢᵢ", "leverage ", "Its factors, by id"):
+        assert term in ran.stdout
+    assert " step " not in ran.stdout.replace("the last step", ""), "a step has another number than the revision"
     assert ran.returncode == 0, ran.stderr
     assert "because" in ran.stdout
     ran = ask("why", name, "3", *at, "--json")

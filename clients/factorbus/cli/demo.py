@@ -84,7 +84,7 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
 
 def demo(request: Request) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
-    from factorbus.cli.children import child, service, worker
+    from factorbus.cli.children import STARTING, child, service, worker
     from factorbus.cli.picture import course_of, draw
     from factorbus.cli.remote import RemoteMap
     from factorbus.cli.screen import note
@@ -94,7 +94,7 @@ def demo(request: Request) -> dict[str, Any]:
 
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note("starting the solver process (on a cold start it compiles its kernels first: a minute or two, once)")
+        note(STARTING)
         solver, endpoint = stack.enter_context(service(say=note))
         names = [f"worker{number}" for number in range(1, request.workers + 1)]
         workers = [stack.enter_context(worker(endpoint, name)) for name in names]
@@ -109,6 +109,7 @@ def demo(request: Request) -> dict[str, Any]:
             name: w.pid for name, w in zip(names, workers, strict=True)
         }
         note(f"on {endpoint}: " + ", ".join(f"{name} {pid}" for name, pid in processes.items()))
+        note(f"driving {counted(request.poses, 'pose')}; 2,000 take five to thirty seconds")
         _look_on(request, solver, robot, viewer)
         driven = json.loads(robot.output(timeout_s=60))
         viewer.wait_for(driven["revision"])

@@ -63,7 +63,7 @@ def demo(
     plot: Path, frames: int, points: int, features: int, noise: float, outliers: float, seed: int, workers: int
 ) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
-    from factorbus.cli.children import service, worker
+    from factorbus.cli.children import STARTING, service, worker
     from factorbus.cli.screen import note, progress
     from factorbus.cli.sightseeing import Sightseer, verdict
     from factorbus.cli.stopping import interrupt_on_sigterm
@@ -74,7 +74,7 @@ def demo(
     world = monocular(frames, seed, points=points, sigma_pixel=noise, outlier_share=outliers)
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note("starting the service (on a cold start it compiles its kernels first: a minute or two, once)")
+        note(STARTING)
         _, endpoint = stack.enter_context(service(say=note))
         for number in range(1, workers + 1):
             stack.enter_context(worker(endpoint, f"worker{number}"))

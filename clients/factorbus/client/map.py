@@ -310,8 +310,8 @@ class Map:
         mirror = Mirror(self._link, self.name, self.timeout_s)
         self._mirror = mirror
         row = self._row
-        if row.converged is not None:
-            mirror.expect_convergence(row.epoch, row.revision, row.converged, row.converging)
+        if row.converged or row.converging:  # neither: the map gave up, and the row does not say why
+            mirror.expect_convergence(row.epoch, row.revision, bool(row.converged), row.converging)
         mirror.start(self._stack)
 
     def watch_owner(self) -> None:

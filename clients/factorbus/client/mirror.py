@@ -120,11 +120,7 @@ class Mirror:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the map had converged at `revision`.
-
-        None: not known.  That is so where the whole estimate came of a revision that no report has told of, until the
-        service has answered, which it is asked at once.
-        """
+        """Whether the map had converged at `revision`; None: the service is being asked, after a resynchronisation."""
         return self._following.converged
 
     @property
@@ -203,6 +199,7 @@ class Mirror:
             stack.enter_context(self._link.listening(key, lambda data, word=word: self._hear(word, data)))
         self._inbox.put(("ask", None))
         self.wait_for(0)
+        self._try_wait(lambda: self.converged is not None or not self._probing, _ANSWER_S)
 
     def owner(self, token: str, alive: bool) -> None:
         """A service came to own the map, or went: from the bus's thread."""
@@ -314,10 +311,10 @@ class Mirror:
             news = self._following.estimate(estimate, tables)
             if self._foretold[:2] == (self.epoch, self.revision) and self.converged is None:
                 self._following.take_convergence(self._foretold[2])
+            if self._following.live and self.converged is None:
+                self._probe()
             self._confirm()
         self._tell(news)
-        if self._following.live and self.converged is None:
-            self._probe()
 
     def _take_estimate(self, reply: Reply) -> None:
         self._asking = False
@@ -337,22 +334,24 @@ class Mirror:
             self._query("stats", b"", "probed")
 
     def _take_probe(self, reply: Reply) -> None:
-        self._probing = False
-        if isinstance(reply, TimedOut):
-            return  # the service is there and busy
-        if not isinstance(reply, Answer):
-            self._lose()
-            return
+        with self._lock:
+            self._probing = False
+            if isinstance(reply, Answer):
+                self._compare(reply)
+            elif not isinstance(reply, TimedOut):  # else the service is there and busy
+                self._lose()
+            self._changed.notify_all()
+
+    def _compare(self, reply: Answer) -> None:
         told = read_map("stats", reply.payload, ANSWER_LIMITS)
         epoch, revision = fields.integer("stats", told, "epoch"), fields.integer("stats", told, "revision")
-        with self._lock:
-            if epoch != self._following.epoch:
-                self._following.lost()
-            self._expected = max(self._expected, revision)
-            if not self.stale:
-                if revision == self.revision:
-                    self._take_convergence(told)
-                self._confirm()
+        if epoch != self._following.epoch:
+            self._following.lost()
+        self._expected = max(self._expected, revision)
+        if not self.stale:
+            if revision == self.revision:
+                self._take_convergence(told)
+            self._confirm()
 
     def _take_convergence(self, told: Mapping[str, Any]) -> None:
         self._following.take_convergence(told)
