@@ -114,20 +114,22 @@ def test_a_service_that_goes_is_said_and_found_again(tmp_path) -> None:
 
 
 def test_who_has_left_is_no_longer_listed(endpoint: str) -> None:
-    with connect(endpoint, client="stayer") as staying, staying.map("left") as stayed:
+    with connect(endpoint, client="stayer") as staying, staying.map("departed") as stayed:
         stayed.insert(Draft().point2("l1", (1.0, 2.0)).prior_point2("l1", (1.0, 2.0), sigmas=(1.0, 1.0)))
-        with connect(endpoint, client="leaver") as bus, bus.map("left") as joined:
+        with connect(endpoint, client="leaver") as bus, bus.map("departed") as joined:
             joined.insert(Draft().point2("l2", (1.0, 2.0)).prior_point2("l2", (1.0, 2.0), sigmas=(1.0, 1.0)))
             joined.insert(Draft().point2("l3", (1.0, 2.0)).prior_point2("l3", (1.0, 2.0), sigmas=(1.0, 1.0)))
             assert stayed.clients() >= {stayed.client, joined.client}
         looked = [*COMMAND, "--connect", endpoint, "--every", "0.1"]
         shown = subprocess.run([*looked, "--once"], capture_output=True, text=True, timeout=60, check=True).stdout
         told = subprocess.run([*looked, "--json"], capture_output=True, text=True, timeout=60, check=True).stdout
-        assert row_of(shown.splitlines(), stayed.client)[:3] == [stayed.client, "left", "1"]
+        assert row_of(shown.splitlines(), stayed.client)[:3] == [stayed.client, "departed", "1"]
         assert "leaver" not in shown
         assert re.search(r"\d+ clients? gone, after \d+ inserts?", shown)
         mine = {
-            row["name"]: (row["here"], row["inserts"]) for row in json.loads(told)["clients"] if row["map"] == "left"
+            row["name"]: (row["here"], row["inserts"])
+            for row in json.loads(told)["clients"]
+            if row["map"] == "departed"
         }
         assert mine == {stayed.client: (True, 1), joined.client: (False, 2)}
 
