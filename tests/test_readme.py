@@ -99,6 +99,26 @@ def test_commands_of_the_table_are_all_there_are() -> None:
     assert told == set(COMMANDS) - {"robot", "version"}
 
 
+def test_the_table_of_extras_says_what_commands_ask_for() -> None:
+    """In the source: `require("viz", "factorbus demo")`, or with an option that needs it."""
+    text = (ROOT / "README.md").read_text()
+    rows = dict(
+        re.findall(r"^\| `(\w+)` \| (.+) \|$", text[text.index("| extra |") : text.index("## What goes in")], re.M)
+    )
+    asked = set()
+    for path in (ROOT / "clients" / "factorbus" / "cli").glob("*.py"):
+        for extra, what in re.findall(r'require\("(\w+)", "([^"]+)"\)', path.read_text()):
+            command = what.removeprefix("factorbus ") if what.startswith("factorbus ") else f"{path.stem} {what}"
+            asked.add((extra, command))
+    assert len(asked) > 15
+    told = {extra: set(re.findall(r"`([^`]+)`", row)) for extra, row in rows.items()}
+    assert set(told) == {extra for extra, _ in asked} | {"bench"}
+    known = lambda extra, command: any(command.startswith(each) for each in told[extra])  # noqa: E731
+    missing = {(extra, command) for extra, command in asked if not known(extra, command)}
+    # Options of `plot` that solve: the page of --help says so.
+    assert missing <= {("service", "plot_source --solve"), ("service", "plot_source --ellipses of a file")}
+
+
 def distance(said: str) -> float:
     """From the origin, of the first `[x y ...]` in what was printed."""
     x, y = (float(number) for number in said[said.index("[") + 1 :].replace("]", " ").split()[:2])

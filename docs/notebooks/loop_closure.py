@@ -10,7 +10,7 @@ import numpy as np
 from factorbus.client import Draft
 from factorbus.solver import Options, Solver
 
-solver = Solver(Options(mode="tree"))
+solver = Solver(Options(mode="bayes-tree"))
 rng = np.random.default_rng(3)
 
 

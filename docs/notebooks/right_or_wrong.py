@@ -40,13 +40,13 @@ moved_robust = abs(town.estimate["x150"] - before)[:2].max()
 print(f"moved by {moved_robust:.3f} m")
 
 # %% [markdown]
-# And the map can be asked why a pose is where it is: each factor with its misfit, and how much is known from it
-# alone.
+# And the map can be asked why a pose is where it is: each factor with its misfit, and its leverage, the share of what
+# it measures that is known from it alone.
 
 # %%
 why = town.doubt.why("x150").variable
 for factor in sorted(why["factors"], key=lambda each: -each["chi2"]):
-    print(f"{factor['kind']}  χ² {factor['chi2']:.3g}  known from it {factor['influence'] / factor['dims']:.0%}")
+    print(f"{factor['kind']}  χ² {factor['chi2']:.3g}  leverage {factor['influence'] / factor['dims']:.0%}")
 
 # %%
 assert not gate.plausible[0]

@@ -92,7 +92,7 @@ def report(found: dict[str, Any]) -> str:
 
 def _large(problem: Problem) -> dict[str, Any]:
     """One map at its end: blocks, gates, and what they are held against."""
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     steps_ms = [_ms(lambda batch=batch: (solver.stage(batch), solver.step())) for batch in load(problem)]
     copy_ms = _best(lambda: Blocks(solver.factored()))
     fresh = [Blocks(solver.factored()) for _ in range(_REPEAT)]
@@ -128,7 +128,7 @@ def _large(problem: Problem) -> dict[str, Any]:
 
 def _every_step(problem: Problem) -> dict[str, Any]:
     """One replay, with the last pose's covariance, and all diagonal blocks, after every step."""
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     upkeep = solver.try_upkeep()
     if upkeep is None:
         raise RuntimeError("the mode tree keeps nothing up")

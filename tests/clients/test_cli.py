@@ -22,6 +22,7 @@ from factorbus.cli.exits import (
     report,
     require,
 )
+from factorbus.cli.installing import install_command, requirement
 from factorbus.cli.main import COMMANDS, main
 from factorbus.proto.problems import BadName, Refused, Unavailable
 
@@ -138,8 +139,35 @@ def test_a_missing_extra_is_named_with_the_command_that_installs_it(monkeypatch:
     monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "numba" else object())
     assert lacking("service") == ["numba"]
     require("viz", "a picture")
-    with pytest.raises(Stopped, match=r"factorbus serve needs numba.*pip install 'factorbus\[service\]'"):
+    with pytest.raises(Stopped, match=r"factorbus serve needs numba.*: \S.* install .*\[service\]"):
         require("service", "factorbus serve")
+
+
+@pytest.mark.parametrize(
+    ("told", "wanted"),
+    [
+        ({}, "'factorbus[watch,viz]'"),
+        ({"url": "file:///a%20b/c", "dir_info": {"editable": True}}, "-e '/a b/c[watch,viz]'"),
+        ({"url": "file:///a", "dir_info": {}}, "'/a[watch,viz]'"),
+        ({"url": "file:///f.whl", "archive_info": {}}, "'factorbus[watch,viz] @ file:///f.whl'"),
+        (
+            {"url": "https://h/f.git", "vcs_info": {"vcs": "git", "commit_id": "ab12"}},
+            "'factorbus[watch,viz] @ git+https://h/f.git@ab12'",
+        ),
+    ],
+)
+def test_what_pip_is_to_install_is_where_this_copy_is_from(told: dict, wanted: str) -> None:
+    assert requirement(("watch", "viz"), told) == wanted
+
+
+def test_the_command_that_installs_an_extra_is_for_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told = {"url": tmp_path.as_uri(), "dir_info": {"editable": True}}
+    monkeypatch.setattr("factorbus.cli.installing.origin", lambda: told)
+    monkeypatch.setattr("sys.executable", str(tmp_path / ".venv" / "bin" / "python"))
+    monkeypatch.chdir(tmp_path)
+    assert install_command("watch") == ".venv/bin/python -m pip install -e '.[watch]'"
+    monkeypatch.setattr("shutil.which", lambda name: str(tmp_path / ".venv" / "bin" / name))
+    assert install_command("watch") == "pip install -e '.[watch]'"
 
 
 def test_simulate_writes_what_convert_and_read_understand(tmp_path: Path) -> None:
@@ -182,7 +210,8 @@ def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "rerun" else object())
     found = checks.extras()
-    assert (found.state, found.mend) == ("ok", "if wanted: pip install 'factorbus[watch]'")
+    assert found.state == "ok"
+    assert re.fullmatch(r"if wanted: \S.* install .*\[watch\]'", found.mend)
     assert "without watch" in found.seen
     monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda _: None)
     assert checks.extras().seen == "none installed; without service, viz, watch, record, gateway, ros2"

@@ -246,7 +246,7 @@ BROUGHT = {
     "msgpack": "messages are its bytes",
     "factorbus": "client, protocol, and the pieces that linear factors are cut into",
 }
-OURS = {"factorbus.client", "factorbus.proto", "factorbus.pieces"}
+OURS = {"factorbus.client", "factorbus.proto", "factorbus.pieces", "factorbus.wording"}
 TYPES = {"numpy.typing", "numpy._typing._add_docstring"}  # annotations; 0.6 ms
 # Of the standard library: large, and what some other part of the package may want, not this one.
 NOT_WANTED = {

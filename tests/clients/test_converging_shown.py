@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from faulty.service import MAP, Service, endpoint_in
 
-from factorbus.cli.exits import OK
+from factorbus.cli.exits import OK, REFUSED
 from factorbus.cli.main import main
 
 _HISTOGRAM = {"bounds_s": [1.0], "counts": [0, 0], "sum_s": 0.0}
@@ -75,3 +75,24 @@ def test_top_as_a_document(service: Service, tmp_path: Path, capsys: Any) -> Non
 )
 def test_stats(service: Service, tmp_path: Path, how: dict[str, Any], wanted: str, capsys: Any) -> None:
     assert wanted in said(service, tmp_path, how, capsys, "stats")
+
+
+def test_stats_of_one_map(service: Service, tmp_path: Path, capsys: Any) -> None:
+    told = said(service, tmp_path, CONVERGED, capsys, "stats", MAP)
+    assert f"map {MAP}" in told
+    assert main(["stats", "attic", "--connect", endpoint_in(tmp_path)]) == REFUSED
+    assert f"there is no map 'attic' here; there are {MAP}" in capsys.readouterr().err
+
+
+def test_stats_of_one_map_leave_out_the_others(service: Service, tmp_path: Path, capsys: Any) -> None:
+    service.says = _SERVICE | _ROW | CONVERGED
+    rows = [service._row() | {"clients": 0}, service._row() | {"clients": 0, "name": "attic"}]
+    service.says["maps"] = rows
+    service.says["unopened"] = [{"name": "cellar", "state": "damaged", "problem": "a page"}]
+    assert main(["stats", "attic", "--json", "--connect", endpoint_in(tmp_path)]) == OK
+    (found,) = json.loads(capsys.readouterr().out)["services"]
+    assert ([row["name"] for row in found["maps"]], found["unopened"]) == (["attic"], [])
+    assert main(["stats", "cellar", "--connect", endpoint_in(tmp_path)]) == OK
+    shown = capsys.readouterr().out
+    assert "does not open (damaged): a page" in shown
+    assert "attic" not in shown

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from factorbus.cli.exits import OK, USAGE
-from factorbus.cli.explain import read_pages
+from factorbus.cli.explain import code_of, read_pages
 from factorbus.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,5 +61,55 @@ def test_explain_says_it_and_guesses(capsys: pytest.CaptureFixture[str]) -> None
     assert said.startswith("underconstrained\n\nThe factors leave a variable free to move")
     assert main(["explain", "underconstraind"]) == USAGE
     assert "did you mean underconstrained" in capsys.readouterr().err
+
+
+def test_the_list_has_whole_sentences(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain"]) == OK
-    assert len(capsys.readouterr().out.splitlines()) == len(read_pages())
+    entries = re.split(r"\n(?=\w)", capsys.readouterr().out.rstrip("\n"))
+    pages = read_pages()
+    assert [entry.split()[0] for entry in entries] == list(pages)
+    for entry in entries:
+        name, *words = entry.split()
+        assert words[-1].endswith((".", ":")), f"{name} is cut"
+        assert " ".join(pages[name].split()).startswith(" ".join(words))
+
+
+def exceptions() -> set[str]:
+    """The classes of the source that have a code of their own, or are public in the client library."""
+    from factorbus import client
+
+    named = {name for name in client.__all__ if isinstance(getattr(client, name), type)}
+    found = {name for name in named if issubclass(getattr(client, name), BaseException)}
+    for root in ("proto", "service", "workers", "clients"):
+        for path in (ROOT / root / "factorbus").rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef) and any(
+                    isinstance(each, ast.Assign)
+                    and isinstance(each.targets[0], ast.Name)
+                    and each.targets[0].id == "code"
+                    for each in node.body
+                ):
+                    found.add(node.name)
+    return found
+
+
+def test_every_exception_is_found_by_its_name() -> None:
+    found = exceptions()
+    assert found >= {
+        "NotConverged",
+        "NoAnswerYet",
+        "Refused",
+        "Problem",
+        "Unavailable",
+        "KeyCollision",
+        "Underconstrained",
+    }
+    pages = read_pages()
+    assert sorted(name for name in found if code_of(name) not in pages) == []
+    assert code_of("factorbus.client.NotConverged") == code_of("[not_converged]") == "not_converged"
+
+
+def test_what_stats_say_is_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    for word in ("gave_up", "NotConverged"):
+        assert main(["explain", word]) == OK
+    assert "left off improving its estimate" in capsys.readouterr().out

@@ -17,7 +17,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
 from factorbus.solver.joints import find_joints
 
-MODES = ("tree", "inc-l", "all-batch")
+MODES = ("bayes-tree", "inc-l", "all-batch")
 
 
 @dataclass
@@ -69,7 +69,7 @@ def optimum(kinds: dict[str, str], at: dict[str, np.ndarray], held: list[Known])
     return at, float(sum(known.residual(at) @ known.information @ known.residual(at) for known in held))
 
 
-def solved(batch: Batch, mode: str = "tree") -> Solver:
+def solved(batch: Batch, mode: str = "bayes-tree") -> Solver:
     came = codec.decode_insert(codec.encode_insert(Insert(1, batch))).batch
     solver = Solver(Options(mode=mode))
     solver.stage(came)

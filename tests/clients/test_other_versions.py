@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zenoh
-from faulty.service import MAP, Service, _peer, endpoint_in
+from faulty.other_version import someone_of
+from faulty.service import MAP, Service, endpoint_in, peer
 
 from factorbus.client import Changes, Draft, connect
 from factorbus.client.bus import Bus
@@ -19,15 +19,6 @@ from factorbus.proto.protocol import known
 
 pytestmark = pytest.mark.timeout(60)
 CAMERA = Camera("pinhole", (400.0, 400.0, 320.0, 240.0))
-
-
-@contextmanager
-def someone_of(version: str, folder: Path) -> Iterator[None]:
-    """A service of another version: all that we know of it is where its token is."""
-    with zenoh.open(_peer(folder)) as session:
-        token = session.liveliness().declare_token(f"factorbus/{version}/features/s/live")
-        yield
-        token.undeclare()
 
 
 ASKS: dict[str, Callable[[Bus], object]] = {
@@ -44,7 +35,7 @@ ASKS: dict[str, Callable[[Bus], object]] = {
 @pytest.mark.parametrize("version", ["v2", "v0", "v1.1"])
 def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, version: str) -> None:
     for_ever_s = 10 * 60  # in this file a test that waits is ended after a minute
-    with someone_of(version, tmp_path), connect(endpoint_in(tmp_path), timeout_s=for_ever_s) as bus:
+    with someone_of(version, endpoint_in(tmp_path)), connect(endpoint_in(tmp_path), timeout_s=for_ever_s) as bus:
         with pytest.raises(OtherProtocol) as refused:
             ASKS[ask](bus)
         assert refused.value.detail == {"versions": [version], "wanted": "v1"}
@@ -52,7 +43,7 @@ def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, ve
 
 
 def test_the_command_line_says_so_too(tmp_path: Path) -> None:
-    with someone_of("v2", tmp_path):
+    with someone_of("v2", endpoint_in(tmp_path)):
         ran = subprocess.run(
             [sys.executable, "-m", "factorbus.cli", "stats", "--connect", endpoint_in(tmp_path), "--wait", "40"],
             capture_output=True,
@@ -66,7 +57,11 @@ def test_the_command_line_says_so_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ask", ["map", "maps", "features"])
 def test_silence_of_nobody_is_silence(tmp_path: Path, ask: str) -> None:
-    with zenoh.open(_peer(tmp_path)), connect(endpoint_in(tmp_path), timeout_s=1.5) as bus, pytest.raises(Unavailable):
+    with (
+        zenoh.open(peer(endpoint_in(tmp_path))),
+        connect(endpoint_in(tmp_path), timeout_s=1.5) as bus,
+        pytest.raises(Unavailable),
+    ):
         ASKS[ask](bus)
 
 
@@ -77,7 +72,7 @@ def test_who_has_been_heard_of_is_waited_for(tmp_path: Path) -> None:
         kitchen = bus.map(MAP)
         kitchen.insert(Draft().point2("l1", (1.0, 2.0)))
         service.close()
-        with someone_of("v2", tmp_path):
+        with someone_of("v2", endpoint_in(tmp_path)):
             ticket = kitchen.send(Draft().point2("l2", (1.0, 2.0)))
             # Longer than it takes to find that the other one is there, had it looked.
             with pytest.raises(Unavailable):

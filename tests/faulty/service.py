@@ -23,9 +23,12 @@ MAP = "kitchen"
 
 
 class Service:
-    """One map, owned as the contract says; `faults` are taken one per insert."""
+    """One map, owned as the contract says; `faults` are taken one per insert.
 
-    def __init__(self, folder: Path, epoch: int = 1) -> None:
+    endpoint: where it listens; absent: at the socket in `folder`.
+    """
+
+    def __init__(self, folder: Path, epoch: int = 1, endpoint: str | None = None) -> None:
         self.epoch, self.revision = epoch, 0
         self.values: dict[int, np.ndarray] = {}
         self.answers: dict[tuple[str, int], bytes] = {}
@@ -39,7 +42,7 @@ class Service:
         self.says: dict[str, Any] = {}  # of the map, besides its row
         self.held: list[zenoh.Query] = []
         self._inbox: SimpleQueue[zenoh.Query | None] = SimpleQueue()
-        self._session = zenoh.open(_peer(folder))
+        self._session = zenoh.open(peer(endpoint or endpoint_in(folder)))
         self._queryables = [
             self._session.declare_queryable(key, Callback(self._inbox.put, indirect=False), complete=True)
             for key in (keys.inserts_of_any_client(MAP), f"{keys.PREFIX}/map/*/ask/*", f"{keys.PREFIX}/admin/*")
@@ -150,11 +153,12 @@ def endpoint_in(folder: Path) -> str:
     return f"unixsock-stream/{folder}/bus.sock"
 
 
-def _peer(folder: Path) -> zenoh.Config:
+def peer(endpoint: str) -> zenoh.Config:
+    """Of a session that listens there, and nowhere else."""
     config = zenoh.Config()
     settings = {
         "mode": "peer",
-        "listen/endpoints": [endpoint_in(folder)],
+        "listen/endpoints": [endpoint],
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,

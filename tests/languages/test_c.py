@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import free_port
+from faulty.other_version import someone_of
+from faulty.service import MAP, Service
 from processes import Process, processes
 
 from factorbus.client import Draft, connect
+from factorbus.proto.problems import UnknownMap
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE, VECTORS = ROOT / "clients" / "examples" / "c", ROOT / "proto" / "vectors"
@@ -159,12 +163,49 @@ def test_an_estimate_larger_than_a_batch_comes_in_parts(built: Path, endpoint: s
 
 @pytest.mark.timeout(400)
 def test_nobody_there_is_said(built: Path) -> None:
-    from browser import free_port
-
     ran = robot(built, f"tcp/127.0.0.1:{free_port()}", "square")
     assert ran.returncode == 1
     assert "nobody speaks Zenoh at 127.0.0.1" in ran.stderr
     assert run(built / "robot").returncode == 2
+
+
+@pytest.mark.parametrize("version", ["v2", "v0", "v1.1"])
+def test_a_service_of_another_version_is_told_from_silence(built: Path, version: str) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with someone_of(version, endpoint):
+        ran = robot(built, endpoint, "square")
+    assert (ran.returncode, ran.stdout) == (1, "")
+    assert f"speak version {version} of the protocol, this robot v1" in ran.stderr
+    assert ran.stderr.endswith(" [other_protocol]\n")
+
+
+class Quiet(Service):
+    """Says nothing when it is first asked for the estimate, for longer than silence takes to be looked into.
+
+    Beside it is one of another version.
+    """
+
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        super().__init__(folder, endpoint=endpoint)
+        self._other = self._session.liveliness().declare_token("factorbus/v2/features/s/live")
+
+    def _ask(self, question: str, payload: bytes) -> bytes | None:
+        self.asked.append(question)
+        if len(self.asked) <= 5:
+            return None
+        raise UnknownMap(MAP)
+
+
+def test_a_service_that_has_answered_is_waited_for(built: Path, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    service = Quiet(tmp_path, endpoint)
+    try:
+        ran = robot(built, endpoint, MAP)
+        assert ran.returncode == 1
+        assert ran.stderr.endswith(" [unknown_map]\n")
+        assert service.asked == ["estimate"] * 6
+    finally:
+        service.close()
 
 
 def test_its_readme_names_what_there_is() -> None:

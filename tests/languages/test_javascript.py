@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty.other_version import someone_of
+from faulty.service import endpoint_in
 from processes import Process, processes
 
 from factorbus.client import connect
@@ -49,7 +51,7 @@ def test_a_message_that_differs_is_named(tmp_path: Path, what: str) -> None:
         file.write_bytes(file.read_bytes().replace(b"\xca\x7f", b"\xca\x7e").replace(b"previous", b"previouz"))
     else:
         file = tmp_path / "vectors" / "delta.json"
-        file.write_text(file.read_text().replace("0.125", "0.1250000000000001"))
+        file.write_text(file.read_text().replace("1.47844444", "1.4784444400000004"))
     ran = run("vectors.mjs", str(tmp_path / "vectors"))
     assert ran.returncode == 1
     assert ran.stderr.startswith("delta.msgpack: ")
@@ -70,6 +72,7 @@ def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) ->
         steps = list(city_trees(poses=30, seed=1))
         for step in steps[:10]:
             joined.insert(step.batch)
+        joined.wait_converged(60)  # else further steps come in between
         last = joined.estimate.revision + len(steps) - 10
         command = [node(), "--experimental-websocket", "watch.mjs", gateway, "warehouse", str(last)]
         with subprocess.Popen(command, cwd=EXAMPLE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as watch:
@@ -79,7 +82,7 @@ def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) ->
                 joined.insert(step.batch)
             said, errors = watch.communicate(timeout=60)
         assert watch.returncode == 0, errors
-        assert head[0].startswith("map warehouse: mode tree, ")
+        assert head[0].startswith("map warehouse: mode bayes-tree, ")
         assert re.match(rf"revision {last - len(steps) + 10}: (\d+) of \1 variables changed", head[1])
         told = json.loads(said.splitlines()[-1].removeprefix("estimate "))
         for keys, values in joined.estimate.snapshot().columns.values():
@@ -92,3 +95,12 @@ def test_a_map_is_followed_through_the_gateway(spawn: Callable[..., Process]) ->
     commands = re.findall(r"^```bash\n(.*?)^```$", (EXAMPLE / "README.md").read_text(), re.M | re.S)
     assert [line.split()[1] for line in commands] == ["vectors.mjs", "--experimental-websocket"]
     assert run(*commands[0].split()[1:]).returncode == 0
+
+
+def test_a_service_of_another_version_is_told_from_silence(spawn: Callable[..., Process], tmp_path: Path) -> None:
+    with someone_of("v2", endpoint_in(tmp_path)):
+        command = ("-m", "factorbus.cli", "gateway", "--connect", endpoint_in(tmp_path), "--port", "0")
+        ran = run("--experimental-websocket", "watch.mjs", spawn(*command).ready()[0], "warehouse")
+    assert (ran.returncode, ran.stdout) == (1, "")
+    assert "speak version v2 of the protocol, this client v1" in ran.stderr
+    assert ran.stderr.endswith(" [other_protocol]\n")

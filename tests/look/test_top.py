@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 import pty
+import re
 import select
 import signal
 import struct
@@ -17,7 +18,7 @@ from contextlib import contextmanager
 import pyte
 from processes import Process, processes
 
-from factorbus.client import connect
+from factorbus.client import Draft, connect
 from factorbus.simulate import manhattan
 
 COMMAND = [sys.executable, "-m", "factorbus.cli", "top"]
@@ -110,6 +111,40 @@ def test_a_service_that_goes_is_said_and_found_again(tmp_path) -> None:
             screen.wait_for(lambda seen: "nobody answers" in seen[0])
             start("-m", "factorbus.cli", "serve", "--listen", endpoint, "--no-warm", "--map", "again").ready()
             screen.wait_for(lambda seen: bool(row_of(seen, "again")))
+
+
+def test_who_has_left_is_no_longer_listed(endpoint: str) -> None:
+    with connect(endpoint, client="stayer") as staying, staying.map("departed") as stayed:
+        stayed.insert(Draft().point2("l1", (1.0, 2.0)).prior_point2("l1", (1.0, 2.0), sigmas=(1.0, 1.0)))
+        with connect(endpoint, client="leaver") as bus, bus.map("departed") as joined:
+            joined.insert(Draft().point2("l2", (1.0, 2.0)).prior_point2("l2", (1.0, 2.0), sigmas=(1.0, 1.0)))
+            joined.insert(Draft().point2("l3", (1.0, 2.0)).prior_point2("l3", (1.0, 2.0), sigmas=(1.0, 1.0)))
+            assert stayed.clients() >= {stayed.client, joined.client}
+        looked = [*COMMAND, "--connect", endpoint, "--every", "0.1"]
+        shown = subprocess.run([*looked, "--once"], capture_output=True, text=True, timeout=60, check=True).stdout
+        told = subprocess.run([*looked, "--json"], capture_output=True, text=True, timeout=60, check=True).stdout
+        assert row_of(shown.splitlines(), stayed.client)[:3] == [stayed.client, "departed", "1"]
+        assert "leaver" not in shown
+        assert re.search(r"\d+ clients? gone, after \d+ inserts?", shown)
+        mine = {
+            row["name"]: (row["here"], row["inserts"])
+            for row in json.loads(told)["clients"]
+            if row["map"] == "departed"
+        }
+        assert mine == {stayed.client: (True, 1), joined.client: (False, 2)}
+
+
+def test_where_there_is_no_terminal_it_says_what_to_take_instead(endpoint: str) -> None:
+    ran = subprocess.run(
+        [*COMMAND, "--connect", endpoint],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert "--once" in ran.stderr
 
 
 def test_once_as_a_document(endpoint: str) -> None:

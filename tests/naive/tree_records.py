@@ -23,7 +23,7 @@ class Clique:
 
 
 def tree_of(solver: Solver) -> Tree:
-    """The tree of a solver in the mode "tree"."""
+    """The tree of a solver in the mode "bayes-tree"."""
     assert solver._tree is not None
     return solver._tree.tree
 

@@ -280,12 +280,12 @@ EDGE = {"kind": "between_se2", "keys": b"\0" * 16, "measured": b"\0" * 24, "info
         ({"sequence": 1, "variables": [GROUP, GROUP | {"kind": 3}]}, "variables[1].kind: not a string"),
         ({"sequence": 1, "variables": [GROUP | {"keys": "x1"}]}, "variables[0].keys: is a string 'x1'"),
         ({"sequence": 1, "variables": [GROUP | {"keys": b"1234567"}]}, "keys: 7 bytes; wanted a multiple of 8"),
-        ({"sequence": 1, "variables": [GROUP | {"values": b"1"}]}, "variables[0].values: 1 bytes; wanted 24 (1 rows"),
+        ({"sequence": 1, "variables": [GROUP | {"values": b"1"}]}, "variables[0].values: 1 byte; wanted 24 (1 row "),
         ({"sequence": 1, "variables": [GROUP | {"values": [0.0]}]}, "variables[0].values: is an array"),
         ({"sequence": 1, "variables": [GROUP | {"fixed": None}]}, "variables[0].fixed: is nil"),
         (
             {"sequence": 1, "variables": [GROUP, GROUP | {"stamps": b"1"}]},
-            "variables[1].stamps: 1 bytes; wanted 8 (1 int64)",
+            "variables[1].stamps: 1 byte; wanted 8 (1 int64)",
         ),
         ({"sequence": 1, "variables": [GROUP | {"stamps": b""}]}, "variables[0].stamps: 0 bytes; wanted 8 (1 int64)"),
         *(

@@ -7,10 +7,10 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
+from naive.dense_answers import check_blocks, check_candidates, check_cross, check_factor, check_pairs
 from naive.dense_covariances import DenseCovariance
-from naive.dense_factors import jacobians, residual
-from naive.dense_least_squares import CONNECTS, DenseGraph, rho
-from scipy.stats import chi2 as chi2_distribution
+from naive.dense_factors import residual
+from naive.dense_least_squares import DenseGraph, rho
 
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import codec
@@ -83,56 +83,22 @@ def test_deltas_lead_to_the_estimate_bit_for_bit() -> None:
 
 
 def test_covariances_are_those_of_the_map(known: DenseCovariance) -> None:
-    for group in asked.decode_covariances(read("covariances")).groups:
-        for key, block in zip(group.keys.tolist(), group.covariance, strict=True):
-            np.testing.assert_allclose(block, known.joint([key]), rtol=1e-7, atol=1e-11)
+    check_blocks(asked.decode_covariances(read("covariances")).groups, known, rtol=1e-7, atol=1e-11)
     joint = asked.decode_covariances(read("covariances_joint"))
     np.testing.assert_allclose(joint.covariance, known.joint(joint.keys.tolist()), rtol=1e-7, atol=1e-11)
-    cross = asked.decode_covariances(read("covariances_cross"))
-    rows, columns = cross.keys.tolist(), cross.others.tolist()
-    whole = known.joint(rows + columns)
-    size = int(cross.dims.sum())
-    np.testing.assert_allclose(cross.covariance, whole[:size, size:], rtol=1e-7, atol=1e-11)
+    check_cross(asked.decode_covariances(read("covariances_cross")), known, rtol=1e-7, atol=1e-11)
 
 
 def test_gates_gains_and_pairs_are_those_of_the_map(known: DenseCovariance) -> None:
     gate, gated = asked.decode_ask_gate(read("ask_gated")), asked.decode_gated(read("gated"))
-    gained = asked.decode_gained(read("gained"))
-    rows = [
-        (group.kind, keys, z, upper)
-        for group in gate.factors
-        for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True)
-    ]
-    for n, (kind, keys, z, upper) in enumerate(rows):
-        r, spread, noise = known.innovation(kind, keys, z, upper)
-        assert gated.distance[n] == pytest.approx(r @ np.linalg.solve(spread + noise, r), rel=1e-7)
-        assert gated.threshold[n] == pytest.approx(chi2_distribution.ppf(gate.probability, len(r)), rel=1e-9)
-        assert gained.gain[n] == pytest.approx(
-            0.5 * np.linalg.slogdet(np.eye(len(r)) + np.linalg.solve(noise, spread))[1], rel=1e-7
-        )
-    assert gated.plausible.tolist() == (gated.distance <= gated.threshold).tolist()
-    assert set(gated.plausible.tolist()) == {True, False}, "the example has both"
-    seen, found = asked.decode_ask_associate(read("ask_associated")), asked.decode_associated(read("associated"))
-    for sighting, landmark, distance in zip(found.sightings, found.candidates, found.distances, strict=True):
-        ends, z, upper = [seen.pose, int(landmark)], seen.measured[sighting], seen.information[sighting]
-        r, spread, noise = known.innovation(seen.kind, ends, z, upper)
-        assert distance == pytest.approx(r @ np.linalg.solve(spread + noise, r), rel=1e-7)
+    check_candidates(gate, gated, asked.decode_gained(read("gained")), known, 1e-7)
+    check_pairs(
+        asked.decode_ask_associate(read("ask_associated")), asked.decode_associated(read("associated")), known, 1e-7
+    )
 
 
-def test_why_is_what_the_equations_say(dense: DenseGraph, known: DenseCovariance) -> None:
-    told = asked.decode_why(read("why_factor")).factor
-    kind, keys, z, W = dense.factors[told["factor"]]
-    ends = [dense.values[key] for key in keys]
-    r = residual(kind, ends, z)
-    H = np.hstack(jacobians(kind, CONNECTS[kind], ends, z))
-    spread = H @ known.joint(keys) @ H.T
-    assert (told["kind"], told["keys"], told["loss"]) == (kind, keys, "")
-    np.testing.assert_allclose(told["residual"], r, atol=1e-7)
-    np.testing.assert_allclose(told["weighted"], np.linalg.cholesky(W).T @ r, atol=1e-6)
-    assert told["chi2"] == pytest.approx(r @ W @ r, rel=1e-5)
-    assert told["influence"] == pytest.approx(np.trace(W @ spread), rel=1e-7)
-    without = r @ np.linalg.solve(np.linalg.inv(W) - spread, r)
-    assert told["without"] == pytest.approx(without, rel=1e-5)
+def test_why_is_what_the_equations_say(known: DenseCovariance) -> None:
+    check_factor(asked.decode_why(read("why_factor")).factor, known, 1e-7, 1e-5)
     variable = asked.decode_why(read("why_variable")).variable
     block = known.joint([variable["key"]])
     np.testing.assert_allclose(variable["covariance"], block, rtol=1e-7, atol=1e-11)
@@ -163,6 +129,4 @@ def test_a_form_in_pieces_says_what_it_stands_for() -> None:
     pieces.put(graph.batch.variables)
     assert any(kind.startswith("linear") for kind, *_ in pieces.factors)
     known = DenseCovariance(pieces)
-    for group in asked.decode_covariances(read("covariances_pieces")).groups:
-        for key, block in zip(group.keys.tolist(), group.covariance, strict=True):
-            np.testing.assert_allclose(block, known.joint([key]), rtol=1e-6, atol=1e-10)
+    check_blocks(asked.decode_covariances(read("covariances_pieces")).groups, known, rtol=1e-6, atol=1e-10)

@@ -40,7 +40,7 @@ ASKED: dict[str, tuple[str, bytes]] = {
 }
 
 
-@pytest.fixture(scope="module", params=["tree", "all-batch"])
+@pytest.fixture(scope="module", params=["bayes-tree", "all-batch"])
 def solver(request: pytest.FixtureRequest) -> Solver:
     keys = np.arange(POSES)
     ends = np.column_stack([keys[:-1], keys[1:]])

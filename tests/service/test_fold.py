@@ -305,7 +305,7 @@ def told(folded: Result) -> Any:
     return plain, reports, columns, steps, first, codes(folded), folded.variables, folded.factors
 
 
-@pytest.mark.parametrize("mode", ["inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["inc-l", "bayes-tree"])
 def test_one_insert_comes_to_the_same_either_way(mode: str) -> None:
     quick, usual = (Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()) for _ in range(2))
     alone = 0

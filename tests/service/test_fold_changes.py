@@ -150,7 +150,7 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
     assert first.revision == second.revision
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
 def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
     folder = make(Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
     came(folder, waiting(gone(4), 6))

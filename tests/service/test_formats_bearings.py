@@ -106,7 +106,7 @@ def course(seed: int, poses: int = 60) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 @pytest.mark.parametrize("seed", range(2))
 def test_no_mode_loses_a_point(tmp_path: Path, mode: str, seed: int) -> None:
     """At every step points are where there can be some, and at the end the map is at the optimum of the true start."""

@@ -169,7 +169,7 @@ def test_a_pose_without_a_time_among_others_is_left_out_and_said(tmp_path: Path)
     batch = Batch((poses([7, NO_STAMP, 9]), poses(None, "y")))
     files = write_tum(tmp_path / "out.tum", batch)
     assert [times(file.read_text()) for file in files] == [["0.000000007", "0.000000009"], ["0", "1", "2"]]
-    assert tum_notes(batch) == ("1 poses left out: others have a time stamp and x1 none",)
+    assert tum_notes(batch) == ("1 pose left out: x1 has no time stamp, and others have one",)
     assert tum_notes(batch, "y") == ()
     assert len(kitti_text(batch, "x").splitlines()) == 3, "which has no times"
 

@@ -201,7 +201,7 @@ def test_variable_that_nothing_tells_of_is_left_out_and_said() -> None:
     lonely = Variables("se2", np.array([symbol("x", 3)]))
     written = as_g2o(Batch((lonely,)))
     assert written.left_out == {"variables": 1}
-    assert written.notes == ("1 variables left out: neither a value nor an edge tells of x3",)
+    assert written.notes == ("1 variable left out: neither a value nor an edge tells of x3",)
     with pytest.raises(FormatError, match="a factor of x0, which is not in the graph"):
         g2o_text(Batch((), small().factors))
 

@@ -37,7 +37,7 @@ POSES, DEGREES = 100, 120.0
 # Few tries in each step, so that there are many steps.
 FEW = {"max_iterations": 2, "nonmonotone_steps": 0}
 MODES = ["inc-l", "all-batch"]
-ALL_MODES = [*MODES, "inc-l-b10", "tree"]
+ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
 
 
 def folder_in(mode: str, **options: Any) -> Folder:

@@ -22,7 +22,7 @@ from factorbus.service.questions import Question
 from factorbus.solver import Options, Solver
 
 POINT = symbol("l", 0)
-MODES = ("tree", "inc-l", "all-batch")
+MODES = ("bayes-tree", "inc-l", "all-batch")
 # What an insert within its bounds may be refused for.
 REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialised", "out_of_bounds", "bad_sight",
            "bad_direction", "not_positive_definite", "bad_range"}  # fmt: skip
@@ -153,7 +153,7 @@ def test_of_several_inserts_only_the_guilty_is_refused(mode: str) -> None:
 
 
 def test_changes_have_the_same_bounds_and_undo_what_was_far() -> None:
-    tried = start("tree")
+    tried = start("bayes-tree")
     assert tried.insert(near(1.0)) == "accepted"
     ids = np.array([1])
 
@@ -172,7 +172,7 @@ def test_changes_have_the_same_bounds_and_undo_what_was_far() -> None:
 
 
 def test_the_reported_case_is_refused_by_name() -> None:
-    tried = Map("tree")
+    tried = Map("bayes-tree")
     x0 = Variables("se2", np.array([symbol("x", 0)]), np.zeros((1, 3)), fixed=True)
     assert tried.insert(Batch((x0,))) == "accepted"
     ends = np.array([[symbol("x", 0), POINT]])

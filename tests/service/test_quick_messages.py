@@ -356,7 +356,7 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
 def test_answer_and_delta_are_the_bytes_of_the_codec(
     seed: int, sequence: int, epoch: int, revision: int, first_factor: int
 ) -> None:
-    solver, out = Solver(Options(mode=("inc-l", "tree")[seed % 2])), np.empty(1 << 16, np.uint8)
+    solver, out = Solver(Options(mode=("inc-l", "bayes-tree")[seed % 2])), np.empty(1 << 16, np.uint8)
     for batch in random_steps(seed % 10_000, steps=5):
         solver.stage(batch)
         account = solver.step().as_dict() | {"solver_ms": 0.25}

@@ -72,7 +72,7 @@ class Service:
     """A map's core and a solver that takes everything; of one client."""
 
     def __init__(self) -> None:
-        self.core = MapCore("m", "tree", EPOCH, Limits(), 0.0)
+        self.core = MapCore("m", "bayes-tree", EPOCH, Limits(), 0.0)
         self.now = 0.0
         self.taken: list[tuple[str, int]] = []
         self._refuse: Callable[[Arrived], bool] = lambda _: False

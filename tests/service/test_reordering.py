@@ -185,7 +185,7 @@ def test_further_steps_are_followed_and_made_again(leave: threading.Event, tmp_p
     for batch in batches[n : n + 20]:
         driven.insert(batch)
         driven.fold((), further=True)
-    store = create(tmp_path / "m", "m", "tree", {}, EPOCH, "none")
+    store = create(tmp_path / "m", "m", "bayes-tree", {}, EPOCH, "none")
     for inserts, events, further in driven.journal:
         if inserts or events:
             last = store.last()

@@ -48,7 +48,7 @@ def room(spread: float, sigma: float) -> tuple[Solver, np.ndarray]:
             keys.append([i, 100 + l])
             seen.append(turn @ (point - [x, y]) + rng.normal(0, sigma, 2))
     weight = np.tile([1 / sigma**2, 0.0, 1 / sigma**2], (len(keys), 1))
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     solver.stage(
         Batch(
             (
@@ -66,7 +66,7 @@ def room(spread: float, sigma: float) -> tuple[Solver, np.ndarray]:
 def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
     """A robot that has slipped: each sighting is nearest to a wrong landmark, all together are right."""
     rng = np.random.default_rng(2)
-    solver, n = Solver(Options(mode="tree")), 5
+    solver, n = Solver(Options(mode="bayes-tree")), 5
     row = np.column_stack([np.arange(n) * 0.6, np.full(n, 3.0)])
     rough = np.array([[1 / 0.09, 0, 0, 1e4, 0, 1e4]])  # 0.3 m along the row, sure otherwise
     solver.stage(

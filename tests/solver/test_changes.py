@@ -17,10 +17,10 @@ from factorbus.solver.changes import CHANGES
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor
 
-MODES = ["tree", "inc-l", "all-batch", "inc-l-b10"]
+MODES = ["bayes-tree", "inc-l", "all-batch", "inc-l-b10"]
 
 
-def fed(batches: list[Batch], mode: str = "tree") -> tuple[Solver, list[int]]:
+def fed(batches: list[Batch], mode: str = "bayes-tree") -> tuple[Solver, list[int]]:
     """A solver with these, step by step, and the first factor of each."""
     solver, firsts = Solver(Options(mode=mode)), []
     for batch in batches:
@@ -304,7 +304,7 @@ BAD: dict[str, tuple[type[errors.SolverError], list[Change]]] = {
 }
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_is_refused_and_the_map_is_as_it_was(name: str, mode: str) -> None:
     error, changes = BAD[name]

@@ -23,7 +23,7 @@ from factorbus.solver.tree_steps import TreeSteps
 
 X = symbol("x", 0), symbol("x", 10**6)
 FLOOR = 1e-3  # χ² of which a share means nothing
-MODES = ["tree", "inc-l", "inc-l-b10", "all-batch"]
+MODES = ["bayes-tree", "inc-l", "inc-l-b10", "all-batch"]
 BATCH = Options(mode="all-batch", tolerance=1e-10, max_iterations=50)
 
 

@@ -20,7 +20,7 @@ from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
-MODES = ("tree", "inc-l", "all-batch")
+MODES = ("bayes-tree", "inc-l", "all-batch")
 DIM = {name: kind.dim for name, kind in VARIABLE_KINDS.items()}
 
 
@@ -78,7 +78,7 @@ def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
 
 @pytest.mark.parametrize("ends", [(5, 1), (1, 5)])
 def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, int]) -> None:
-    solver = solved(3, "tree")
+    solver = solved(3, "bayes-tree")
     blocks, n = Blocks(solver.factored()), solver.variable_count
     first, second = np.arange(0, 10) % min(ends[0], n), np.arange(0, 10) % min(ends[1], n)
     dims = blocks.factored.dims
@@ -90,7 +90,7 @@ def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, in
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
-    solver = solved(seed, "tree", steps=12)
+    solver = solved(seed, "bayes-tree", steps=12)
     alone, every = Blocks(solver.factored()), np.arange(solver.variable_count)
     diagonal = alone.diagonal()
     for hub in every[:: max(1, len(every) // 4)]:
@@ -103,7 +103,7 @@ def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
 
 
 def test_in_place_is_what_the_copy_says() -> None:
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     for step in manhattan(200, 4):
         solver.stage(step.batch)
         solver.step()
@@ -119,7 +119,7 @@ def test_in_place_is_what_the_copy_says() -> None:
 
 def test_a_copy_stays_as_it_is_while_the_map_goes_on() -> None:
     steps = [step.batch for step in manhattan(150, 2)]
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     for batch in steps[:100]:
         solver.stage(batch)
         solver.step()
@@ -184,7 +184,7 @@ def test_candidates_of_every_kind(seed: int) -> None:
 
 
 def test_candidates_that_no_insert_could_bring_are_refused() -> None:
-    solver = solved(1, "tree")
+    solver = solved(1, "bayes-tree")
     blocks = Blocks(solver.factored())
     group = candidates(solver, 1)[4]
     marks = blocks.factored.graph.mark()
@@ -249,7 +249,7 @@ def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
 
 
 def test_relative_to_a_point_is_refused() -> None:
-    solver = solved(2, "tree")
+    solver = solved(2, "bayes-tree")
     blocks, graph = Blocks(solver.factored()), solver._graph
     point = next(v for v in range(solver.variable_count) if graph.var[v, at.V_KIND] == at.POINT2)
     with pytest.raises(errors.KindMismatch):
@@ -287,7 +287,7 @@ def test_why_a_variable(mode: str) -> None:
     solver = solved(7, mode, steps=8)
     twin, blocks = dense(solver), Blocks(solver.factored())
     for v in range(solver.variable_count):
-        account = why_variable(blocks, v, keeps_steps=mode == "tree")
+        account = why_variable(blocks, v, keeps_steps=mode == "bayes-tree")
         assert account.fixed == (solver._graph.var[v, at.V_COLUMN] < 0)
         assert [each.factor for each in account.factors] == sorted(each.factor for each in account.factors)
         assert len(account.factors) == len(solver._graph.factors_of(v))
@@ -297,7 +297,7 @@ def test_why_a_variable(mode: str) -> None:
         close(account.sigmas**2, np.diag(twin.joint([account.key])), twin.tell)
         assert 0 < account.conditioning <= 1 + 1e-3
         assert account.pivot >= 1 / account.sigmas.max() * (1 - 1e-9)
-        assert (account.linearised_step >= 1) == (mode == "tree")
+        assert (account.linearised_step >= 1) == (mode == "bayes-tree")
         assert account.as_dict()["factors"][0]["keys"]
 
 
@@ -319,13 +319,13 @@ def kept_up(solver: Solver, batches) -> float:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_blocks_kept_up_are_those_computed_anew_after_every_step(seed: int) -> None:
-    assert kept_up(Solver(Options(mode="tree")), [step.batch for step in manhattan(400, seed)]) < 1e-8
-    assert kept_up(Solver(Options(mode="tree")), [step.batch for step in city_trees(150, seed)]) < 1e-8
+    assert kept_up(Solver(Options(mode="bayes-tree")), [step.batch for step in manhattan(400, seed)]) < 1e-8
+    assert kept_up(Solver(Options(mode="bayes-tree")), [step.batch for step in city_trees(150, seed)]) < 1e-8
 
 
 def test_blocks_are_kept_up_over_steps_that_were_missed_or_refused() -> None:
     steps = [step.batch for step in manhattan(120, 8)]
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     upkeep = solver.try_upkeep()
     assert upkeep is not None
     for n, batch in enumerate(steps):

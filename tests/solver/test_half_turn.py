@@ -43,7 +43,7 @@ def settled(batches: list[Batch], mode: str) -> Solver:
     return solver
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 @pytest.mark.parametrize("axis", AXES)
 def test_one_factor_holds_a_pose_half_a_turn_off(mode: str, axis: str) -> None:
     first = Batch((pose(X[0], True),), ())
@@ -57,7 +57,7 @@ def test_one_factor_holds_a_pose_half_a_turn_off(mode: str, axis: str) -> None:
     assert settled([Batch((pose(X[0]),), (factor,))], mode).chi2() < 1e-12
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 @pytest.mark.parametrize("finished", [settled, left_alone], ids=["settled", "left alone"])
 @pytest.mark.parametrize("axis", ["y", "z"])
 def test_a_loop_with_values_half_a_turn_off(

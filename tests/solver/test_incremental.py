@@ -166,7 +166,7 @@ def test_forced_batches_come_when_due_and_the_linear_estimate_in_between(mode: s
 
 def test_modes_by_the_papers_names() -> None:
     assert Solver(Options(mode="inc-l b10")).step().mode == "inc-l-b10"
-    assert Solver(Options(mode="auto")).step().mode == "tree"
+    assert Solver(Options(mode="auto")).step().mode == "bayes-tree"
     with pytest.raises(errors.UnknownMode, match="inc-l b7"):
         Options(mode="inc-l b7")
     assert CLI_MODES == MODES

@@ -21,7 +21,7 @@ from factorbus.solver.groups import FactorGroup
 from factorbus.solver.joints import find_joints, negative_rows
 from factorbus.solver.repair import find_loops, repair
 
-MODES = ("tree", "inc-l", "all-batch")
+MODES = ("bayes-tree", "inc-l", "all-batch")
 SIZE = {"se2": 3, "se3": 7}
 
 
@@ -79,7 +79,7 @@ def _composed(kind: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return _vector(pose_matrix(a) @ pose_matrix(b))
 
 
-def solved(batch: Batch, mode: str = "tree") -> Solver:
+def solved(batch: Batch, mode: str = "bayes-tree") -> Solver:
     solver = Solver(Options(mode=mode))
     solver.stage(batch)
     solver.step(settle=True)
@@ -208,7 +208,7 @@ def symbol_number(key: int) -> int:
 
 
 @pytest.mark.parametrize(
-    ("kind", "seed", "mode"), [("se2", seed, mode) for seed in (1, 2) for mode in MODES] + [("se3", 3, "tree")]
+    ("kind", "seed", "mode"), [("se2", seed, mode) for seed in (1, 2) for mode in MODES] + [("se3", 3, "bayes-tree")]
 )
 def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_a_dense_twin(
     kind: str, seed: int, mode: str

@@ -50,7 +50,7 @@ def step(kind: str, n: int, rng: np.random.Generator, closure: int = 2) -> Batch
     return Batch((Variables(kind, np.array([key])),), tuple(factors))
 
 
-def driven(kind: str, poses: int, mode: str = "tree", closure: int = 2) -> tuple[Solver, np.random.Generator]:
+def driven(kind: str, poses: int, mode: str = "bayes-tree", closure: int = 2) -> tuple[Solver, np.random.Generator]:
     rng, solver = np.random.default_rng(3), Solver(Options(mode=mode))
     solver.stage(start(kind))
     for n in range(1, poses):
@@ -74,7 +74,7 @@ def covariance(solver: Solver, *names: int) -> np.ndarray:
     return blocks.joint(np.array([solver._graph.find(symbol("x", n)) for n in names]))
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 @pytest.mark.parametrize("closure", [1, 2])
 @pytest.mark.parametrize("kind", SPACES)
 def test_what_is_left_stays_where_it_is_and_as_certain_as_it_was(kind: str, closure: int, mode: str) -> None:

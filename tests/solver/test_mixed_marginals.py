@@ -21,7 +21,7 @@ from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.joints import find_joints
 from factorbus.solver.kernels import layout as at
 
-MODES = ("tree", "inc-l", "all-batch")
+MODES = ("bayes-tree", "inc-l", "all-batch")
 WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "landmarks": lambda seed: random_steps(seed, 8),
     "cameras": lambda seed: camera_steps(seed, 8, noise=0.003),
@@ -30,7 +30,7 @@ WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
 seeds = st.integers(0, 2**32 - 1)
 
 
-def solved(world: str, seed: int, mode: str = "tree") -> Solver:
+def solved(world: str, seed: int, mode: str = "bayes-tree") -> Solver:
     solver = Solver(Options(mode=mode))
     for batch in WORLDS[world](seed):
         solver.stage(batch)

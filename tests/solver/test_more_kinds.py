@@ -11,7 +11,7 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.factors import FACTOR_KINDS
 from factorbus.solver.kernels import layout as at
 
-MODES = ["tree", "inc-l", "all-batch"]
+MODES = ["bayes-tree", "inc-l", "all-batch"]
 
 
 def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:

@@ -73,10 +73,10 @@ def test_every_lens_gives_the_residual_of_the_dense_twin(kind: str, name: str) -
         np.testing.assert_allclose(r[row : row + 2], pixel - z[:2], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
 @pytest.mark.parametrize("seed", range(2))
 def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
-    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "rounds": 40} if mode == "tree" else {}
+    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "rounds": 40} if mode == "bayes-tree" else {}
     solver, twin = Solver(Options(mode=mode, **TIGHT, **tree)), DenseGraph()
     for batch in camera_steps(seed):
         solver.stage(batch)
@@ -91,7 +91,7 @@ def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
                 assert distance(group.kind, value, twin.values[key]) < 1e-6
 
 
-@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_robust_estimates_are_where_the_twins_gradient_is_zero(loss: str, mode: str) -> None:
     solver, twin = Solver(Options(mode=mode)), DenseGraph()
@@ -206,7 +206,7 @@ def test_losses_that_are_none_are_refused(loss: str, scale: np.ndarray | None) -
         Solver().stage(bad)
 
 
-@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
 def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> None:
     """A strong prior pulls a point behind the camera that saw it."""
     solver = Solver(Options(mode=mode))
@@ -266,7 +266,7 @@ def test_a_point_by_two_pixels_and_a_camera_by_its_points_are_held() -> None:
         keys = [[symbol("x", n), symbol("p", k)] for k in range(6)]
         return Factors("point_seen", np.array(keys), np.array(z), np.repeat(unit(2), 6, 0))
 
-    for mode in ("inc-l", "tree"):
+    for mode in ("inc-l", "bayes-tree"):
         solver = Solver(Options(mode=mode))
         keys = np.array([symbol("x", 0), symbol("x", 1)])
         fixed = Variables("se3", keys, np.array(cameras[:2]), fixed=True)
@@ -352,7 +352,7 @@ def drive_past(solver: Solver, frames: int = 8, features: int = 12, noise: float
     return camera
 
 
-@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
 def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
     solver = Solver(Options(mode=mode))
     drive_past(solver)

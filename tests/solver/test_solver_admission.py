@@ -177,7 +177,7 @@ def everything(solver: Solver) -> bytes:
 
 
 def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the graph says of them; in the mode "tree" nobody writes where blocks of Λ are."""
+    """What the graph says of them; in the mode "bayes-tree" nobody writes where blocks of Λ are."""
     var, fac = solver._graph.var[:variables], solver._graph.fac[:factors]
     return (var, fac) if solver._tree is None else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
 
@@ -195,7 +195,7 @@ def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[b
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")  # from plain Python, where kernels are not compiled
-@pytest.mark.parametrize("mode", ["inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["inc-l", "bayes-tree"])
 @pytest.mark.parametrize("name", REFUSED)
 def test_bad_batches_are_refused_whole(name: str, mode: str) -> None:
     code, bad = REFUSED[name]

@@ -107,7 +107,7 @@ def test_what_no_state_can_hold_is_an_error_and_so_is_a_state_of_something_else(
     with pytest.raises(ValueError, match="no state of Solver: _graph"):
         Solver().load({name: value for name, value in state.items() if name != "_graph"})
     with pytest.raises(ValueError, match="in one of them only"):
-        Solver(Options(mode="tree")).load(Solver(Options(mode="tree")).dump() | {"_tree": {"_tree": {}}})
+        Solver(Options(mode="bayes-tree")).load(Solver(Options(mode="bayes-tree")).dump() | {"_tree": {"_tree": {}}})
 
 
 def test_the_fingerprint_is_that_of_the_sources() -> None:

@@ -114,7 +114,7 @@ def test_values_come_from_the_first_factor_that_reaches_whatever_the_order() -> 
             assert distance(kind, value, truth[key]) < 1e-9
 
 
-@pytest.mark.parametrize("mode", ["inc-l", "tree"])
+@pytest.mark.parametrize("mode", ["inc-l", "bayes-tree"])
 def test_changed_are_exactly_the_variables_with_other_bits(mode: str) -> None:
     solver = Solver(Options(mode=mode))
     before: dict[int, tuple[str, np.ndarray]] = {}
@@ -181,7 +181,7 @@ def test_folding_batches_into_one_step_gives_the_same_optimum() -> None:
     ("mode", "phases"),
     [
         ("inc-l", {"linearise", "order", "symbolic", "numeric", "solve"}),
-        ("tree", {"linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute"}),
+        ("bayes-tree", {"linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute"}),
     ],
 )
 def test_the_clock_is_passed_in(mode: str, phases: set[str]) -> None:

@@ -16,7 +16,7 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.packing import Packing
 
-MODES = ["tree", "inc-l", "all-batch"]
+MODES = ["bayes-tree", "inc-l", "all-batch"]
 seeds = st.integers(0, 9999)
 T0 = 1_403_636_579_763_555_584
 
@@ -64,7 +64,7 @@ def line(count: int = 6) -> Iterator[Batch]:
         yield Batch((pose(n, T0 + n),), (edge(n - 1, n),))
 
 
-def fed(batches: Iterable[Batch], mode: str = "tree") -> Solver:
+def fed(batches: Iterable[Batch], mode: str = "bayes-tree") -> Solver:
     solver = Solver(Options(mode=mode))
     for batch in batches:
         solver.stage(batch)

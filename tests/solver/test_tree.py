@@ -20,7 +20,7 @@ from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
-EXACT = {"mode": "tree", "ripple": 0.0}
+EXACT = {"mode": "bayes-tree", "ripple": 0.0}
 # Whole cliques only; as the default; every clique at every place; and a few variables moved to the root in every step.
 WAYS = {
     "whole": {"split_pivots": 10**9, "split_share": 1.0},
@@ -119,7 +119,7 @@ def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: s
 
 def test_what_is_left_undone_does_not_add_up() -> None:
     """χ² along 800 steps, beside a tree that leaves nothing undone."""
-    solvers = {ripple: Solver(Options(mode="tree", ripple=ripple)) for ripple in (0.0, 0.05, 2.0)}
+    solvers = {ripple: Solver(Options(mode="bayes-tree", ripple=ripple)) for ripple in (0.0, 0.05, 2.0)}
     ratios = []
     for n, step in enumerate(manhattan(800, 9)):
         for one in solvers.values():
@@ -136,7 +136,7 @@ def test_what_is_left_undone_does_not_add_up() -> None:
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6))
 def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool]) -> None:
-    tried, spared = Solver(Options(mode="tree")), Solver(Options(mode="tree"))
+    tried, spared = Solver(Options(mode="bayes-tree")), Solver(Options(mode="bayes-tree"))
     for n, batch in enumerate(random_steps(seed, steps=6)):
         for solver in (tried, spared):
             solver.stage(batch)
@@ -178,7 +178,7 @@ ROUGH = {"sigma_xy_m": 0.05, "sigma_theta_rad": 0.03}
     ("world", "noise", "worst"), [(manhattan, {}, 1.02), (city_trees, {}, 1.002), (city_trees, ROUGH, 1.002)]
 )
 def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, float], worst: float) -> None:
-    solver, ratios = Solver(Options(mode="tree")), []
+    solver, ratios = Solver(Options(mode="bayes-tree")), []
     for n, step in enumerate(world(400, 3, **noise)):
         solver.stage(step.batch)
         report = solver.step()
@@ -194,7 +194,7 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, 
 
 def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
     """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.16)."""
-    solver, ratios = Solver(Options(mode="tree")), []
+    solver, ratios = Solver(Options(mode="bayes-tree")), []
     for n, step in enumerate(manhattan(600, 11)):
         solver.stage(step.batch)
         solver.step()
@@ -237,7 +237,7 @@ def test_a_long_drive_does_not_drift() -> None:
 
 
 def test_changed_are_the_variables_with_other_bits() -> None:
-    solver, known = Solver(Options(mode="tree")), {}
+    solver, known = Solver(Options(mode="bayes-tree")), {}
     for step in manhattan(200, 7):
         solver.stage(step.batch)
         solver.step()
@@ -258,7 +258,7 @@ def test_a_step_that_would_raise_chi2_is_replaced_by_a_batch() -> None:
         np.tile([1.0, 0.0, 2 * np.pi / n], (n, 1)),
         np.tile([100.0, 0, 0, 100.0, 0, 1000.0], (n, 1)),
     )
-    solver = Solver(Options(mode="tree", place_new=False))
+    solver = Solver(Options(mode="bayes-tree", place_new=False))
     fixed = Variables("se2", np.array([0]), wild[:1], fixed=True)
     solver.stage(Batch((fixed, Variables("se2", np.arange(1, n), wild[1:])), (edges,)))
     first = DenseGraph()

@@ -101,7 +101,7 @@ def test_a_password_does_instead_of_a_certificate_and_appears_nowhere(
     assert denied.returncode == 4
     service.end()
     said = "".join(log.read_text() for log in tmp_path.glob("*.log"))
-    assert "map kitchen, mode tree" in said
+    assert "map kitchen, mode bayes-tree" in said
     assert SECRET not in said + told.stdout + told.stderr + denied.stdout + denied.stderr
 
 

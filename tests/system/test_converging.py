@@ -26,7 +26,7 @@ from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 
 # With so many further steps, and more, for the map that is LONG and only goes downhill.
-MODES = {"all-batch": 20, "inc-l": 20, "tree": 0}
+MODES = {"all-batch": 20, "inc-l": 20, "bayes-tree": 0}
 # The first finishes in a few steps, the second in hundreds of short ones.
 SHORT, LONG = (200, 90.0), (1000, 90.0)
 
@@ -95,7 +95,7 @@ def test_a_map_left_alone_comes_to_its_optimum(services: Callable[..., Services]
     with alone(services, tmp_path / "j", mode) as (_, joined):
         deltas = turn(joined, LONG)
         joined.wait_converged(PATIENCE_S)
-        assert not (mode != "tree" and deltas.all[0].report["converged"])
+        assert not (mode != "bayes-tree" and deltas.all[0].report["converged"])
         check_left_alone(joined, deltas)
         assert [delta.previous for delta in deltas.all] == [delta.revision - 1 for delta in deltas.all]
         assert deltas.further() == deltas.all[1:]
@@ -111,7 +111,7 @@ def test_a_map_left_alone_comes_to_its_optimum(services: Callable[..., Services]
         assert joined.chi2().chi2 == pytest.approx(optimum(*LONG), rel=1e-6)
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_a_map_that_has_converged_is_polished_when_it_is_left_alone(endpoint: str, mode: str, world: str) -> None:
     """To a millionth of χ²; `converged` allows a thousandth."""
@@ -135,7 +135,7 @@ def test_a_map_that_has_converged_is_polished_when_it_is_left_alone(endpoint: st
         assert joined.settle(PATIENCE_S).revision == revision + 1, "nothing has happened since"
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
 def test_killed_before_it_is_polished_it_comes_to_the_same_bits(
     services: Callable[..., Services], tmp_path: Path, mode: str
 ) -> None:

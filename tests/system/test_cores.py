@@ -28,7 +28,7 @@ def test_what_was_made_on_several_cores_is_what_one_core_makes(
     running = services(tmp_path / "journal", "cores=2", "reorder=0.0")
     with (
         connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
-        bus.map("m2", "tree", window=32) as map_,
+        bus.map("m2", "bayes-tree", window=32) as map_,
     ):
         stream = Stream(map_, batches)
         stream.start()

@@ -61,7 +61,7 @@ def later(n: int) -> Draft:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 def test_a_fork_is_the_same_to_the_bit_and_goes_on_by_itself(endpoint: str, mode: str) -> None:
     name, what_if = f"original-{mode}", f"what-if-{mode}"
     with connect(endpoint, client="forker", timeout_s=60) as bus, bus.map(name, mode) as original:
@@ -193,7 +193,7 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
 
 
 def test_a_fork_for_which_there_is_no_memory_takes_none() -> None:
-    folder = make_folder("tree", {}, 7, Limits())
+    folder = make_folder("bayes-tree", {}, 7, Limits())
     assert folder._copied(0).bytes > 0
     assert folder._copied(0).state is None
     assert folder._copied(1 << 40).state is not None

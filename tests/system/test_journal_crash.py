@@ -23,7 +23,9 @@ EACH = 120  # inserts let loose before a kill
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("mode", "window", "kills"), [("inc-l", 32, KILLS), ("tree", 32, KILLS // 3), ("inc-l", 1, 4)])
+@pytest.mark.parametrize(
+    ("mode", "window", "kills"), [("inc-l", 32, KILLS), ("bayes-tree", 32, KILLS // 3), ("inc-l", 1, 4)]
+)
 def test_killed_at_any_moment_nothing_answered_is_lost_and_nothing_is_done_twice(
     services: Callable[..., Services], tmp_path: Path, mode: str, window: int, kills: int
 ) -> None:

@@ -28,7 +28,7 @@ def test_killed_after_another_solver_took_the_place_it_comes_back_as_it_was(
     running = services(tmp_path / "journal", "reorder=0.01", "snapshot_s=0.02", f'durability="{durability}"')
     with (
         connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
-        bus.map("m2", "tree", window=32) as driven,
+        bus.map("m2", "bayes-tree", window=32) as driven,
     ):
         stream = Stream(driven, batches)
         stream.start()

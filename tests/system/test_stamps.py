@@ -84,7 +84,7 @@ def test_many_in_one_insert_and_large_ones_are_as_small_ones(endpoint: str, join
     everywhere(endpoint, joined, {"x0": 0} | {f"x{n}": n * n for n in range(1, 1500, 2)})
 
 
-@pytest.mark.parametrize("mode", ["tree", "inc-l", "all-batch"])
+@pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
 def test_undone_marginalised_removed_and_brought_back(endpoint: str, mode: str) -> None:
     with (
         connect(endpoint, client="timed", timeout_s=PATIENCE_S) as bus,
@@ -189,6 +189,6 @@ def test_a_trajectory_has_its_nanoseconds(
     joined.insert(drafts(4)[3])
     exported = joined.ask.export("tum", None).result()
     assert exported.text.splitlines()[-1].split()[0] == lines[-1].split()[0]
-    assert exported.notes == ("1 poses left out: others have a time stamp and x3 none",)
+    assert exported.notes == ("1 pose left out: x3 has no time stamp, and others have one",)
     g2o = joined.ask.export("g2o", None).result()
     assert any("time stamps left out" in note for note in g2o.notes)

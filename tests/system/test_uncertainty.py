@@ -48,7 +48,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         process.end()
 
 
-@pytest.fixture(params=["tree", "inc-l"])
+@pytest.fixture(params=["bayes-tree", "inc-l"])
 def square(endpoint: str, request: pytest.FixtureRequest) -> Iterator[tuple[Map, Solver]]:
     """A map on the bus, and a solver in the same mode with the same inserts."""
     twin = Solver(Options(mode=request.param))
@@ -150,7 +150,7 @@ def test_refusals_carry_their_codes(square: tuple[Map, Solver], named: list[str]
 
 
 def test_an_empty_map_has_no_last_pose(endpoint: str) -> None:
-    with connect(endpoint, client="asker") as bus, bus.map("empty", "tree") as empty:
+    with connect(endpoint, client="asker") as bus, bus.map("empty", "bayes-tree") as empty:
         with pytest.raises(Refused) as refused:
             empty.doubt.last()
         assert refused.value.code == "unknown_variable"
@@ -210,6 +210,9 @@ def test_the_command_line_asks(endpoint: str, square: tuple[Map, Solver], tmp_pa
     assert ran.returncode == 0, ran.stderr
     assert "between_se2 (x2, x6)" in ran.stdout
     ran = ask("why", name, "x4", *at)
+    for term in ("smallest pivot of R", "smallest R²ᵢᵢ/Λᵢᵢ", "leverage ", "Its factors, by id"):
+        assert term in ran.stdout
+    assert " step " not in ran.stdout.replace("the last step", ""), "a step has another number than the revision"
     assert ran.returncode == 0, ran.stderr
     assert "because" in ran.stdout
     ran = ask("why", name, "3", *at, "--json")

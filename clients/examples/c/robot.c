@@ -4,6 +4,7 @@
  */
 #define _POSIX_C_SOURCE 200809L
 #include "messagepack.h"
+#include "versions.h"
 #include "zenoh.h"
 
 #include <inttypes.h>
@@ -15,7 +16,8 @@
 /* Nanoseconds of a variable without a time stamp, §4. */
 #define NO_STAMP INT64_MIN
 
-enum { POSES = 5, TRY_MS = 10000, TRIES = 20, FIRST_PAUSE_MS = 100, LONGEST_PAUSE_MS = 1000, PATIENCE_MS = 10000 };
+enum { POSES = 5, TRY_MS = 10000, TRIES = 20, FIRST_PAUSE_MS = 100, LONGEST_PAUSE_MS = 1000, PATIENCE_MS = 10000,
+       SILENCES = 3 /* in a row, 0.3 s, are worth a look for services of other versions */ };
 
 static const double SIDE[3] = {1.0, 0.02, 1.55}, HOME[3] = {0.0, 0.0, 0.0};
 /* Upper triangles: 5 cm and 0.03 rad; 1 cm and 0.01 rad. */
@@ -33,6 +35,7 @@ typedef struct {
     z_session *bus;
     char map[65], name[16];
     uint64_t epoch, sequence;
+    bool heard; /* a service has answered: whatever else is there, it may come back */
     estimate now;
 } robot;
 
@@ -127,6 +130,7 @@ static mp_value *ask(robot *me, const char *key, const mp_buffer *message, uint8
     *bytes = NULL;
     for (int tried = 0; tried < TRIES && !message->failed; tried++) {
         z_answer answer = z_query(me->bus, key, message->bytes, message->size, TRY_MS);
+        me->heard |= answer.outcome == Z_REPLY || answer.outcome == Z_ERROR;
         if (answer.outcome == Z_REPLY) {
             *bytes = answer.payload;
             return mp_read(answer.payload, answer.size);
@@ -135,6 +139,8 @@ static mp_value *ask(robot *me, const char *key, const mp_buffer *message, uint8
         bool repeat = again(&answer, &wait_ms);
         if (!repeat || tried + 1 == TRIES) complain(key, &answer);
         free(answer.payload);
+        /* Others than ours will not answer, however often they are asked, §13. */
+        if (repeat && !me->heard && tried + 1 >= SILENCES && only_other_versions(me->bus)) return NULL;
         if (!repeat || !z_wait(me->bus, wait_ms)) return NULL;
         pause_ms = 2 * pause_ms < LONGEST_PAUSE_MS ? 2 * pause_ms : LONGEST_PAUSE_MS;
     }

@@ -20,7 +20,9 @@ enum {
     OAM = 0x1f, DECLARE = 0x1e, PUSH = 0x1d, REQUEST = 0x1c, RESPONSE = 0x1b, RESPONSE_FINAL = 0x1a, INTEREST = 0x19,
     /* … what they carry, and what is declared. */
     PUT = 0x01, DEL = 0x02, QUERY = 0x03, REPLY = 0x04, ERR = 0x05,
-    D_KEY = 0x00, D_SUBSCRIBER = 0x02, D_TOKEN = 0x06,
+    D_KEY = 0x00, D_SUBSCRIBER = 0x02, D_TOKEN = 0x06, D_FINAL = 0x1a,
+    /* Of an interest: in keys and tokens, within a key expression that follows whole. */
+    I_TOKENS = 0x09, I_WITHIN = 0x30,
     VERSION = 9, CLIENT = 2, RESOLUTION = 0x0a, /* numbers of frames and requests have 32 bits */
     LEASE_MS = 10000, BEAT_MS = 2500, OPENING_MS = 10000,
     KEYS = 256, LONGEST_KEY = 512, LARGEST = 256 << 20,
@@ -35,6 +37,10 @@ struct z_session {
     uint64_t waiting_for; /* the query that is out, 0: none */
     bool ended;           /* it has ended, or its first reply is here */
     z_answer answer;
+    uint64_t looking_for; /* the look at tokens that is out, 0: none */
+    bool looked;          /* all of them are here */
+    z_on_token on_token;
+    void *token_context;
     uint8_t *parts; /* of a message in fragments */
     size_t parts_size;
     char *keys[KEYS]; /* that the other side has given a number */
@@ -179,11 +185,12 @@ static void on_response(z_session *session, reader *in, uint8_t header)
 static void on_declare(z_session *session, reader *in, uint8_t header)
 {
     char key[LONGEST_KEY];
-    if (header & F1) number(in);
+    uint64_t interest = header & F1 ? number(in) : 0;
+    bool ours = interest > 0 && interest == session->looking_for;
     skip_extensions(in, header);
     uint8_t what = byte(in);
     bool keyed = (what & ID) == D_KEY || (what & ID) == D_SUBSCRIBER || (what & ID) == 0x04 || (what & ID) == D_TOKEN;
-    uint64_t declared = (what & ID) == 0x1a ? 0 : number(in); /* 0x1a: all has been declared */
+    uint64_t declared = (what & ID) == D_FINAL ? 0 : number(in);
     if (keyed) {
         read_key(session, in, what, key, sizeof key);
         if ((what & ID) == D_KEY && declared < KEYS && !in->bad) {
@@ -193,6 +200,8 @@ static void on_declare(z_session *session, reader *in, uint8_t header)
         }
     }
     skip_extensions(in, what);
+    if (ours && (what & ID) == D_TOKEN && !in->bad) session->on_token(session->token_context, key);
+    if (ours && (what & ID) == D_FINAL) session->looked = true;
 }
 
 static void on_interest(z_session *session, reader *in, uint8_t header)
@@ -441,6 +450,27 @@ z_answer z_query(z_session *session, const char *key, const void *payload, size_
     }
     session->waiting_for = 0;
     return session->answer;
+}
+
+bool z_look(z_session *session, const char *key, z_on_token on_token, void *context, int timeout_ms)
+{
+    writer *out = calloc(1, sizeof *out);
+    bool sent = out != NULL;
+    session->looking_for = session->next_request++;
+    session->looked = false;
+    session->on_token = on_token;
+    session->token_context = context;
+    if (sent) {
+        put_byte(out, INTEREST | F1); /* in what there is now */
+        put_number(out, session->looking_for);
+        put_byte(out, I_TOKENS | I_WITHIN);
+        put_key(out, key);
+        sent = send_message(session, out);
+    }
+    free(out);
+    bool fine = sent && pump(session, now_ms() + timeout_ms, &session->looked);
+    session->looking_for = 0;
+    return fine;
 }
 
 bool z_wait(z_session *session, int timeout_ms)

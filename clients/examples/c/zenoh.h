@@ -35,6 +35,10 @@ bool z_subscribe(z_session *session, const char *key);
 bool z_announce(z_session *session, const char *key);
 /* The first reply counts. */
 z_answer z_query(z_session *session, const char *key, const void *payload, size_t size, int timeout_ms);
+/* A liveliness token that is there. As z_on_sample, it may not use the session. */
+typedef void (*z_on_token)(void *context, const char *key);
+/* Every liveliness token that `key`, an expression with wildcards, matches. False when the connection is gone. */
+bool z_look(z_session *session, const char *key, z_on_token on_token, void *context, int timeout_ms);
 /* Lets publications in for so long. False when the connection is gone. */
 bool z_wait(z_session *session, int timeout_ms);
 

@@ -16,6 +16,11 @@ if (typeof WebSocket === "undefined") {
 }
 
 const listed = await fetch(`${root}/api/maps`).then((answer) => answer.json());
+if (listed.problem) {
+  // For example `other_protocol`: the gateway, which speaks Zenoh for us, has looked for services of other versions (§13).
+  console.error(`${listed.problem.message} [${listed.problem.code}]`);
+  process.exit(1);
+}
 const row = listed.maps.find((each) => each.name === name);
 if (!row) {
   console.error(`there is no map ${name}; there are: ${listed.maps.map((each) => each.name).join(", ") || "none"}`);

@@ -167,6 +167,11 @@ def why_command(
 ) -> int:
     """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
 
+    Residuals and χ² are at the estimate. The leverage of a factor is the trace of its part of the hat matrix,
+    tr(Ω H Σ Hᵀ), from 0 (the others determine what it measures) to the dimension of its residual (it alone does). The
+    pivots of a variable are those of the Cholesky factor R, and Λ is the information matrix: R²ᵢᵢ/Λᵢᵢ is 1 where no
+    variable that was eliminated before depends on it, and near 0 where its estimate rests on those.
+
     A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
     both are told, unless --variable or --factor says which is meant.
 
@@ -214,7 +219,7 @@ def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
 def _tell(what: str, found: Any) -> None:
     if found.variable:
         table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
-        table([(_told(each), _factor_line(each)) for each in found.variable["factors"]], title="Its factors")
+        table([(_told(each), _factor_line(each)) for each in found.variable["factors"]], title="Its factors, by id")
     else:
         table([(_told(found.factor), _factor_line(found.factor))], title=f"At revision {found.revision}")
     step = found.step
@@ -310,23 +315,22 @@ def repair_command(
 
 
 def _variable_rows(account: Any) -> list[tuple[str, str]]:
-    steps = [(name.replace("_", " "), account[name]) for name in ("linearised_step", "changed_step", "seen_step")]
     return [
         ("kind", account["kind"] + (", fixed" if account["fixed"] else "")),
         *([("time stamp", f"{account['stamp']} ns")] if account.get("stamp") is not None else []),
         ("value", "  ".join(f"{number:.6g}" for number in account["value"])),
         ("sigmas", "  ".join(f"{number:.4g}" for number in account["sigmas"])),
-        ("smallest pivot", f"{account['pivot']:.4g}, {account['conditioning']:.2g} of what its factors bring"),
-        *((name, str(step)) for name, step in steps if step >= 0),
+        ("smallest pivot of R", f"{account['pivot']:.4g}"),
+        ("smallest R²ᵢᵢ/Λᵢᵢ", f"{account['conditioning']:.2g}"),
     ]
 
 
 def _factor_line(account: Any) -> str:
     if account.get("asleep"):
-        return f"asleep: {account['asleep']}"
+        return f"inactive: {account['asleep']}"
     without, loss = account["without"], account.get("loss")
-    fall = "nothing else measures this" if without is None else f"without it χ² falls by {without:.3g}"
-    share = f"{account['influence']:.2f} of {account['dims']} known from it"
+    fall = "no redundancy: nothing else measures it" if without is None else f"without it χ² falls by {without:.3g}"
+    share = f"leverage {account['influence']:.2f} of {account['dims']}"
     if not loss:
         return f"χ² {account['chi2']:.3g}, {share}, {fall}"
     counts = f"rᵀΩr {account['chi2']:.3g}, of which {loss} counts {account['rho']:.3g} (weight {account['weight']:.2g})"

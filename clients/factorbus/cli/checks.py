@@ -16,11 +16,13 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from factorbus.cli.exits import EXTRAS, Stopped, lacking
+from factorbus.cli.installing import install_command
 from factorbus.cli.options import USUAL_ENDPOINT
 from factorbus.cli.version import LIBRARIES, installed
 from factorbus.ownership import UnsafeFolder, check_folder, make_private
 from factorbus.proto.problems import Problem
 from factorbus.proto.version import __version__
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,21 +45,21 @@ def libraries() -> Finding:
     have = {name: installed(name) for name in LIBRARIES}
     seen = ", ".join([f"factorbus {__version__}", *(f"{name} {version}" for name, version in have.items() if version)])
     if lacking("service"):
-        mend = "fine for a front end; for solver and workers: pip install 'factorbus[service]'"
+        mend = f"fine for a front end; for solver and workers: {install_command('service')}"
         return Finding("libraries", "warn", f"{seen}; a light client without the solver", mend)
     if lacking("viz"):
-        return Finding("libraries", "warn", f"{seen}; no pictures", "pip install 'factorbus[viz]'")
+        return Finding("libraries", "warn", f"{seen}; no pictures", install_command("viz"))
     return Finding("libraries", "ok", seen)
 
 
 def cholmod() -> Finding:
     """SuiteSparse's CHOLMOD and its BLAS"""
     if find_spec("sksparse") is None:
-        return Finding("cholmod", "warn", "scikit-sparse is not installed", "pip install 'factorbus[service]'")
+        return Finding("cholmod", "warn", "scikit-sparse is not installed", install_command("service"))
     try:
         import sksparse.cholmod  # noqa: F401
     except ImportError as error:
-        mend = "pip install --force-reinstall --no-binary scikit-sparse 'factorbus[service]'"
+        mend = "pip install --force-reinstall --no-deps --no-binary scikit-sparse scikit-sparse==0.4.16"
         return Finding("cholmod", "fail", f"scikit-sparse does not load: {error}", mend)
     mapped = _mapped_libraries()
     library = next((path for path in mapped if "libcholmod" in path), None)
@@ -88,7 +90,7 @@ def cache() -> Finding:
     compiled = sum(1 for _ in folder.glob("kernels/*/*.nbc"))
     if not compiled:
         return Finding("kernel cache", "warn", f"{folder}: empty", "factorbus warm compiles ahead")
-    return Finding("kernel cache", "ok", f"{folder}: {compiled} compiled kernels, {free >> 30} GiB free")
+    return Finding("kernel cache", "ok", f"{folder}: {counted(compiled, 'compiled kernel')}, {free >> 30} GiB free")
 
 
 def port() -> Finding:
@@ -105,7 +107,9 @@ def port() -> Finding:
 
     try:
         with connect(USUAL_ENDPOINT, client="doctor", timeout_s=3) as bus:
-            return Finding("port", "ok", f"{number} is taken by a factorbus service with {len(bus.maps())} maps")
+            return Finding(
+                "port", "ok", f"{number} is taken by a factorbus service with {counted(len(bus.maps()), 'map')}"
+            )
     except Problem:
         mend = f"stop what listens there (ss -ltnp 'sport = :{number}'), or factorbus serve --listen tcp/127.0.0.1:7448"
         return Finding("port", "warn", f"{number} is taken by something that is no factorbus service", mend)
@@ -114,7 +118,7 @@ def port() -> Finding:
 def bus() -> Finding:
     """a round trip over the bus"""
     if lacking("service"):
-        return Finding("bus", "warn", "not tried: it needs a solver process", "pip install 'factorbus[service]'")
+        return Finding("bus", "warn", "not tried: it needs a solver process", install_command("service"))
     from factorbus.cli.children import service
     from factorbus.client import connect
 
@@ -163,7 +167,7 @@ def machine() -> Finding:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     load = os.getloadavg()[0]
-    seen = f"{cores} cores, load {load:.1f}, {files} open files allowed"
+    seen = f"{counted(cores, 'core')}, load {load:.1f}, {counted(files, 'open file')} allowed"
     if cores < 2:
         return Finding("machine", "warn", seen, "one core is shared by solver and bus: expect jitter")
     if files < 1024:
@@ -192,7 +196,7 @@ def extras() -> Finding:
     have = [name for name in EXTRAS if not lacking(name)]
     missing = [name for name in EXTRAS if name not in have]
     seen = f"{', '.join(have) or 'none'} installed" + (f"; without {', '.join(missing)}" if missing else "")
-    mend = f"if wanted: pip install 'factorbus[{','.join(missing)}]'" if missing else ""
+    mend = f"if wanted: {install_command(*missing)}" if missing else ""
     return Finding("extras", "ok", seen, mend)
 
 

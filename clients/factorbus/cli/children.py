@@ -17,6 +17,10 @@ from factorbus.cli.exits import Stopped
 from factorbus.proto.problems import Unavailable
 
 READY = "ready "
+# What is said before a process is started that computes.
+STARTING = (
+    "starting the solver process; kernels that are not compiled yet come first, once on a machine: one to five minutes"
+)
 _STOP_S = 20.0
 _LONG_S = 3.0
 

@@ -12,6 +12,7 @@ import click
 from factorbus.cli.exits import require
 from factorbus.cli.options import WORLDS, json_option, out_option
 from factorbus.cli.starts import optimum_from
+from factorbus.wording import counted
 
 _COMPARISONS = 10
 
@@ -78,12 +79,12 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
     if as_json:
         screen.document(result)
     else:
-        screen.table(_rows(result), title=f"{result['world']}, {result['poses']} poses")
+        screen.table(_rows(result), title=f"{result['world']}, {counted(result['poses'], 'pose')}")
 
 
 def demo(request: Request) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
-    from factorbus.cli.children import child, service, worker
+    from factorbus.cli.children import STARTING, child, service, worker
     from factorbus.cli.picture import course_of, draw
     from factorbus.cli.remote import RemoteMap
     from factorbus.cli.screen import note
@@ -93,7 +94,7 @@ def demo(request: Request) -> dict[str, Any]:
 
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note("starting the solver process (on a cold start it compiles its kernels first: a minute or two, once)")
+        note(STARTING)
         solver, endpoint = stack.enter_context(service(say=note))
         names = [f"worker{number}" for number in range(1, request.workers + 1)]
         workers = [stack.enter_context(worker(endpoint, name)) for name in names]
@@ -108,6 +109,7 @@ def demo(request: Request) -> dict[str, Any]:
             name: w.pid for name, w in zip(names, workers, strict=True)
         }
         note(f"on {endpoint}: " + ", ".join(f"{name} {pid}" for name, pid in processes.items()))
+        note(f"driving {counted(request.poses, 'pose')}; 2,000 take five to thirty seconds")
         _look_on(request, solver, robot, viewer)
         driven = json.loads(robot.output(timeout_s=60))
         viewer.wait_for(driven["revision"])
@@ -131,7 +133,9 @@ def demo(request: Request) -> dict[str, Any]:
         "plot": str(request.plot),
     }
     _write(request, estimate, world.truth)
-    subtitle = f"{result['poses']:,} poses, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
+    subtitle = (
+        f"{counted(result['poses'], 'pose')}, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
+    )
     course = course_of(reports, compared)
     draw(request.plot, world.batches, estimate, course, f"{request.world}, as the bus saw it", subtitle, world.truth)
     return result
@@ -175,15 +179,19 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     last = result["against_batch"][-1]
     by = f"{optimum_from(last['start'])}; {last['worker']}, {last['seconds'] * 1e3:.0f} ms"
     rows = [
-        ("poses", f"{result['poses']:,}" + (f", and {result['landmarks']} landmarks" if result["landmarks"] else "")),
-        ("factors", f"{result['factors']:,}, {result['loop_closures']:,} of them loop closures"),
+        (
+            "poses",
+            f"{result['poses']:,}"
+            + (f", and {counted(result['landmarks'], 'landmark')}" if result["landmarks"] else ""),
+        ),
+        ("factors", f"{result['factors']:,}, {counted(result['loop_closures'], 'loop closure')} among them"),
         ("speed", f"{result['poses_per_s']:.0f} poses/s, {result['seconds']:.1f} s in all"),
         ("step in the solver", _times(result["step_ms"])),
         ("bus, beyond the solver", _times(result["bus_ms"])),
         ("χ²", f"{result['chi2']:.8g}; {result['chi2_initial']:.4g} by odometry alone"),
         (
             "χ² / batch optimum",
-            f"{last['ratio']:.9f} at the end ({by}), at worst {max(ratios):.9f} of {len(ratios)} times",
+            f"{last['ratio']:.9f} at the end ({by}), at worst {max(ratios):.9f} of {counted(len(ratios), 'time')}",
         ),
         (
             "error against the truth",
@@ -191,14 +199,15 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         ),
     ]
     if worse := sum(each["better_optimum"] for each in result["against_batch"]):
-        rows.append(("better_optimum", f"{worse} times the map was above it by more than 1 %"))
+        rows.append(("better_optimum", f"the map was above it by more than 1 % {counted(worse, 'time')}"))
     if result["error_landmarks_m"]:
         rows.append(("landmarks' error", _metres(result["error_landmarks_m"])))
     every = "every one" if result["every_estimate_received"] else "NOT every one"
     rows += [
         (
             "estimates received",
-            f"{every}: {result['steps']:,} steps, {got['robot']:,} by the robot, {got['viewer']:,} by the viewer",
+            f"{every}: {counted(result['steps'], 'step')}, "
+            f"{got['robot']:,} by the robot, {got['viewer']:,} by the viewer",
         ),
         ("picture", result["plot"]),
     ]

@@ -8,6 +8,7 @@ import click
 
 from factorbus.cli.exits import require
 from factorbus.cli.options import Number, json_option, out_option
+from factorbus.wording import counted
 
 _RHO, _SIGMA_RHO = 0.28, 0.2  # 1/metre: anything from 1.5 metres to behind the horizon
 
@@ -52,14 +53,17 @@ def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
     if as_json:
         screen.document(result)
     else:
-        screen.table(_rows(result), title=f"a camera among {result['points']} points, {result['frames']} frames")
+        screen.table(
+            _rows(result),
+            title=f"a camera among {counted(result['points'], 'point')}, {counted(result['frames'], 'frame')}",
+        )
 
 
 def demo(
     plot: Path, frames: int, points: int, features: int, noise: float, outliers: float, seed: int, workers: int
 ) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
-    from factorbus.cli.children import service, worker
+    from factorbus.cli.children import STARTING, service, worker
     from factorbus.cli.screen import note, progress
     from factorbus.cli.sightseeing import Sightseer, verdict
     from factorbus.cli.stopping import interrupt_on_sigterm
@@ -70,7 +74,7 @@ def demo(
     world = monocular(frames, seed, points=points, sigma_pixel=noise, outlier_share=outliers)
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note("starting the service (on a cold start it compiles its kernels first: a minute or two, once)")
+        note(STARTING)
         _, endpoint = stack.enter_context(service(say=note))
         for number in range(1, workers + 1):
             stack.enter_context(worker(endpoint, f"worker{number}"))
@@ -81,7 +85,10 @@ def demo(
         with progress("the camera looks", frames) as show:
             for frame in sightseer.run():
                 seen.append(frame)
-                show(frame.number + 1, f"{len(frame.rays)} features, {frame.error_m * 100:.1f} cm from the truth")
+                show(
+                    frame.number + 1,
+                    f"{counted(len(frame.rays), 'feature')}, {frame.error_m * 100:.1f} cm from the truth",
+                )
     truth = [frame.pose[:3] for frame in world]
     result = {**verdict(seen, sightseer), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
     shares = [course.share for _, course in sightseer.ended]

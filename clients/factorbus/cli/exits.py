@@ -10,6 +10,8 @@ from typing import Any
 
 import click
 
+from factorbus.cli.installing import install_command
+
 OK, FAILED, USAGE, BAD_FILE, UNAVAILABLE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 
 EXIT_CODES = {
@@ -82,7 +84,7 @@ def require(extra: str, what: str) -> None:
         hint = " (compiles against SuiteSparse: apt-get install libsuitesparse-dev first)" if extra == "service" else ""
         raise Stopped(
             "missing_extra",
-            f"{what} needs {', '.join(missing)}, not installed here: pip install 'factorbus[{extra}]'{hint}",
+            f"{what} needs {', '.join(missing)}, not installed here: {install_command(extra)}{hint}",
             extra=extra,
         )
 

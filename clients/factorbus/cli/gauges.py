@@ -44,6 +44,7 @@ class Gauges:
         except Problem:  # dropped since the list was made
             self._joined.pop(name, None)
             return
+        present = self._joined[name].clients(_ANSWER_S)
         now = time.perf_counter()
         at, before = self._before.get((name, stats["epoch"]), (now, stats))
         self._before[name, stats["epoch"]] = now, stats
@@ -68,6 +69,8 @@ class Gauges:
         )
         for client, following in sorted(stats["clients"].items()):
             fresh = following - before["clients"].get(client, 1)  # the number that it sends next begins at 1
+            # Tokens are optional: who inserts without one is there too.
+            here = client in present or fresh > 0
             seen["clients"].append(
-                {"name": client, "map": name, "inserts": following - 1, "inserts_per_s": fresh / seconds}
+                {"name": client, "map": name, "here": here, "inserts": following - 1, "inserts_per_s": fresh / seconds}
             )

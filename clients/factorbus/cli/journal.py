@@ -10,6 +10,7 @@ import click
 from factorbus.cli import screen
 from factorbus.cli.exits import FAILED, OK, require
 from factorbus.cli.options import json_option
+from factorbus.wording import counted
 
 _MAP = click.argument("names", nargs=-1, metavar="[MAP ...]")
 _FOLDER = click.option(
@@ -103,7 +104,7 @@ def verify(names: tuple[str, ...], folder: Path) -> int:
         if differs:
             click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
         else:
-            click.echo(f"{name}: {total} folds, {revision} revisions, all the same to the bit")
+            click.echo(f"{name}: {counted(total, 'fold')}, {counted(revision, 'revision')}, all the same to the bit")
         alike = alike and not differs
     return OK if alike else FAILED
 

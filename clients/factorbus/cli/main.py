@@ -46,7 +46,7 @@ _HIDDEN = ("robot",)
 
 _EPILOG = """\b
 Start here:
-  factorbus demo                              what it looks like, in a minute
+  factorbus demo                              what it looks like; the first time it compiles, 1 to 5 minutes
   factorbus replay my.g2o --plot map.png      the same with a file of your own
   factorbus serve                             then connect with ten lines of Python
 

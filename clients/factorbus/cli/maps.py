@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.client.map import MapRow
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 @json_option
 def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
     """List the maps of the service at ENDPOINT; at a router, those of all services.
+
+    The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
 
     \b
     factorbus maps
@@ -37,4 +40,5 @@ def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
 
 
 def _told(row: "MapRow") -> str:
-    return f"{row.variables:,} variables, {row.factors:,} factors, revision {row.revision:,}, {row.mode}"
+    held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
+    return f"{held}, revision {row.revision:,}, mode {row.mode}"

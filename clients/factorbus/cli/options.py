@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
-MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "tree")
+MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "bayes-tree")
 WORLDS = ("manhattan", "city-trees", "sphere")
 
 
@@ -26,6 +26,19 @@ class ModeChoice(click.Choice):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return super().convert(str(value).replace(" ", "-"), param, ctx)
+
+
+def mode_option(command: F) -> F:
+    """--mode."""
+    return click.option(
+        "--mode",
+        type=ModeChoice(),
+        default="auto",
+        show_default=True,
+        help="How the map is solved. bayes-tree, which auto is: a step eliminates what it affects, in a tree of "
+        "cliques. inc-l: R is updated; inc-l-b10, inc-l-b100: with a batch step every 10 or 100 variables alone. "
+        "all-batch: every step factorizes anew.",
+    )(command)
 
 
 class Number(click.FloatRange):

@@ -7,8 +7,9 @@ from typing import Any, TypeVar
 import click
 
 from factorbus.cli.exits import require
-from factorbus.cli.options import ModeChoice, ellipses_option, out_option, zenoh_option
+from factorbus.cli.options import ellipses_option, mode_option, out_option, zenoh_option
 from factorbus.cli.reading import reading_options
+from factorbus.wording import counted
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -78,7 +79,7 @@ def map_command(
 @command.command("drive")
 @click.argument("source")
 @reading_options
-@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
+@mode_option
 @click.option(
     "--every",
     type=click.IntRange(0),
@@ -92,7 +93,7 @@ def drive_command(
     """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
 
     \b
-    factorbus plot drive intel --mode tree --out intel-drive.svg
+    factorbus plot drive intel --mode bayes-tree --out intel-drive.svg
     """
     from factorbus.cli.plot_source import file_of
 
@@ -112,7 +113,7 @@ def drive_command(
     reports = [step.report for step in driven.steps]
     name = Path(file.path).stem
     path = out or Path(f"{name}-drive.png")
-    about = f"{driven.poses:,} poses, {driven.factors:,} factors, mode {reports[-1]['mode']}"
+    about = f"{counted(driven.poses, 'pose')}, {counted(driven.factors, 'factor')}, mode {reports[-1]['mode']}"
     figure = drive_figure(
         course_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )

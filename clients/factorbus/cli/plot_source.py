@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factorbus.proto.messages import Batch, Variables
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
@@ -66,7 +67,8 @@ def placed(drawn: Drawn) -> Drawn:
     left = np.setdiff1d(missing, np.concatenate([np.empty(0, np.int64), *(group.keys for group in have)])).size
     composed = missing.size - left
     note(
-        f"{drawn.name}: {missing.size} variables have no value; {composed} poses are composed from odometry"
+        f"{drawn.name}: {counted(missing.size, 'variable')} without a value; "
+        f"{counted(composed, 'pose')} composed from odometry"
         + (f", {left} are not drawn (--solve places them)" if left else "")
     )
     about = "values composed from odometry" if composed == sum(g.keys.size for g in have) else drawn.about
@@ -88,7 +90,9 @@ def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
     groups = tuple(
         Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in result.values
     )
-    about = f"χ² {result.chi2:.6g}, {optimum_from(result.start, on_file)}, after {result.iterations} iterations"
+    about = (
+        f"χ² {result.chi2:.6g}, {optimum_from(result.start, on_file)}, after {counted(result.iterations, 'iteration')}"
+    )
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
 
 

@@ -7,6 +7,7 @@ import click
 
 from factorbus.cli.exits import require
 from factorbus.cli.options import Number, connect_option, out_option, zenoh_option
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from threading import Event
@@ -73,4 +74,5 @@ def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: 
         while not stop.wait(every_s) and (until is None or joined.estimate.revision < until):
             recording.take(lookout.look())
         recording.take(lookout.last_look(joined.timeout_s))
-    note(f"{path}: {recording.deltas} deltas, {recording.factors} factors, up to revision {recording.revision}")
+    what = f"{counted(recording.deltas, 'delta')}, {counted(recording.factors, 'factor')}"
+    note(f"{path}: {what}, up to revision {recording.revision}")

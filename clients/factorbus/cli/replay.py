@@ -10,9 +10,10 @@ from typing import Any
 import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
-from factorbus.cli.options import SECONDS, ModeChoice, Number, file_argument, json_option, out_option, zenoh_option
+from factorbus.cli.options import SECONDS, Number, file_argument, json_option, mode_option, out_option, zenoh_option
 from factorbus.cli.reading import read_graph, reading_options
 from factorbus.cli.starts import optimum_from
+from factorbus.wording import counted
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
 
@@ -68,7 +69,7 @@ class Request:
     help="Wait so long for a service to be there.  [default: 1 where nobody listens, else 10]",
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
-@click.option("--mode", type=ModeChoice(), default="auto", show_default=True, help="How the map is solved.")
+@mode_option
 @click.option(
     "--every",
     type=click.IntRange(0),
@@ -312,10 +313,17 @@ def _chi2_initial(steps: Any) -> float | None:
     return chi2_unsolved(steps)
 
 
+def _size(result: dict[str, Any]) -> str:
+    return ", ".join(
+        counted(result[many], one)
+        for many, one in (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))
+    )
+
+
 def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     step, bus = result["step_ms"], result["bus_ms"]
     rows = [
-        ("graph", f"{result['poses']} poses, {result['landmarks']} landmarks, {result['factors']} factors"),
+        ("graph", _size(result)),
         ("time", f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s"),
         ("solver CPU", f"{result['solver_cpu_s']:.2f} s"),
         ("step", _times(step)),

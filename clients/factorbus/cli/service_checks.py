@@ -6,6 +6,7 @@ from typing import Any
 from factorbus.cli.checks import Finding
 from factorbus.proto.problems import Problem
 from factorbus.proto.version import __version__
+from factorbus.wording import counted
 
 _WAIT_S = 5.0
 
@@ -25,10 +26,10 @@ def services(endpoint: str, zenoh: str) -> list[Finding]:
 def finding(account: Mapping[str, Any]) -> Finding:
     """The worst that `account` tells of its service."""
     name, maps = f"service {account['service']}", account["maps"]
-    told = ", ".join(f"{row['name']} ({row['variables']} variables)" for row in maps) or "no maps"
+    told = ", ".join(f"{row['name']} ({counted(row['variables'], 'variable')})" for row in maps) or "no maps"
     for state, seen, mend in _troubles(account):
         return Finding(name, state, f"{seen}; {told}", mend)
-    return Finding(name, "ok", f"alive, {told}, {len(account.get('workers', ()))} workers")
+    return Finding(name, "ok", f"alive, {told}, {counted(len(account.get('workers', ())), 'worker')}")
 
 
 def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:

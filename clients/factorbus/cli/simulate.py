@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from factorbus.cli.options import WORLDS, out_option
+from factorbus.wording import counted
 
 
 @click.command()
@@ -48,10 +49,10 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
     if out:
         graph = merged(batches)
         say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
-        screen.note(f"{out}: {poses} poses, {graph.factor_count} factors")
+        screen.note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
     if truth:
         write_tum(truth, merged(truths))
-        screen.note(f"{truth}: where the {poses} poses are")
+        screen.note(f"{truth}: {counted(poses, 'pose')}, as they are")
 
 
 def _steps(world: str, poses: int, seed: int) -> Iterator[Any]:

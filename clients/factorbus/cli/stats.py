@@ -7,21 +7,26 @@ import click
 
 from factorbus.cli.exits import FAILED, OK
 from factorbus.cli.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.proto.problems import UnknownMap
+from factorbus.wording import counted
 
 
 @click.command()
+@click.argument("name", metavar="[MAP]", required=False)
 @connect_option
 @zenoh_option
 @click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For answers.")
 @json_option
-def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
-    """Show how services are, what their maps hold, and how long steps and inserts take.
+def command(name: str | None, endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
+    """Show how services are, what their maps hold, and how long steps and inserts take; with MAP, of that map alone.
 
+    The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
     At a router every service answers. Where access control is on, ask as an operator. The exit code is 1 when a
     service says that it is not alive: one of its threads is stuck.
 
     \b
     factorbus stats
+    factorbus stats warehouse
     factorbus stats --connect tls/solver.local:7447 --zenoh ops.json5 --json
     """
     from factorbus.cli import screen
@@ -29,12 +34,27 @@ def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
 
     with open_bus(endpoint, "stats", zenoh, wait_s) as bus:
         services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
+    if name is not None:
+        services = _of_map(services, name)
     if as_json:
         screen.document({"services": services})
     else:
         for each in services:
             screen.table(_rows(each), title=f"service {each['service']}")
     return OK if all(each["alive"] for each in services) else FAILED
+
+
+def _of_map(services: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """The services that have map `name`, with its row alone.  Raises UnknownMap."""
+    found = []
+    for each in services:
+        own = {rows: [row for row in each.get(rows, ()) if row["name"] == name] for rows in ("maps", "unopened")}
+        if any(own.values()):
+            found.append(each | own)
+    if not found:
+        rows = [row for each in services for row in (*each["maps"], *each.get("unopened", ()))]
+        raise UnknownMap(name, sorted(row["name"] for row in rows))
+    return found
 
 
 def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -57,11 +77,13 @@ def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _map(row: Mapping[str, Any]) -> str:
     inserts = row["inserts"]
     lines = [
-        f"{row['variables']} variables, {row['factors']} factors, revision {row['revision']}, {row['mode']}",
+        f"{counted(row['variables'], 'variable')}, {counted(row['factors'], 'factor')}, revision {row['revision']:,}, "
+        f"mode {row['mode']}",
         f"χ² {row['chi2']:.6g}, {_convergence(row)}; {_steps(row['strategies'])}",
         f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
-        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; {row['clients']} clients",
+        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
+        f"{counted(row['clients'], 'client')}",
         *(f"{name}: {value}" for name, value in row.get("journal", {}).items()),
     ]
     return "\n".join(lines)
@@ -69,7 +91,7 @@ def _map(row: Mapping[str, Any]) -> str:
 
 def _convergence(row: Mapping[str, Any]) -> str:
     state = "converged" if row["converged"] else "not converged"
-    so_far = f" after {row['further_steps']} further steps"
+    so_far = f" after {counted(row['further_steps'], 'further step')}"
     if row["converging"]:
         return f"{state}, converging,{so_far}"
     return f"{state}{so_far}: gave up, as {row['gave_up']}" if row["gave_up"] else state

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from factorbus.cli.options import Number, connect_option, json_option, zenoh_option
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -29,10 +30,12 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
 
     \b
     In the tables:
+      mode       how the map is solved, see factorbus replay --help
       steps/s    steps since the look before; inserts/s: accepted inserts
       step ms    solver's time of a step, mean since the look before
       χ²         converging: left alone, the map goes on by itself to its optimum; gave up: it does not
       waiting    inserts that are accepted by no step yet, and those parked behind a gap
+      client     those that are there; gone: those that have left, whose inserts are in the map
       answer ms  from asking for these numbers to having them, over the bus
     """
     from factorbus.cli import screen
@@ -40,6 +43,12 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
     from factorbus.cli.gauges import Gauges
     from factorbus.cli.stopping import stop_on_signals
 
+    console = _console()
+    if not (once or as_json or _can_redraw(console)):
+        raise click.UsageError(
+            "top draws its tables over each other, for which standard output has to be a terminal; "
+            "take --once for one look, or --json for a program"
+        )
     with stop_on_signals(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
         gauges = Gauges(bus)
         seen = gauges.read()
@@ -49,11 +58,11 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
             if as_json:
                 screen.document(seen)
             else:
-                _console().print(_view(seen, endpoint))
+                console.print(_view(seen, endpoint))
             return
         from rich.live import Live
 
-        with Live(_view(seen, endpoint), console=_console(), screen=True, auto_refresh=False) as live:
+        with Live(_view(seen, endpoint), console=console, screen=True, auto_refresh=False) as live:
             while not stop.wait(every_s):
                 live.update(_view(gauges.read(), endpoint), refresh=True)
 
@@ -63,6 +72,10 @@ def _console() -> Any:
 
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=120)
+
+
+def _can_redraw(console: Any) -> bool:
+    return console.is_terminal and not console.is_dumb_terminal
 
 
 def _view(seen: dict[str, Any], endpoint: str) -> "RenderableType":
@@ -105,8 +118,17 @@ def _convergence(row: dict[str, Any]) -> str:
 def _clients(seen: dict[str, Any]) -> "RenderableType":
     table = _table("client", "map", "inserts", "inserts/s")
     for row in seen["clients"]:
-        table.add_row(row["name"], row["map"], f"{row['inserts']:,}", f"{row['inserts_per_s']:.1f}")
+        if row["here"]:
+            table.add_row(row["name"], row["map"], f"{row['inserts']:,}", f"{row['inserts_per_s']:.1f}")
+    gone = [row for row in seen["clients"] if not row["here"]]
+    if gone:
+        table.caption = f"{counted(len(gone), 'client')} gone, after {counted(_inserts(gone), 'insert')}"
+        table.caption_justify = "left"
     return table
+
+
+def _inserts(rows: list[dict[str, Any]]) -> int:
+    return sum(row["inserts"] for row in rows)
 
 
 def _workers(seen: dict[str, Any]) -> "RenderableType":

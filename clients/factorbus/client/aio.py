@@ -243,6 +243,10 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.stats(timeout_s))
 
+    async def clients(self, timeout_s: float | None = None) -> set[str]:
+        """Names of the clients that have joined the map and not left it, of those that tell."""
+        return await asyncio.to_thread(self._map.clients, timeout_s)
+
     async def export(
         self,
         format: str = "g2o",

@@ -210,5 +210,6 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         state=fields.text(where, content, "state", default="open"),
         problem=fields.text(where, content, "problem", default=""),
         protocol=fields.mapping(where, content, "protocol"),
+        converged=fields.flag(where, content, "converged") if "converged" in content else None,
         converging=fields.flag(where, content, "converging"),
     )

@@ -19,6 +19,7 @@ from factorbus.client.promise import Promise
 from factorbus.client.replies import Again, Reply, Silence, judge
 from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import Problem, Refused, Unavailable
+from factorbus.wording import counted
 
 # An unanswered try is repeated after this long: a step may take longer, but then repeating costs little.
 TRY_S = 5.0
@@ -131,7 +132,8 @@ class Courier:
             self._finish(errand, verdict)
 
     def _put_back(self, errand: Errand, again: Again) -> None:
-        errand.because = f"{again.because} on {errand.key} ({len(errand.payload)} bytes sent, {errand.attempt} tries)"
+        sent = f"{counted(len(errand.payload), 'byte')} sent, {counted(errand.attempt, 'try', 'tries')}"
+        errand.because = f"{again.because} on {errand.key} ({sent})"
         at = time.monotonic() + again.pause_s
         if errand.deadline is not None and at >= errand.deadline:
             self._finish(errand, Unavailable(errand.what, self._waited(errand), errand.because))

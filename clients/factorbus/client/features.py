@@ -28,6 +28,7 @@ from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
 from factorbus.proto.segments import PAGE
+from factorbus.wording import counted
 
 # A smaller answer is sooner sent than shared memory is made for it.
 _SHARED_FROM_BYTES = 64 << 10
@@ -129,7 +130,7 @@ class Features:
         started = time.monotonic()
         service = self._service or self._any_service(timeout_s)
         left = max(0.001, timeout_s - (time.monotonic() - started))
-        what = f"service {service}, asked for {ask.sighting.count} features,"
+        what = f"service {service}, asked for {counted(ask.sighting.count, 'feature')},"
         return self._courier.carry(Errand(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
 
     def _any_service(self, timeout_s: float) -> str:

@@ -14,6 +14,7 @@ from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Factors
 from factorbus.proto.problems import BadInformation, BadLoss, BadShape, UnknownKind
 from factorbus.proto.symbols import format_symbol
+from factorbus.wording import counted
 
 _SPACE = (6, 7)  # numbers of an idp and of an se3: what is with them and has three is a point3
 _BY_SIZE = {2: "point2", 3: "se2", 6: "idp", 7: "se3"}
@@ -48,7 +49,7 @@ def linear_pieces(
         information = _filled(triangle, b.size, min(dims))
         return [Factors(*piece[:3], information[None], loss, np.array([scale]) if loss else None)]
     if loss:
-        limit = f"{min(dims)} rows" if len(keys) <= 2 else "two variables"
+        limit = counted(min(dims), "row") if len(keys) <= 2 else "two variables"
         raise BadLoss(where, repr(loss), f"none: a linear factor of more than {limit} is sent in pieces")
     root = _root(where, full(triangle, b.size))
     return [Factors(*piece) for piece in as_pieces(names, np.array(keys), y, root @ H, root @ b)]

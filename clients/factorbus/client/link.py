@@ -72,17 +72,21 @@ class Link:
 
     def ask_versions(self, timeout_s: float, done: Callable[[set[str]], None]) -> None:
         """Which versions of the protocol do services speak that are there?  `done` is called once."""
+        self.ask_tokens(
+            keys.ANY_SERVICE_OF_ANY_VERSION, timeout_s, lambda found: done(set(map(keys.version_of, found)))
+        )
+
+    def ask_tokens(self, token: str, timeout_s: float, done: Callable[[set[str]], None]) -> None:
+        """Which liveliness tokens that `token` matches are alive?  `done` is called once."""
         found: set[str] = set()
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                found.add(keys.version_of(str(reply.ok.key_expr)))
+                found.add(str(reply.ok.key_expr))
 
         with suppress(zenoh.ZError):  # it is closed
             self._session.liveliness().get(
-                keys.ANY_SERVICE_OF_ANY_VERSION,
-                Callback(on_reply, drop=lambda: done(found), indirect=False),
-                timeout=timeout_s,
+                token, Callback(on_reply, drop=lambda: done(found), indirect=False), timeout=timeout_s
             )
 
     def _query(

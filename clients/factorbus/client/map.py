@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any
 
 from numpy.typing import ArrayLike
@@ -28,6 +29,7 @@ from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Estimate, Graph, Insert
 from factorbus.proto.problems import NotSupported, Problem, Refused, TooLarge, Unavailable
+from factorbus.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,8 @@ class MapRow:
     state: "open"; "blocked" while its journal cannot be written; anything else: it is on disk and does not open
     (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
-    list of maps.  converging: it takes further steps by itself, unless an insert comes.
+    list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
+    itself, unless an insert comes.
     """
 
     name: str
@@ -49,6 +52,7 @@ class MapRow:
     state: str = "open"
     problem: str = ""
     protocol: Mapping[str, Any] = field(default_factory=dict)
+    converged: bool | None = None
     converging: bool = False
 
 
@@ -205,7 +209,7 @@ class Map:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
                 raise Unavailable(
-                    f"map {self.name!r}", timeout_s, f"{left} inserts are unanswered and still being sent"
+                    f"map {self.name!r}", timeout_s, f"{counted(left, 'insert')} without an answer, still being sent"
                 )
             refused = self._window.take_refused()
         for ticket, refusal in refused:
@@ -266,6 +270,13 @@ class Map:
         """What the service counts and times about this map.  Raises Refused, Unavailable."""
         return self.ask.stats(timeout_s).result()
 
+    def clients(self, timeout_s: float | None = None) -> set[str]:
+        """Names of the clients that have joined the map and not left it, of those that tell; this one is among them."""
+        came: SimpleQueue[set[str]] = SimpleQueue()
+        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        self._link.ask_tokens(keys.any_client_token(self.name), timeout_s, came.put)
+        return set(map(keys.client_of, came.get()))
+
     def export(
         self,
         format: str = "g2o",
@@ -298,6 +309,9 @@ class Map:
         """Start the live estimate and wait for it.  Raises Unavailable."""
         mirror = Mirror(self._link, self.name, self.timeout_s)
         self._mirror = mirror
+        row = self._row
+        if row.converged or row.converging:  # neither: the map gave up, and the row does not say why
+            mirror.expect_convergence(row.epoch, row.revision, bool(row.converged), row.converging)
         mirror.start(self._stack)
 
     def watch_owner(self) -> None:
@@ -312,7 +326,7 @@ class Map:
         two processes that use the same name by mistake do not answer for each other.
         """
         self.name, self.mode, self.epoch = row.name, row.mode, row.epoch
-        self._protocol = row.protocol
+        self._row, self._protocol = row, row.protocol
         self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)
         self._window: Window[Ticket] = Window(self._size)
@@ -368,7 +382,7 @@ class Map:
         if self._closed:
             raise Unavailable(f"map {self.name!r}", 0.0, "it was closed here; open it again")
         if not room:
-            hint = f"{self._size} inserts are unanswered (window={self._size}); this one was not sent"
+            hint = f"{counted(self._size, 'insert')} without an answer (window={self._size}); this one was not sent"
             raise Unavailable(f"map {self.name!r}", timeout_s, hint)
 
     def _give_up(self, hint: str) -> None:

@@ -76,6 +76,7 @@ class Mirror:
         self._asking, self._probing, self._silences = False, False, 0
         self._ask_at = 0.0
         self._gave_up = ""  # why the map does not go on converging
+        self._foretold: tuple[int, int, dict[str, Any]] = (0, 0, {})  # epoch, revision, and how far it had converged
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
 
@@ -119,7 +120,7 @@ class Mirror:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the map had converged at `revision`; None: not known, until the next step or for a second."""
+        """Whether the map had converged at `revision`; None: the service is being asked, after a resynchronisation."""
         return self._following.converged
 
     @property
@@ -198,6 +199,7 @@ class Mirror:
             stack.enter_context(self._link.listening(key, lambda data, word=word: self._hear(word, data)))
         self._inbox.put(("ask", None))
         self.wait_for(0)
+        self._try_wait(lambda: self.converged is not None or not self._probing, _ANSWER_S)
 
     def owner(self, token: str, alive: bool) -> None:
         """A service came to own the map, or went: from the bus's thread."""
@@ -207,6 +209,10 @@ class Mirror:
         """`revision` exists: until it is here, the values are stale."""
         if epoch == self._following.epoch:
             self._expected = max(self._expected, revision)
+
+    def expect_convergence(self, epoch: int, revision: int, converged: bool, converging: bool) -> None:
+        """What the service has said of a revision, before `start`: an estimate message does not say it."""
+        self._foretold = (epoch, revision, {"converged": converged, "converging": converging})
 
     # From here on: callbacks of the bus, which only hand over, and the mirror's own thread.
 
@@ -303,6 +309,10 @@ class Mirror:
             if estimate.epoch != self._following.epoch:
                 self._expected = 0
             news = self._following.estimate(estimate, tables)
+            if self._foretold[:2] == (self.epoch, self.revision) and self.converged is None:
+                self._following.take_convergence(self._foretold[2])
+            if self._following.live and self.converged is None:
+                self._probe()
             self._confirm()
         self._tell(news)
 
@@ -324,22 +334,24 @@ class Mirror:
             self._query("stats", b"", "probed")
 
     def _take_probe(self, reply: Reply) -> None:
-        self._probing = False
-        if isinstance(reply, TimedOut):
-            return  # the service is there and busy
-        if not isinstance(reply, Answer):
-            self._lose()
-            return
+        with self._lock:
+            self._probing = False
+            if isinstance(reply, Answer):
+                self._compare(reply)
+            elif not isinstance(reply, TimedOut):  # else the service is there and busy
+                self._lose()
+            self._changed.notify_all()
+
+    def _compare(self, reply: Answer) -> None:
         told = read_map("stats", reply.payload, ANSWER_LIMITS)
         epoch, revision = fields.integer("stats", told, "epoch"), fields.integer("stats", told, "revision")
-        with self._lock:
-            if epoch != self._following.epoch:
-                self._following.lost()
-            self._expected = max(self._expected, revision)
-            if not self.stale:
-                if revision == self.revision:
-                    self._take_convergence(told)
-                self._confirm()
+        if epoch != self._following.epoch:
+            self._following.lost()
+        self._expected = max(self._expected, revision)
+        if not self.stale:
+            if revision == self.revision:
+                self._take_convergence(told)
+            self._confirm()
 
     def _take_convergence(self, told: Mapping[str, Any]) -> None:
         self._following.take_convergence(told)

@@ -37,6 +37,7 @@ from factorbus.proto.asking import (
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors
 from factorbus.proto.problems import BadShape, Unavailable
+from factorbus.wording import counted
 
 T = TypeVar("T")
 
@@ -163,7 +164,7 @@ def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, 
     if not isinstance(candidates, Batch):
         return tuple(candidates)
     if candidates.variable_count:
-        raise BadShape("candidates", f"{candidates.variable_count} variables among them", "factors only")
+        raise BadShape("candidates", f"{counted(candidates.variable_count, 'variable')} among them", "factors only")
     return candidates.factors
 
 

@@ -10,6 +10,7 @@ nothing from `next` on.  Then no further insert is sent until all are answered, 
 from typing import Generic, TypeVar
 
 from factorbus.proto.problems import Problem
+from factorbus.wording import counted
 
 T = TypeVar("T")
 
@@ -19,7 +20,7 @@ class Window(Generic[T]):
 
     def __init__(self, size: int) -> None:
         if size < 1:
-            raise ValueError(f"window of {size} inserts; wanted at least 1")
+            raise ValueError(f"window of {counted(size, 'insert')}; wanted at least 1")
         self.size = size
         self.last = 0
         self._unanswered: dict[int, T] = {}

@@ -12,6 +12,7 @@ from urllib.parse import quote, urlsplit
 from factorbus.datasets.catalogue import Source
 from factorbus.datasets.errors import BadAddress, BrokenDownload, HttpStatus, Unreachable, cannot_write
 from factorbus.proto.version import __version__
+from factorbus.wording import counted
 
 GITHUB = "https://raw.githubusercontent.com"
 
@@ -67,7 +68,7 @@ def _store(answer: Any, url: str, target: Path, progress: Progress | None) -> No
             if progress:
                 progress(done, total)
     if total is not None and done != total:  # read(n) ends silently where the connection does
-        raise BrokenDownload(url, f"the connection was cut after {done} bytes", f"{total} bytes")
+        raise BrokenDownload(url, f"the connection was cut after {counted(done, 'byte')}", counted(total, "byte"))
 
 
 class _writing:  # noqa: N801

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from factorbus.datasets.errors import BadSource
 from factorbus.datasets.weights import from_covariance, from_root
+from factorbus.wording import counted
 
 # A vertex of a graph: ("x", id) for a pose, ("l", id) for a landmark; some sources number the two separately.
 Vertex = tuple[str, int]
@@ -61,7 +62,7 @@ def read_lines(form: str, file: str, content: bytes) -> Iterator[VertexLine | Ed
 def _line(file: str, number: int, name: str, record: _Record, words: list[str]) -> VertexLine | EdgeLine:
     ids, values, weights = record.widths
     if len(words) != sum(record.widths):
-        raise BadSource(file, number, f"{name} with {len(words)} fields", f"{sum(record.widths)}")
+        raise BadSource(file, number, f"{name} with {counted(len(words), 'field')}", f"{sum(record.widths)}")
     if not all(word.isdigit() for word in words[:ids]) or not all(map(_finite, words[ids:])):
         raise BadSource(file, number, f"{name} with a field that is no number", "ids, then finite numbers")
     ends = [(kind, int(word)) for kind, word in zip(record.ends, words[:ids], strict=False)]

@@ -43,7 +43,7 @@ _PAGE = Path(__file__).parent / "page"
 _STATUS = {
     "unknown_map": 404, "unknown_variable": 404, "unknown_question": 400,
     "bad_name": 400, "bad_symbol": 400, "bad_option": 400,
-    "unavailable": 503, "shutting_down": 503,
+    "unavailable": 503, "shutting_down": 503, "other_protocol": 502,
 }  # fmt: skip
 _OPTIMUM_S = 60.0
 # Codes of a WebSocket that is closed, from the range that is the application's.

@@ -6,6 +6,7 @@ from typing import Any
 
 from factorbus.proto.asking import Why
 from factorbus.proto.symbols import format_symbol
+from factorbus.wording import counted
 
 _WORDS = {
     "se2": "a pose in the plane",
@@ -63,13 +64,17 @@ def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]]) -> 
     """In a sentence or four."""
     what = f"{name} is {_WORDS.get(account['kind'], 'of kind ' + account['kind'])}"
     if account["fixed"]:
-        return f"{what}, and fixed: it is not estimated. {len(rows)} factors lead away from it."
+        return f"{what}, and fixed: it is not estimated. {_leading(len(rows))}"
     if not rows:
         return f"{what}, and no factor holds it."
     others = sorted({key for row in rows for key in row["keys"]} - {name})
-    held = f"{what}, held by {len(rows)} factor{'s' if len(rows) > 1 else ''}"
+    held = f"{what}, held by {counted(len(rows), 'factor')}"
     held += f" to {', '.join(others[:4])}{' and others' if len(others) > 4 else ''}." if others else "."
     return f"{held} {_certainty(account)}{_fit(rows[0])}"
+
+
+def _leading(count: int) -> str:
+    return f"{counted(count, 'factor')} {'leads' if count == 1 else 'lead'} away from it."
 
 
 def _certainty(account: Mapping[str, Any]) -> str:

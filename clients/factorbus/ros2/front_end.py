@@ -22,6 +22,7 @@ from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
 from factorbus.ros2.track import Place, Sample, Track
+from factorbus.wording import counted
 
 _WAITING = 256
 _ALL_AXES = (0, 1, 2, 3, 4, 5)
@@ -272,7 +273,7 @@ def landmark_index(identity: str) -> int:
 def describe(draft: Draft) -> str:
     """What is in it, for a log."""
     keys = [format_symbol(key) for group in draft.batch().variables for key in group.keys.tolist()]
-    return f"new {', '.join(keys) or 'nothing'}, {draft.batch().factor_count} factors"
+    return f"new {', '.join(keys) or 'nothing'}, {counted(draft.batch().factor_count, 'factor')}"
 
 
 def _identity(topic: str, seen: Any) -> str:

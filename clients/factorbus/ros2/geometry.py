@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.proto.arrays import F64
+from factorbus.wording import counted
 
 # A place beyond this is none, metres: a double there is exact to a tenth of a micrometre.
 FARTHEST_M = 1e9
@@ -54,7 +55,7 @@ def from_quaternion(t: Sequence[float], quat_xyzw: Sequence[float]) -> Transform
     """From a translation and a quaternion, which is normalised.  Raises ValueError: it cannot be, or is too far."""
     numbers = np.array([*t, *quat_xyzw], np.float64)
     if numbers.shape != (7,):
-        raise ValueError(f"{len(numbers)} numbers")
+        raise ValueError(counted(len(numbers), "number"))
     norm = math.hypot(*numbers[3:].tolist())
     if not (np.abs(numbers[:3]) <= FARTHEST_M).all() or not 0.5 < norm < 2.0:
         raise ValueError(f"translation {list(t)} and quaternion {list(quat_xyzw)}")

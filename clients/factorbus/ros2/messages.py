@@ -13,6 +13,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from factorbus.ros2.problems import BadRosMessage
+from factorbus.wording import counted
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -93,4 +94,6 @@ class Messages:
         try:
             return self._store.deserialize_cdr(data, type_name)
         except (SerdeError, LookupError, ValueError, ArithmeticError, MemoryError, struct.error) as error:
-            raise BadRosMessage(topic, f"{len(data)} bytes that cannot be read ({error})", f"a {type_name}") from None
+            raise BadRosMessage(
+                topic, f"{counted(len(data), 'byte')} that cannot be read ({error})", f"a {type_name}"
+            ) from None

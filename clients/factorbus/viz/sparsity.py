@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.viz import style
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,8 +40,8 @@ def sparsity_figure(pattern: Pattern, title: str = "") -> "Figure":
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    before = f"{pattern.nnz_lambda:,} nonzeros; R would have {pattern.nnz_unordered:,}"
-    after = f"{pattern.nnz_r:,} nonzeros, {len(pattern.fill):,} blocks of fill-in"
+    before = f"{counted(pattern.nnz_lambda, 'nonzero')}; R would have {pattern.nnz_unordered:,}"
+    after = f"{counted(pattern.nnz_r, 'nonzero')}, {counted(len(pattern.fill), 'block')} of fill-in"
     same = "the same blocks, rows and columns permuted"
     panels = (
         ("Λ, in the order of keys", before, _both(pattern.inserted), None),
@@ -75,7 +76,7 @@ def _draw(axes: Any, n: int, blocks: I64, fill: I64 | None) -> None:
     _paint(image, _counts(np.concatenate([blocks, diagonal]), n, side), style.ESTIMATE)
     axes.imshow(image, extent=(0, n, n, 0), interpolation="nearest")
     axes.tick_params(length=2)
-    axes.set_xlabel(f"{n:,} block columns")
+    axes.set_xlabel(counted(n, "block column"))
 
 
 def _counts(blocks: I64, n: int, side: int) -> F64:

@@ -7,6 +7,7 @@ import numpy as np
 from factorbus.proto.arrays import F64, I64
 from factorbus.viz import style
 from factorbus.viz.sparsity import Pattern
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -56,7 +57,7 @@ def tree_figure(pattern: Pattern, touched: I64, title: str = "") -> "Figure":
         _dots(axes, places, touched, style.INK, 46, "joined by the last loop closure", marker="D")
         axes.set_axis_off()
         axes.legend(loc="lower right", markerscale=1.2)
-        about = f"{pattern.n:,} block columns; a tree {1 + int(-places[:, 1].min()):,} high"
+        about = f"{counted(pattern.n, 'block column')}; a tree {1 + int(-places[:, 1].min()):,} high"
         axes.set_title(about, loc="left", fontsize=9.5, color="#555555")
         figure.suptitle(title, x=0.012, ha="left", fontsize=13)
     return figure

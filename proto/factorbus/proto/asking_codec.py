@@ -29,6 +29,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Factors
 from factorbus.proto.problems import BadMessage, UnknownKind
+from factorbus.wording import counted
 
 # Where quantiles of χ² are numbers that can be computed with.
 _SURE = (1e-12, 1.0 - 1e-12)
@@ -52,7 +53,7 @@ def decode_ask_covariance(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskCo
     others = _keys(content, "others", needed=blocks == "cross")
     if blocks == "relative" and keys is not None:
         if keys.size % 2:
-            raise BadMessage("question.keys", f"{keys.size} keys", "pairs")
+            raise BadMessage("question.keys", counted(keys.size, "key"), "pairs")
         keys = keys.reshape(-1, 2)
     return AskCovariance(blocks, keys, others)
 
@@ -166,7 +167,7 @@ def decode_ask_associate(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskAss
     size = FACTOR_KINDS[kind].size
     measured = _read_f8("question", content, "measured", None)
     if measured.size % size:
-        raise BadMessage("question.measured", f"{measured.size} numbers", f"a multiple of {size}")
+        raise BadMessage("question.measured", counted(measured.size, "number"), f"a multiple of {size}")
     count = measured.size // size
     information = _read_f8("question", content, "information", count * FACTOR_KINDS[kind].information_size)
     return AskAssociate(
@@ -276,7 +277,7 @@ def _keys(content: Map, name: str, needed: bool) -> I64 | None:
     if value is None and not needed:
         return None
     if type(value) is not bytes or len(value) % 8:
-        seen = "missing" if value is None else f"{len(value)} bytes" if type(value) is bytes else "not a bin"
+        seen = "missing" if value is None else counted(len(value), "byte") if type(value) is bytes else "not a bin"
         raise BadMessage(name, seen, "a bin of <i8")
     return np.frombuffer(value, I8)
 
@@ -287,7 +288,7 @@ def _read_f8(where: str, content: Map, name: str, count: int | None) -> F64:
     if type(value) is not bytes or len(value) % 8:
         raise BadMessage(place, "missing or not a bin of <f8", "a bin of <f8")
     if count is not None and len(value) != 8 * count:
-        raise BadMessage(place, f"{len(value)} bytes", f"{8 * count} ({count} float64)")
+        raise BadMessage(place, counted(len(value), "byte"), f"{8 * count} ({count} float64)")
     return np.frombuffer(value, F8)
 
 
@@ -297,7 +298,7 @@ def _read_group(index: int, content: Mapping[str, Any], blocks: str) -> Covarian
     covariance = _read_f8(place, content, "covariance", None)
     dim = math.isqrt(covariance.size // len(keys)) if len(keys) else 0
     if covariance.size != len(keys) * dim * dim:
-        raise BadMessage(f"{place}.covariance", f"{covariance.size} numbers", f"{len(keys)} squares")
+        raise BadMessage(f"{place}.covariance", counted(covariance.size, "number"), counted(len(keys), "square"))
     values = None
     if content.get("values") is not None:
         values = _read_f8(place, content, "values", None).reshape(len(keys), -1 if len(keys) else 0)
@@ -320,5 +321,5 @@ def _flags(column: Any) -> bytes:
 def _read_flags(content: Map, name: str, count: int) -> Any:
     value = fields.binary("", content, name)
     if len(value) != count:
-        raise BadMessage(name, f"{len(value)} bytes", f"{count}")
+        raise BadMessage(name, counted(len(value), "byte"), f"{count}")
     return np.frombuffer(value, np.uint8).astype(bool)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from factorbus.proto.problems import Problem
+from factorbus.wording import counted
 
 # The numbers of each model, in this order; from the first in `_OPTIONAL` on they may be left out and are 0.
 MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -54,7 +55,7 @@ class Camera:
             raise BadCamera("model", repr(str(self.model)[:64]), f"one of {', '.join(MODELS)}")
         names = MODELS[self.model]
         if not _LEAST[self.model] <= len(self.numbers) <= len(names):
-            raise BadCamera(f"numbers of {self.model}", f"{len(self.numbers)} numbers", " ".join(names))
+            raise BadCamera(f"numbers of {self.model}", counted(len(self.numbers), "number"), " ".join(names))
         for name, number in zip(names, self.numbers, strict=False):
             if not math.isfinite(number):
                 raise BadCamera(name, number, "a finite number")

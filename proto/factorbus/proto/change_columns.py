@@ -11,6 +11,7 @@ from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import CHANGES, LOSSES, VARIABLE_KINDS
 from factorbus.proto.messages import Change
 from factorbus.proto.problems import BadLoss, BadMessage, UnknownKind
+from factorbus.wording import counted
 
 
 def changes_to_maps(changes: Sequence[Change]) -> list[dict[str, Any]]:
@@ -76,7 +77,7 @@ def _column(place: Callable[[], str], content: Map, name: str) -> I64:
     """A column of int64 of any length."""
     value = fields.binary(place(), content, name)
     if len(value) % 8:
-        raise BadMessage(f"{place()}.{name}", f"{len(value)} bytes", "a multiple of 8")
+        raise BadMessage(f"{place()}.{name}", counted(len(value), "byte"), "a multiple of 8")
     return np.ndarray((len(value) // 8,), I8, value)
 
 

@@ -12,6 +12,7 @@ from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadLoss, BadMessage, BadStamp, TooLarge, UnknownKind
+from factorbus.wording import counted
 
 
 def variables_to_maps(groups: Sequence[Variables]) -> list[dict[str, Any]]:
@@ -143,7 +144,7 @@ def _read_numbers(place: Callable[[], str], content: Map, name: str, count: int)
     """A column with one int64 for each row."""
     value = fields.binary(place(), content, name)
     if len(value) != 8 * count:
-        raise BadMessage(f"{place()}.{name}", f"{len(value)} bytes", f"{8 * count} ({count} int64)")
+        raise BadMessage(f"{place()}.{name}", counted(len(value), "byte"), f"{8 * count} ({count} int64)")
     return np.ndarray((count,), I8, value)
 
 

@@ -28,6 +28,7 @@ from factorbus.proto.features import (
 from factorbus.proto.fields import F8, Map
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.problems import BadMessage
+from factorbus.wording import counted
 
 _pack = cast(Callable[..., bytes], msgpack.packb)
 _OPTIONAL = ("rows", "cross", "blocks", "turn", "own", "U", "S")
@@ -66,7 +67,7 @@ def decode_ask(data: bytes, limits: Limits = REQUEST_LIMITS) -> Ask:
         *(fields.number("", content, name) for name in ("rho", "sigma_rho", "sigma_pixel")),
     )
     if len(content["state"]) != 8 * CAMERA_STATE:
-        raise BadMessage("state", f"{len(content['state'])} bytes", f"{8 * CAMERA_STATE} (13 float64)")
+        raise BadMessage("state", counted(len(content["state"]), "byte"), f"{8 * CAMERA_STATE} (13 float64)")
     return Ask(sighting, form, _segment(content))
 
 
@@ -134,7 +135,7 @@ def _array(content: Map, name: str, multiple: int) -> F64:
     """The column `name`, of a multiple of so many numbers."""
     value = content.get(name)
     if type(value) is not bytes or len(value) % (8 * multiple) or (multiple == CAMERA_STATE and not value):
-        seen = f"{len(value)} bytes" if type(value) is bytes else "missing or not a bin"
+        seen = counted(len(value), "byte") if type(value) is bytes else "missing or not a bin"
         raise BadMessage(name, seen, f"a bin of <f8, a multiple of {8 * multiple} bytes")
     return np.ndarray((len(value) // 8,), F8, value)
 

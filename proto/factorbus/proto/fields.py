@@ -13,6 +13,7 @@ import numpy as np
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.limits import Limits
 from factorbus.proto.problems import BadMessage, BadOption, TooLarge
+from factorbus.wording import counted
 
 F8 = np.dtype("<f8")
 I8 = np.dtype("<i8")
@@ -137,7 +138,7 @@ def keys(place: Callable[[], str], fields: Map, arity: int) -> I64:
     if type(value) is not bytes:
         raise BadMessage(f"{place()}.keys", _seen(fields, "keys"), "a bin of <i8")
     if len(value) % width:
-        raise BadMessage(f"{place()}.keys", f"{len(value)} bytes", f"a multiple of {width}")
+        raise BadMessage(f"{place()}.keys", counted(len(value), "byte"), f"a multiple of {width}")
     count = len(value) // width
     return np.ndarray((count, arity) if arity else (count,), I8, value)
 
@@ -149,7 +150,9 @@ def rows(place: Callable[[], str], fields: Map, name: str, count: int, size: int
         raise BadMessage(f"{place()}.{name}", _seen(fields, name), "a bin of <f8")
     if len(value) != 8 * count * size:
         raise BadMessage(
-            f"{place()}.{name}", f"{len(value)} bytes", f"{8 * count * size} ({count} rows of {size} float64)"
+            f"{place()}.{name}",
+            counted(len(value), "byte"),
+            f"{8 * count * size} ({counted(count, 'row')} of {size} float64)",
         )
     return np.ndarray((count, size), F8, value)
 

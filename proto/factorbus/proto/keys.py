@@ -47,9 +47,9 @@ def inserts_of_any_client(map_name: str) -> str:
     return f"{map_root(map_name)}/in/*"
 
 
-def client_of(insert_key_expr: str) -> str:
-    """The client that an insert's key names: its last chunk."""
-    return insert_key_expr.rpartition("/")[2]
+def client_of(key: str) -> str:
+    """The client that the key of an insert, or of its token, names: the last chunk."""
+    return key.rpartition("/")[2]
 
 
 def ask_key(map_name: str, question: str) -> str:
@@ -84,7 +84,12 @@ def service_token(map_name: str, service: str) -> str:
 
 def client_token(map_name: str, client: str) -> str:
     """Alive while `client` has joined the map."""
-    return f"{map_root(map_name)}/live/client/{checked_name('client', client)}"
+    return f"{any_client_token(map_name)[:-1]}{checked_name('client', client)}"
+
+
+def any_client_token(map_name: str) -> str:
+    """Those of all clients of a map."""
+    return f"{map_root(map_name)}/live/client/*"
 
 
 def job_key(worker: str) -> str:

@@ -141,7 +141,7 @@ class TooLarge(Problem):
     def __init__(self, what: str, size: int, limit: int, unit: str = "") -> None:
         unit = f" {unit}" if unit else ""
         super().__init__(
-            f"{what} has {size}{unit}, the limit is {limit}{unit}; send it in parts or raise the limit",
+            f"{what} has {size}{unit}, the limit is {limit}; send it in parts or raise the limit",
             size=size,
             limit=limit,
         )

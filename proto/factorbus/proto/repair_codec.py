@@ -13,6 +13,7 @@ from factorbus.proto.columns import read_values, variables_to_maps
 from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
 from factorbus.proto.problems import BadMessage
+from factorbus.wording import counted
 
 
 def encode_ask_repair(ask: AskRepair) -> bytes:
@@ -70,5 +71,5 @@ def decode_repaired(data: bytes, limits: Limits = ANSWER_LIMITS) -> Repaired:
 def _integers(where: str, content: Map, name: str) -> I64:
     value = fields.binary(where, content, name)
     if len(value) % 8:
-        raise BadMessage(name, f"{len(value)} bytes", "a multiple of 8")
+        raise BadMessage(name, counted(len(value), "byte"), "a multiple of 8")
     return np.ndarray((len(value) // 8,), I8, value)

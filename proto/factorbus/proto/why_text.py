@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from factorbus.proto.symbols import format_symbol
+from factorbus.wording import counted
 
 _SHOWN = 8
 
@@ -33,7 +34,7 @@ def _of_variable(revision: int, variable: Mapping[str, Any]) -> Iterator[str]:
     factors = sorted(variable.get("factors", ()), key=lambda each: -float(each.get("chi2") or 0.0))
     yield from map(_of_factor, factors[:_SHOWN])
     if len(factors) > _SHOWN:
-        yield f"and {len(factors) - _SHOWN} factors more"
+        yield f"and {counted(len(factors) - _SHOWN, 'factor')} more"
 
 
 def _of_factor(factor: Mapping[str, Any]) -> str:

@@ -5,7 +5,8 @@
 
 Four poses and two landmarks, whose factors do not agree: every number of every answer can be computed again from
 `insert` and the equations, which a test does with dense matrices.  What differs from run to run is made the same:
-epochs are 7, times 0.5, sizes of memory 1 MiB.  Messages of wire version 1 never change: these were written once.
+epochs are 7, times 0.5, sizes of memory 1 MiB.  Written anew where a service answers more than it did; last bits
+differ between machines.
 """
 
 import json

@@ -110,7 +110,7 @@ def _columns(name: str, record: Edge, bucket: Bucket, reading: Reading) -> EdgeC
     columns = EdgeColumns(record.kind, lines, ends, measured, np.ascontiguousarray(information))
     if record.lead == "switch":
         scale = np.sqrt([reading.switches.get(number, 1.0) for number in heads_left[:, -1].tolist()])
-        reading.left.say(f"{len(lines)} {name} read with the loss dcs, as wide as their switches are held on")
+        reading.left.say(f"{len(lines)} {name} read with the loss dcs, each as wide as its switch is held on")
         return replace(columns, loss="dcs", scale=scale)
     return columns if lead is None else Lead(name, columns, lead)
 

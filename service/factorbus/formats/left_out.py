@@ -6,8 +6,11 @@ import numpy as np
 
 from factorbus.formats.errors import FormatError
 from factorbus.proto.arrays import I64
+from factorbus.wording import counted
 
 _SHOWN = 5
+# Names that are nouns have a singular; names of records and kinds do not.
+_ONE = {"vertices": "vertex", "points": "point", "variables": "variable", "time stamps": "time stamp"}
 
 
 @dataclass(slots=True)
@@ -32,19 +35,25 @@ class LeftOut:
                 self.file, int(np.min(lines)), f"{name}, {why}", "nothing that would have to be left out (strict)"
             )
         self.counts[name] = self.counts.get(name, 0) + len(lines)
-        self.notes.append(f"{len(lines)} {name} left out: {why}")
+        self.notes.append(f"{_counted(len(lines), name)} left out: {why}")
 
     def drop(self, name: str, count: int, why: str) -> None:
         """The same for what stands on no line.  Raises FormatError when strict."""
         if count and self.strict:
-            raise FormatError(self.file, None, f"{count} {name}, {why}", "nothing that would be left out (strict)")
+            raise FormatError(
+                self.file, None, f"{_counted(count, name)}, {why}", "nothing that would be left out (strict)"
+            )
         if count:
             self.counts[name] = self.counts.get(name, 0) + count
-            self.notes.append(f"{count} {name} left out: {why}")
+            self.notes.append(f"{_counted(count, name)} left out: {why}")
 
     def say(self, note: str) -> None:
         """Nothing is left out, but somebody may want to know."""
         self.notes.append(note)
+
+
+def _counted(count: int, name: str) -> str:
+    return counted(count, _ONE.get(name, name), name)
 
 
 def shown(names: list[str]) -> str:

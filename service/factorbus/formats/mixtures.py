@@ -45,7 +45,7 @@ def best_components(file: str, mixed: Lead, vertices: Sequence[VertexColumns], l
         w = weight[known]
         is_null[known] = np.where(w > 0, 0.5 * dim * np.log(np.maximum(w, 5e-324)) - w * m > -m, False)
     left.say(
-        f"{len(known)} {mixed.name} read as their likelier component at the file's values: "
+        f"{len(known)} {mixed.name} read as the likelier component at the file's values: "
         f"{len(known) - int(is_null.sum())} as measured, {int(is_null.sum())} as the null hypothesis"
     )
     return replace(columns, information=columns.information * np.where(is_null, weight, 1.0)[:, None])

@@ -9,6 +9,7 @@ from factorbus.formats.errors import FormatError, refuse_first
 from factorbus.formats.lines import Bucket
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.symbols import MAX_KEY
+from factorbus.wording import counted
 
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _EXACT = 2.0**53  # integers below are exact as floats
@@ -57,7 +58,7 @@ def _line_by_line(file: str, name: str, bucket: Bucket, width: int, fields: str)
     for rest, line in zip(bucket.rests, bucket.numbers, strict=True):
         found = rest.split()
         if len(found) != width:
-            raise FormatError(file, line, f"{name} with {len(found)} fields", f"{width}: {fields}")
+            raise FormatError(file, line, f"{name} with {counted(len(found), 'field')}", f"{width}: {fields}")
         rows.append([_number(file, line, name, word) for word in found])
     return np.array(rows, np.float64).reshape(-1, width)
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.wording import counted
 
 _TORO_ORDER = (0, 1, 4, 2, 5, 3)  # the file has xx xy yy tt xt yt; (xx, xy, xt, yy, yt, tt) are at these places
 
@@ -27,7 +28,7 @@ class Vertex:
 
     @property
     def fields(self) -> str:
-        return f"id and {self.width - 1} numbers ({VARIABLE_KINDS[self.kind].values})"
+        return f"id and {counted(self.width - 1, 'number')} ({VARIABLE_KINDS[self.kind].values})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +75,12 @@ class Edge:
 
     @property
     def fields(self) -> str:
-        offset = f", the id(s) of {self.parameters} offset(s)" if self.parameters else ""
+        ids = "id" if self.parameters == 1 else "ids"
+        offset = f", the {ids} of {counted(self.parameters, 'offset')}" if self.parameters else ""
         lead = {"switch": ", the id of its switch", "mixture": ", the weight of its null hypothesis"}.get(self.lead, "")
         what = {"sigmas": "standard deviations"}.get(self.weight, "information")
-        return f"{self.ids} id(s){offset}{lead}, {self.measured} numbers measured, {self.weights} of {what}"
+        measured = f"{counted(self.measured, 'number')} measured"
+        return f"{counted(self.ids, 'id')}{offset}{lead}, {measured}, {self.weights} of {what}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import format_symbol
+from factorbus.wording import counted
 
 POSES = ("se2", "se3")
 
@@ -269,4 +270,4 @@ def _parts(count: int, ends: list[I64]) -> list[I64]:
 def _shown_part(names: Roster, part: I64) -> str:
     keys = names.keys[part[np.lexsort((names.keys[part], ~names.is_pose[part]))]]  # poses first
     ends = [format_symbol(int(key)) for key in (keys[0], keys[-1])]
-    return ends[0] if len(part) == 1 else f"{ends[0]} .. {ends[1]} ({len(part)} variables)"
+    return ends[0] if len(part) == 1 else f"{ends[0]} .. {ends[1]} ({counted(len(part), 'variable')})"

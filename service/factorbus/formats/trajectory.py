@@ -13,6 +13,7 @@ from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import SeveralRobots
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
+from factorbus.wording import counted
 
 
 class Stamped(NamedTuple):
@@ -68,8 +69,10 @@ def untimed(rows: list[Stamped]) -> list[Stamped]:
 def untimed_note(rows: list[Stamped]) -> str:
     """What is to be said of those, for people; empty: there are none."""
     lacking = untimed(rows)
-    names = shown([format_symbol(row.key) for row in lacking])
-    return f"{len(lacking)} poses left out: others have a time stamp and {names} none" if lacking else ""
+    if not lacking:
+        return ""
+    names, has = shown([format_symbol(row.key) for row in lacking]), "has" if len(lacking) == 1 else "have"
+    return f"{counted(len(lacking), 'pose')} left out: {names} {has} no time stamp, and others have one"
 
 
 def write_trajectories(

@@ -7,6 +7,7 @@ from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.solver.modes import MODES, mode_named
+from factorbus.wording import counted
 
 
 class OtherMode(Problem):
@@ -24,7 +25,7 @@ class MovedOn(Problem):
     code = "moved_on"
 
     def __init__(self, name: str, revision: int, wanted: int, waiting: int) -> None:
-        more = f" and {waiting} inserts under way" if waiting else ""
+        more = f" and {counted(waiting, 'insert')} under way" if waiting else ""
         super().__init__(
             f"map {name!r} is at revision {revision}{more}, not at {wanted}: it was not dropped; copy it again, or "
             "have its front ends leave first",

@@ -12,6 +12,7 @@ Reasons and figures: docs/decisions/further-steps.md.
 import math
 
 from factorbus.service.events import Stepped
+from factorbus.wording import counted
 
 # Idle is a map whose last step of another sort ended so long ago: one that has not converged goes on, and one that has
 # is polished, that is, goes on to its optimum.
@@ -99,9 +100,10 @@ class Converging:
             return "the solver failed in a further step and was replaced, see the service's log"
         # With damping left the next step tries another way, of which there are no more than _USELESS.
         if self._still >= _STILL and not stepped.damping:
-            return f"{self._still} further steps in a row changed nothing"
+            return f"{counted(self._still, 'further step')} in a row changed nothing"
         if self._useless >= _USELESS:
-            return f"{self._useless} further steps in a row did not lower χ²"
+            return f"{counted(self._useless, 'further step')} in a row did not lower χ²"
         if self.steps >= MOST or self._spent_s >= MOST_S:
-            return f"{self.steps} further steps in a row, {self._spent_s:.0f} s of a core, were not enough"
+            steps = counted(self.steps, "further step")
+            return f"it was not at its optimum after {steps} in a row, which took {self._spent_s:.0f} s of a core"
         return ""

@@ -173,7 +173,7 @@ class Holding:
     @property
     def nonzeros(self) -> int:
         """Of R, as of the last step; 0: not known, or R is not kept from step to step."""
-        known = self._account.get("mode") == "tree" and not self._broken
+        known = self._account.get("mode") == "bayes-tree" and not self._broken
         return int(self._account.get("nnz_r", 0)) if known else 0
 
     @property

@@ -21,6 +21,7 @@ from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Job, JobDone, Variables
 from factorbus.proto.problems import Problem
 from factorbus.solver.errors import SolverError
+from factorbus.wording import counted
 
 # χ² is summed in another order, or by another compiler; an optimum is compared with a map by no more digits.
 _CHI2 = 1e-6
@@ -97,7 +98,7 @@ def _check_keys(known: Mapping[int, str], told: Mapping[int, str], wanted: Mappi
     strange = [key for key, kind in told.items() if known.get(key) != kind]
     missing = wanted.keys() - told.keys()
     if strange or missing:
-        what = f"{len(missing)} variables missing, {len(strange)} that the graph does not have"
+        what = f"{counted(len(missing), 'variable')} missing, {len(strange)} that the graph does not have"
         raise WrongAnswer(f"answered a batch job with {what}")
 
 

@@ -52,7 +52,7 @@ def open_metrics(where: str, vitals: Vitals) -> Metrics:
     try:
         import prometheus_client  # noqa: F401
     except ImportError:
-        raise BadConfig("metrics need prometheus-client: pip install 'factorbus[service]'") from None
+        raise BadConfig("metrics need prometheus-client, of the extra `service`: factorbus doctor") from None
     host, _, port = where.rpartition(":")
     try:
         server = _Server((host.strip("[]"), int(port)), _handler(vitals))

@@ -13,6 +13,7 @@ from factorbus.solver.kernels import tree_layout as tl
 from factorbus.solver.kernels.bounds import find_escaped
 from factorbus.solver.report import StepReport
 from factorbus.solver.tree_steps import TreeSteps
+from factorbus.wording import counted
 
 
 def try_in_place(
@@ -69,4 +70,4 @@ def _put_back(graph: Graph, steps: TreeSteps, report: StepReport) -> None:
 
 def _told(edit: FactorEdit) -> str:
     parts = [(edit.gone.size, "removed"), (edit.renewed.size, "with another weight or loss")]
-    return ", ".join(f"{count} factor{'s' if count > 1 else ''} {what}" for count, what in parts if count)
+    return ", ".join(f"{counted(count, 'factor')} {what}" for count, what in parts if count)

@@ -12,6 +12,7 @@ from factorbus.solver.kernels.multifrontal import factorize
 from factorbus.solver.lending import BOARD
 from factorbus.solver.ordering import integers
 from factorbus.solver.symbolic import Symbolic
+from factorbus.wording import counted
 
 _LINE = 8  # doubles in a cache line
 
@@ -109,7 +110,8 @@ class Cholesky:
 
 def _check_blocks(symbolic: Symbolic, data: F64, offsets: I64) -> None:
     if len(offsets) != len(symbolic.areas):
-        raise ValueError(f"{len(offsets)} offsets for the {len(symbolic.areas)} blocks of the analysed pattern")
+        blocks = counted(len(symbolic.areas), "block")
+        raise ValueError(f"{counted(len(offsets), 'offset')} for the {blocks} of the analysed pattern")
     least, end = offsets.min(initial=0), (offsets + symbolic.areas).max(initial=0)
     if least < 0 or end > data.size or data.ndim != 1:
         raise ValueError(f"blocks reach from {least} to {end} in data of shape {data.shape}")

@@ -38,6 +38,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from factorbus.wording import counted
+
 _INDEX_BITS = 56
 
 
@@ -317,8 +319,8 @@ class TooConnected(SolverError):
         listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
         super().__init__(
             f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
-            f"factors with {len(border)} others, {listed}; wanted at most {most}: marginalise some of these as well, "
-            "or remove some of its factors first",
+            f"factors with {counted(len(border), 'other')}, {listed}; wanted at most {most}: marginalise some of these "
+            "as well, or remove some of its factors first",
             key=key,
             border=list(border),
         )
@@ -366,9 +368,10 @@ class Underconstrained(SolverError):
     code = "underconstrained"
 
     def __init__(self, key: int, factors: Sequence[str], missing: str) -> None:
-        listed = ", ".join(factors) if factors else "it has none"
+        listed = ", ".join(factors[:8]) + (", ..." if len(factors) > 8 else "")
+        by = f"by its {counted(len(factors), 'factor')} ({listed})" if factors else "as no factor is on it"
         super().__init__(
-            f"{printed(key)} is not fixed by its {len(factors)} factor(s) ({listed}): {missing}",
+            f"{printed(key)} is not fixed {by}: {missing}",
             key=key,
             factors=list(factors),
             missing=missing,

@@ -21,6 +21,7 @@ from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.kernels._jit import F64, I64
 from factorbus.solver.quadratic import quadratic
+from factorbus.wording import counted
 
 SINGLE = {n: k.code for n, k in FACTOR_KINDS.items() if at.LINEAR_SE2 <= k.code < at.LINEAR_PAIR_SE2}
 _MOST_TOGETHER, _MOST_PIECES = 2 * MOST, 32768  # variables and factors of one form
@@ -108,7 +109,9 @@ def check_joints(graph: Graph, first: int = 0) -> None:
         keys = [int(graph.keys[v]) for v in joint.variables]
         ids = graph.ids_of(np.array(joint.rows)).tolist()
         if len(keys) > _MOST_TOGETHER or len(ids) > _MOST_PIECES:
-            many = f"{len(ids)} on {len(keys)} variables hang together, {_MOST_PIECES} on {_MOST_TOGETHER} may"
+            many = (
+                f"{len(ids)} on {counted(len(keys), 'variable')} hang together, {_MOST_PIECES} on {_MOST_TOGETHER} may"
+            )
             raise errors.Apart(keys[:_MOST_TOGETHER], ids[:_MOST_PIECES], many)
         form = quadratic(graph, joint.rows, [])
         scale = np.where(form.plus > 0.0, 1.0 / np.sqrt(np.where(form.plus > 0.0, form.plus, 1.0)), 1.0)

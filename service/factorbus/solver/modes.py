@@ -28,10 +28,10 @@ MODE_OF_NAME = {
         Mode("inc-l-b10", updates=True, batch_every=10),
         Mode("inc-l-b100", updates=True, batch_every=100),
         Mode("all-batch", updates=False),
-        Mode("tree", updates=True, tree=True),
+        Mode("bayes-tree", updates=True, tree=True),
     )
 }
-AUTO = "tree"
+AUTO = "bayes-tree"
 MODES = ("auto", *MODE_OF_NAME)
 
 

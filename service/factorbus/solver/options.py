@@ -17,8 +17,8 @@ class Options:
 
     mode            "inc-l": R is updated, and made anew when that is better (2013 paper, Algorithm 1); "inc-l-b10",
                     "inc-l-b100": the same with a batch after every 10 or 100 new variables and none in between;
-                    "all-batch": every step that solves factorises anew; "tree": only the part of R that a step affects
-                    is made again, and only variables that need it are relinearised (MATH §9); "auto" is "tree"
+                    "all-batch": every step that solves factorises anew; "bayes-tree": only the part of R that a step
+                    affects is made again, and only variables that need it are relinearised (MATH §9); "auto" is that
     clock           seconds, for the phases in the report; without one they are zero
     tolerance       all-batch: an ordinary step stops when the next one would lower χ² by less than this share of it
     tol             inc-l: the same, and a first step that would is not made.  The paper's tol, with the length of δ
@@ -51,7 +51,7 @@ class Options:
                     if what waits has `many` scalars
     many            tree: for fewer scalars much less is worth it; poses in space and landmarks have to be worth more
     converged_share a step has converged if what is left to gain is at most this share of χ² (MATH §9.6); a step of the
-                    mode "tree" goes on for up to ten rounds until it has, and one that raised χ² by more is replaced
+                    mode "bayes-tree" goes on for up to ten rounds until it has, and one that raised χ² by more is replaced
                     by Levenberg–Marquardt from where the estimate stood
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
                     scalars were; in wide cliques, which take longer, by more than that (MATH §9.7)

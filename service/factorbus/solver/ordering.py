@@ -4,6 +4,7 @@ import numpy as np
 
 from factorbus.solver.kernels._jit import I64
 from factorbus.solver.kernels.amd import amd
+from factorbus.wording import counted
 
 
 def order(dims: I64, rows: I64, cols: I64, group: I64 | None = None) -> I64:
@@ -16,7 +17,9 @@ def order(dims: I64, rows: I64, cols: I64, group: I64 | None = None) -> I64:
     dims, rows, cols = checked_pattern(dims, rows, cols)
     group = np.zeros(len(dims), np.int64) if group is None else integers(group)
     if group.shape != dims.shape or group.min(initial=0) < 0:
-        raise ValueError(f"{len(group)} groups, the least {group.min(initial=0)}: {len(dims)} of 0 or more are wanted")
+        raise ValueError(
+            f"{counted(len(group), 'group')}, the least {group.min(initial=0)}: {len(dims)} of 0 or more are wanted"
+        )
     return amd(dims, rows, cols, group)
 
 
@@ -24,9 +27,11 @@ def checked_pattern(dims: I64, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
     """The pattern as the kernels want it.  They look at nothing again, so what is wrong must not get past here."""
     dims, rows, cols = integers(dims), integers(rows), integers(cols)
     if dims.min(initial=1) < 1:
-        raise ValueError(f"a variable of {dims.min()} scalars: each needs at least one")
+        raise ValueError(f"a variable of {counted(dims.min(), 'scalar')}: each needs at least one")
     if rows.shape != cols.shape:
-        raise ValueError(f"{len(rows)} rows and {len(cols)} columns: one of each per block is wanted")
+        raise ValueError(
+            f"{counted(len(rows), 'row')} and {counted(len(cols), 'column')}: one of each per block is wanted"
+        )
     least = min(rows.min(initial=0), cols.min(initial=0))
     largest = max(rows.max(initial=-1), cols.max(initial=-1))
     if least < 0 or largest >= len(dims):

@@ -13,7 +13,7 @@ class StepReport(NamedTuple):
     mode         the solver's mode
     strategy     "extend": the gradient was zero, there was nothing to solve; "omega", "lambda", "full": how R was
                  brought up to date in the incremental modes (MATH §8); "all-batch": all was factorised, in that mode;
-                 "tree", "batch": part of R was made again, or all was solved by Gauss-Newton, in the mode "tree"
+                 "tree", "batch": part of R was made again, or all was solved by Gauss-Newton, in the mode "bayes-tree"
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
     chi2, chi2_before        Σ rᵀ Ω r of all factors at the published estimate; and at the values before the step, the
@@ -22,13 +22,14 @@ class StepReport(NamedTuple):
     changed      variables whose values differ from before, the new ones included
     relinearised linearisation points that were moved, counted once per iteration
     eliminated   variables eliminated, counted once per factorisation
-    asleep       sights without a pixel, and so without weight, at the estimate (mode "tree": where it is linearised);
-                 `Solver.asleep` tells which and why
+    asleep       sights without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
+                 linearised); `Solver.asleep` tells which and why
     nnz_r, flops of one factorisation; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
     converged    a full Gauss-Newton step from the estimate would not lower χ² by more than `Options.converged_share` of
-                 it, in the mode "tree" by a bound; in the others the last iteration did not by more than the tolerance
+                 it, in the mode "bayes-tree" by a bound; in the others the last iteration did not by more than the
+                 tolerance
     phases_ms    milliseconds by phase;  step_ms: the whole step;  compiled_ms: the part of it within one compiled call,
-                 where that does the work (mode "tree"), else None
+                 where that does the work (mode "bayes-tree"), else None
     """
 
     mode: str

@@ -38,6 +38,7 @@ from factorbus.solver.symbolic import Symbolic
 from factorbus.solver.system import System
 from factorbus.solver.tree_steps import TreeSteps
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.wording import counted
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
@@ -231,7 +232,7 @@ class Solver:
 
         Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
         it is where they remove, fix, free, place or marginalise variables, where linear factors are among them, where
-        something would be free to move, with `settle`, and in modes other than "tree".  Nothing may be staged.
+        something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.
         Raises as `changes.collect` and `stage` do.
         """
         if self._tree is None or settle:
@@ -301,7 +302,7 @@ class Solver:
     def factored(self) -> Factored:
         """A copy of R and of all that it is of, as of the last step: what covariances are computed from, elsewhere.
 
-        In the mode "tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        In the mode "bayes-tree" that is its R, linearised where it is; in the others one made here, at the estimate.
         """
         return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
 
@@ -359,7 +360,7 @@ class Solver:
         if settle:
             return "asked to settle"
         if suspects.size:
-            return f"{suspects.size} new variables are held only by several factors together"
+            return f"only several factors together hold {counted(suspects.size, 'new variable')}"
         if not np.isfinite(self._done.unsolved):
             return "the last step had not converged"
         if self._goes_on:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from factorbus.solver.block_factor import Reach
 from factorbus.solver.options import Options
+from factorbus.wording import counted
 
 _FEW_ROWS = 40
 # An Ω-update costs as much as Ω has rows, a Λ-update does not: with more factors than these the latter is for it.
@@ -23,7 +24,7 @@ def choose(reach: Reach, factors: int, columns: int, options: Options) -> Plan:
     """The update for what that many new factors reach in R, which has `columns` block columns."""
     size, share = int(reach.rows.size), _FEW_ROWS + options.loop_share * columns
     small, big = min(options.small_loop, share), min(options.big_loop, share)
-    loop = f"a loop over {reach.span} of {columns} block columns that reaches {size}"
+    loop = f"a loop over {reach.span} of {counted(columns, 'block column')} that reaches {size}"
     if size <= small and factors <= _FEW_FACTORS:
         return Plan("omega", f"{loop}, no more than smallLoopThresh = {small:.0f}", size)
     if size <= big:

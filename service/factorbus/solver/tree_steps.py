@@ -1,4 +1,4 @@
-"""Steps in the mode "tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
+"""Steps in the mode "bayes-tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
 
 A step solves a linear problem, measures χ² at the estimate that it comes to, and relinearizes what is too far from its
 linear model (MATH §9.6).  One that raises χ² is replaced by Levenberg-Marquardt from where the estimate stood.
@@ -26,6 +26,7 @@ from factorbus.solver.report import Shares, StepReport, Stopwatch
 from factorbus.solver.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.system import System
 from factorbus.solver.tree import Tree
+from factorbus.wording import counted
 
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
@@ -143,7 +144,7 @@ class TreeSteps:
             )
         system.begin(suspects, Stopwatch(None))
         system.factorize(0.0)
-        return f"{suspects.size} new variables are held only by several factors together"
+        return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
     def _complete(self, settle: bool, because: str) -> tuple[Course | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
@@ -245,7 +246,7 @@ class TreeSteps:
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
-            "tree",
+            "bayes-tree",
             "batch" if course else ("tree" if moved or relinearised else "extend"),
             because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
@@ -270,5 +271,5 @@ class TreeSteps:
 def _relinearized(count: int, rounds: int) -> str:
     """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
     if rounds > 1:
-        return f"{count} relinearizations in {rounds} rounds"
-    return f"{count} variable{'s' if count > 1 else ''} relinearized"
+        return f"{counted(count, 'relinearization')} in {rounds} rounds"
+    return f"{counted(count, 'variable')} relinearized"

@@ -166,7 +166,7 @@ ENTRIES = {
         _ours("inc-l", "Inc-L"),
         _ours("inc-l-b10", "Inc-L b10"),
         _ours("inc-l-b100", "Inc-L b100"),
-        _ours("tree", "tree"),
+        _ours("bayes-tree", "Bayes tree"),
         _ours("auto", "auto"),
     )
 }
@@ -174,7 +174,7 @@ ENTRIES = {
 # in quality where angles weigh much (victoria_park after 2500 poses: 1.47 x the optimum; 1.001 x with 1e-5).
 # gn-loop and update() alone are for `bench peers`.
 _PEERS = ("isam2-0.1-update", "isam2-0.1-update-as-read", "isam2-0.01-update", "gn-loop")
-ON_REQUEST = ("auto", "tree", "isam2-0.1-fine", *_PEERS)
+ON_REQUEST = ("auto", "bayes-tree", "isam2-0.1-fine", *_PEERS)
 TABLE_1 = tuple(name for name in ENTRIES if name not in ON_REQUEST)
 PEER = "isam2-0.1-update"
 STAND_IN = "isam2-0.1-update-as-read"  # where that gives up

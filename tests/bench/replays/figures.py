@@ -21,7 +21,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "inc-l-b10": {"color": "#E69F00", "linewidth": 1.1, "zorder": 4},
     "inc-l-b100": {"color": "#CC79A7", "linewidth": 1.1, "zorder": 3},
     "auto": {"color": "#000000", "linewidth": 1.6, "zorder": 7},
-    "tree": {"color": "#000000", "linewidth": 1.4, "linestyle": (0, (4, 1)), "zorder": 6},
+    "bayes-tree": {"color": "#000000", "linewidth": 1.4, "linestyle": (0, (4, 1)), "zorder": 6},
     "isam2-0.1": {"color": "#0072B2", "linewidth": 1.3, "linestyle": (0, (5, 2)), "zorder": 4},
     "isam2-0.01": {"color": "#56B4E9", "linewidth": 1.3, "linestyle": (0, (5, 2)), "zorder": 3},
     "isam2-0.1-qr": {"color": "#0072B2", "linewidth": 1.0, "linestyle": (0, (1, 1.5)), "zorder": 2},

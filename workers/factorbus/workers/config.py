@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from factorbus.proto.keys import checked_name
 from factorbus.proto.problems import Problem
+from factorbus.wording import counted
 
 
 class BadConfig(Problem):
@@ -33,7 +34,9 @@ def checked(config: Config) -> Config:
     if not config.connect:
         raise BadConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
     if not 1 <= config.slots <= 1024:
-        raise BadConfig(f"slots is {config.slots}; wanted 1 to 1024 (this machine has {os.cpu_count()} cores)")
+        raise BadConfig(
+            f"slots is {config.slots}; wanted 1 to 1024 (this machine has {counted(os.cpu_count() or 1, 'core')})"
+        )
     if config.name:
         checked_name("worker", config.name)
     return config

@@ -79,7 +79,7 @@ async function explain(key) {
   const panel = of("panel");
   try {
     const found = await ask(`/api/maps/${map.name}/variables/${key}`);
-    const head = element("tr", null, ...["factor", "of", "χ²", "misfit", "known from it"].map((name) => element("th", name)));
+    const head = element("tr", null, ...["factor", "of", "χ²", "misfit", "leverage"].map((name) => element("th", name)));
     const rows = found.factors.map((f) => element("tr", null,
       element("td", f.kind), element("td", f.keys.join(" ")),
       element("td", f.loss ? `${f.rho.toPrecision(3)} of ${f.chi2.toPrecision(3)}, ${f.loss}` : f.chi2.toPrecision(3)),

@@ -1,4 +1,4 @@
-"""All diagonal blocks kept up from step to step, in the mode "tree".  MATH §10.6.
+"""All diagonal blocks kept up from step to step, in the mode "bayes-tree".  MATH §10.6.
 
 A step that moves no linearisation point changes Λ by its new factors.  Of these, one for each new variable only says
 where that is; the others, the loops, take from old blocks what they tell of them, which is of few ranks.  After any
