@@ -50,8 +50,8 @@ class Options:
     bent_now, rounds   tree: and solved for again in the same step, in up to `rounds` rounds, at more than this share,
                     if what waits has `many` scalars
     many            tree: for fewer scalars much less is worth it; poses in space and landmarks have to be worth more
-    converged_share tree: a step has converged if what is left to gain is at most this share of χ² (MATH §9.6); it goes on
-                    for up to ten rounds until it has, and one that raised χ² by more is replaced by
+    converged_share tree: a step has converged if what is left to gain is at most this share of χ² (MATH §9.6); it
+                    goes on for up to ten rounds until it has, and one that raised χ² by more is replaced by
                     Levenberg–Marquardt from where the estimate stood
     ripple          tree: δ follows where it is off by more than would add the square of this as a share to χ², if all
                     scalars were; in wide cliques, which take longer, by more than that (MATH §9.7)
