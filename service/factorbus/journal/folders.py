@@ -14,8 +14,9 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def maps_in(folder: Path, file: str) -> list[str]:
-    """The maps in `folder`: names of folders that have `file`, in order."""
-    return sorted(p.parent.name for p in folder.glob(f"*/{file}") if _NAME.fullmatch(p.parent.name) and p.is_file())
+    """The maps in `folder`: names of folders that have `file`, or what is written beside it, in order."""
+    there = [path for kind in (f"{file}*", "snapshot-*") for path in folder.glob(f"*/{kind}")]
+    return sorted({path.parent.name for path in there if _NAME.fullmatch(path.parent.name) and path.is_file()})
 
 
 def left_behind(folder: Path) -> list[Path]:
