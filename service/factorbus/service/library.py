@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from factorbus.journal.folders import GONE, left_behind, maps_in, sync_folder
+from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
@@ -68,7 +68,7 @@ class Library:
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name."""
-        return (self._owned.folder / name / NAME).is_file()
+        return is_map(self._owned.folder / name, NAME)
 
     def is_taken(self, name: str) -> bool:
         """Whether a new map cannot have this name: there is one, or a folder that is something else."""
