@@ -44,8 +44,8 @@ def _count(least: int) -> Range:
 
 _SHARE, _FINITE, _AMOUNT, _FACTOR = Range(0.0, 1.0), Range(most=1e9), Range(), Range(above=True)
 
-# An amount may be infinite: what it is the threshold of then never happens.  Where that would be to solve nothing, and to
-# say that it has converged, it is a share, or finite.
+# An amount may be infinite: what it is the threshold of then never happens.  Where that would be to solve nothing, and
+# to say that it has converged, it is a share, or finite.
 RANGES = types.MappingProxyType(
     {
         "tolerance": _SHARE,
