@@ -1,4 +1,4 @@
-"""A journal's database: the one file that touches SQLite.
+"""A journal's database: what is in its tables, and how it is written.
 
 Written by one process, and read by others at the same time (WAL).  One transaction takes in all folds that wait for it
 (group commit); it is there after a crash wholly or not at all.
