@@ -121,6 +121,11 @@ def test_whatever_a_disk_did_to_one_map_is_told_and_the_others_work(
             fill(bus, name, 30)
     service.end(HOWS[how])
     spoil(tmp_path / "journal" / "m", how)
+    checked = factorbus("journal", "check", "--journal", str(tmp_path / "journal"))
+    assert (checked.returncode, checked.stderr) == (1, "")
+    hall, m = checked.stdout.split("m: NOT SOUND\n")
+    assert hall == "hall: sound\n"
+    assert m.startswith("  ")
     with connect(service.start(), client="after", timeout_s=60) as bus:
         hall, m = bus.maps()
         assert (hall.name, hall.state) == ("hall", "open")

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -225,7 +226,7 @@ class Store:
             self.header()
         except JournalDamaged as damaged:
             yield str(damaged.detail["what"])
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             yield str(error)
 
     def copy_to(self, path: Path) -> None:
@@ -307,7 +308,7 @@ class Store:
     def _check_sequences(self) -> Iterator[str]:
         """Each client's numbers are 1, 2, 3, ... in every epoch."""
         begins = [fold for (fold,) in self._db.execute("SELECT fold FROM epoch ORDER BY number")]
-        for first, end in zip(begins, [*begins[1:], 1 << 62], strict=True):
+        for first, end in pairwise([*begins, 1 << 62]):
             rows = self._db.execute(
                 "SELECT client, sequence, sequence - LAG(sequence, 1, 0) OVER (PARTITION BY client ORDER BY number) "
                 "FROM entry WHERE fold >= ? AND fold < ?", (first, end),
