@@ -149,6 +149,23 @@ def factorbus(*words: str, **environment: str) -> "subprocess.CompletedProcess[s
     )  # fmt: skip
 
 
+def test_the_doctor_takes_a_volume_that_everybody_may_mount_as_the_service_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An emptyDir is 0777; kernels are in folders of the user's own in it."""
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    volume.chmod(0o777)
+    monkeypatch.setenv("FACTORBUS_CACHE", str(volume))
+    assert cache().state == "fail"
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) in (volume, Path("/")))
+    assert cache().seen.endswith(": empty")
+    inside = volume / "kernels" / "0123"
+    make_private("kernels", inside)
+    inside.chmod(0o777)
+    assert (cache().state, str(inside) in cache().seen) == ("fail", True)
+
+
 def test_a_cache_that_others_can_write_to_is_refused_and_the_doctor_says_so(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

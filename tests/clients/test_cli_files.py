@@ -8,9 +8,10 @@ import pytest
 
 from factorbus.cli import reading
 from factorbus.cli.columns import merged
+from factorbus.cli.convert import _written
 from factorbus.cli.exits import BAD_FILE, OK, REFUSED, USAGE
 from factorbus.cli.main import main
-from factorbus.formats import IDS, READS, read
+from factorbus.formats import IDS, READS, GraphFile, read
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
@@ -101,15 +102,51 @@ def test_a_trajectory_for_each_robot(folder: Path, capsys: pytest.CaptureFixture
         assert not (folder / f"out.{form}").exists()
         assert main(["convert", "ab.g2o", f"b.{form}", "--robot", "b"]) == OK
         assert (folder / f"b.{form}").read_text() == (folder / f"out-b.{form}").read_text()
+        assert capsys.readouterr().err.splitlines() == [
+            f"b.{form}: 4 factors left out: a trajectory has poses alone",
+            f"b.{form}: 3 poses left out: of other robots than 'b'",
+            f"b.{form}: 3 poses, 0 landmarks, 0 factors",
+        ]
     assert [line.split()[:3] for line in (folder / "out-b.tum").read_text().splitlines()] == [
         ["1", "0.0", "100.0"],
         ["3", "1.0", "100.0"],
         ["5", "2.0", "100.0"],
     ]
-    capsys.readouterr()
+    assert main(["convert", "ab.g2o", "c.tum", "--robot", "b", "--json"]) == OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["poses"], told["landmarks"], told["factors"]) == (3, 0, 0)
     assert main(["convert", "ab.g2o", "c.tum", "--robot", "c"]) == REFUSED
     assert "there are a, b, and none is 'c'" in capsys.readouterr().err
     assert main(["convert", "ab.g2o", "c.g2o", "--robot", "a"]) == USAGE
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "said"),
+    [
+        ("PARAMS_SE2OFFSET 0 0 0 0\n", "b.g2o", "nothing that a .g2o would have"),
+        ("PARAMS_SE2OFFSET 0 0 0 0\n", "b.tum", "no pose, and a .tum has nothing else"),
+        ("VERTEX_XY 0 1 2\n", "b.kitti", "no pose, and a .kitti has nothing else"),
+    ],
+)
+def test_a_file_with_nothing_in_it_is_not_written(
+    folder: Path, capsys: pytest.CaptureFixture[str], text: str, target: str, said: str
+) -> None:
+    (folder / "a.g2o").write_text(text)
+    assert main(["convert", "a.g2o", target]) == BAD_FILE
+    assert said in capsys.readouterr().err
+    assert not (folder / target).exists()
+
+
+def test_poses_without_a_time_among_others_are_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    groups = tuple(
+        Variables("se2", np.array([symbol("a", n)]), np.zeros((1, 3)), False, np.array([7 if n else NO_STAMP]))
+        for n in range(3)
+    )
+    graph = GraphFile("a.g2o", "g2o", Batch(groups), ())
+    files, notes, counts = _written(graph, folder / "b.tum", False, None, "auto")
+    assert ([file.name for file in files], counts["poses"]) == (["b.tum"], 2)
+    assert len((folder / "b.tum").read_text().splitlines()) == 2
+    assert any("1 poses left out: others have a time stamp and a0 none" in note for note in notes)
 
 
 def test_ids_come_out_as_they_went_in_unless_asked(folder: Path) -> None:

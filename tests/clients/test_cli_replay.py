@@ -15,12 +15,15 @@ from typing import IO, Any
 import pytest
 
 from factorbus.cli.children import service
+from factorbus.cli.columns import merged
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.local import LocalMap
 from factorbus.cli.main import main
 from factorbus.client import connect
 from factorbus.datasets import CATALOGUE, named
 from factorbus.formats import read
+from factorbus.simulate import sphere
+from factorbus.solver import solve_batch
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
 POSES = 250
@@ -242,3 +245,17 @@ def test_what_the_batch_optimum_was_found_from_is_said(wound: Path, capsys: pyte
     assert "from the file's values" in " ".join(capsys.readouterr().out.split())
     assert main(["replay", str(wound), "--in-process", "--every", "16"]) == OK
     assert "from the map's own values" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_drive_over_a_sphere_of_much_noise_ends_at_the_best_of_the_starts(seed: int) -> None:
+    world = sphere(300, seed, ring=25, rings=12, sigma_rotation_rad=0.25)
+    target, batches = LocalMap("auto"), [step.batch for step in world]
+    for batch in batches:
+        target.send(batch)
+    settled, found, graph = target.settle(), target.optimum(), merged(batches)
+    assert settled.report["converged"]
+    best = solve_batch(graph.variables, graph.factors)
+    assert found.batch <= best.chi2 * (1 + 1e-6), "the map's own values are one start more"
+    assert (found.notice is None) == (settled.report["chi2"] <= 1.01 * found.batch)
+    assert target.adopt(found).report["chi2"] == pytest.approx(found.batch, rel=1e-6)

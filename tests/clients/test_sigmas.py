@@ -1,5 +1,7 @@
 """How certain a measurement is: radians everywhere, and nothing that is misspelt or cannot be meant is swallowed."""
 
+import inspect
+
 import gtsam
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import strategies as st
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 
-from factorbus.client import Changes, Draft
+from factorbus.client import Camera, Changes, Draft
 from factorbus.client.certainty import DEFAULT_SCALES
 from factorbus.proto.kinds import LOSSES
 from factorbus.proto.messages import Batch, Variables
@@ -212,3 +214,51 @@ def test_whatever_is_given_it_is_taken_or_refused_with_a_code(
             code = problem.code
         assert code in ("", "bad_shape", "bad_information", "bad_loss", "bad_symbol")
         assert draft.batch().factor_count == (0 if code else 1)
+
+
+CAMERA = Camera("pinhole", (500.0, 500.0, 320.0, 240.0))
+EVERY_METHOD = {
+    "prior_se2": lambda d, **how: d.prior_se2("x0", (0, 0, 0), **how),
+    "prior_se3": lambda d, **how: d.prior_se3("x0", IDENTITY, **how),
+    "prior_point2": lambda d, **how: d.prior_point2("l0", (0, 0), **how),
+    "prior_point3": lambda d, **how: d.prior_point3("l0", (0, 0, 0), **how),
+    "between_se2": lambda d, **how: d.between_se2("x0", "x1", (1, 0, 0), **how),
+    "between_se3": lambda d, **how: d.between_se3("x0", "x1", IDENTITY, **how),
+    "landmark_se2": lambda d, **how: d.landmark_se2("x0", "l0", (1, 0), **how),
+    "landmark_se3": lambda d, **how: d.landmark_se3("x0", "l0", (1, 0, 0), **how),
+    "bearing_range_se2": lambda d, **how: d.bearing_range_se2("x0", "l0", (0.1, 2.0), **how),
+    "position_se2": lambda d, **how: d.position_se2("x0", (1, 0), **how),
+    "position_se3": lambda d, **how: d.position_se3("x0", (1, 0, 0), **how),
+    "heading_se2": lambda d, **how: d.heading_se2("x0", 0.1, **how),
+    "attitude_se3": lambda d, **how: d.attitude_se3("x0", (0, 0, 1), **how),
+    "range_se2": lambda d, **how: d.range_se2("x0", "l0", 2.0, **how),
+    "range_se3": lambda d, **how: d.range_se3("x0", "l0", 2.0, **how),
+    "bearing_se2": lambda d, **how: d.bearing_se2("x0", "l0", 0.1, **how),
+    "bearing_se3": lambda d, **how: d.bearing_se3("x0", "l0", (1, 0, 0), **how),
+    "linear": lambda d, **how: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), **how),
+    "idp_seen": lambda d, **how: d.idp_seen("x0", "f0", CAMERA, (1, 2), **how),
+    "point_seen": lambda d, **how: d.point_seen("x0", "l0", CAMERA, (1, 2), **how),
+    "factor": lambda d, **how: d.factor("prior_se2", "x0", (0, 0, 0), **how),
+}
+
+
+def test_every_method_that_takes_a_certainty_is_among_them() -> None:
+    kinds = inspect.Parameter.VAR_KEYWORD
+    takes = {
+        name
+        for name, method in inspect.getmembers(Draft, inspect.isfunction)
+        if not name.startswith("_") and any(p.kind is kinds for p in inspect.signature(method).parameters.values())
+    }
+    assert takes == set(EVERY_METHOD)
+
+
+@pytest.mark.parametrize("method", EVERY_METHOD)
+def test_no_method_swallows_a_certainty_that_is_misspelt_or_missing(method: str) -> None:
+    draft, add = Draft(), EVERY_METHOD[method]
+    for wrong in ("los", "robust", "sigma", "covariance", "sigmas_", "Loss", "noise"):
+        for rest in ({}, {"information": np.eye(3)}):
+            with pytest.raises(BadInformation, match=f"no keyword '{wrong}'"):
+                add(draft, **rest, **{wrong: 0.1})
+    with pytest.raises(BadInformation, match="sigmas"):
+        add(draft)
+    assert draft.batch().factor_count == 0

@@ -51,6 +51,7 @@ OPTIMA: dict[str, Damage] = {
     "chi2_negative": other_chi2(-1.0),
     "chi2_nan": other_chi2(float("nan")),
     "chi2_other": other_chi2(0.5),
+    "start_unknown": lambda right: Optimum(right.chi2, right.iterations, right.variables, "x\0"),
     "values_moved": other_values(moved),
     "values_nan": other_values(to_nan),
     "one_missing": other_values(lambda g: Variables(g.kind, g.keys[1:], g.values[1:])),

@@ -321,7 +321,7 @@ def test_what_is_wrong_is_named_by_its_place(content: dict[str, Any], text: str)
     ("data", "text"),
     [
         (b"", "not readable"),
-        (b"\xc1", "not readable"),
+        (b"\xc1", r"not readable \(a byte 0xc1"),
         (b"\x93\x01", "not readable"),
         (msgpack.packb([1]), "insert: is an array; wanted a map"),
         (msgpack.packb({"sequence": 1}) + b"\x00", "not readable"),

@@ -74,6 +74,16 @@ OPENS = {
         0.00267980137,
         {"PARAMS_CAMERACALIB": 1},
     ),
+    "camera of the sensor's number": (  # g2o has 2.334492698 of it: two parameters of one number
+        "PARAMS_CAMERACALIB 0 0 0 0 0 0 0 1 500 500 320 240\nPARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n" + SEEN,
+        0.00267980137,
+        {"PARAMS_CAMERACALIB": 1},
+    ),
+    "camera of another number": (
+        "PARAMS_CAMERACALIB 1 9 9 9 0 0 0 1 500 500 320 240\nPARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n" + SEEN,
+        0.00267980137,
+        {"PARAMS_CAMERACALIB": 1},
+    ),
     "camera as the sensor": ("PARAMS_CAMERACALIB 0 0.1 0 0.5 0 0 0 1 500 500 320 240\n" + SEEN, 0.00258535361, {}),
     "positions": (
         "\n".join([*LINE, *(f"EDGE_PRIOR_SE2_XY {z} 1 0 1" for z in POSITIONS)]) + "\n",
@@ -154,6 +164,14 @@ def test_a_mixture_is_its_likelier_component(tmp_path: Path, weight: str, is_nul
     scale = float(weight) if is_null else 1.0
     np.testing.assert_allclose(edges.information[-1], scale * np.array([1, 0, 0, 1, 0, 1.0]))
     assert f"{1 - is_null} as measured, {int(is_null)} as the null hypothesis" in graph.notes[0]
+
+
+def test_a_mixture_is_refused_where_nothing_may_be_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.g2o"
+    path.write_text(loop() + f"EDGE_SE2_MAXMIX 0 2 0.5 0 0 0 {INFO3}\n")
+    with pytest.raises(FormatError, match="EDGE_SE2_MAXMIX, of whose components one is read") as refused:
+        read(path, strict=True)
+    assert refused.value.line == 9
 
 
 def test_a_mixture_in_space(tmp_path: Path) -> None:

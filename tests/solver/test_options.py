@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from typing import Any
 
 import pytest
@@ -41,12 +42,21 @@ def test_a_number_out_of_its_range_is_refused_by_name(name: str) -> None:
         [1],
         1j,
         allowed.least - 1,
+        10**400,
         2.5 if allowed.whole else "1",
     ):
         with pytest.raises(BadOption, match=f"option {name}: seen") as refused:
             Options(**{name: wrong})
         assert refused.value.detail["where"] == name
         assert refused.value.detail["wanted"] == str(allowed)
+
+
+@pytest.mark.parametrize(
+    "name", ["tolerance", "tol", "settle_tolerance", "loop_share", "negligible", "ripple", "reluctance"]
+)
+def test_infinity_is_refused_where_nothing_would_be_solved_and_called_converged(name: str) -> None:
+    with pytest.raises(BadOption, match=f"option {name}: seen inf"):
+        Options(**{name: math.inf})
 
 
 @pytest.mark.parametrize("name", [*SWITCHES, "clock", "mode", "backend"])
@@ -62,6 +72,7 @@ def test_any_value_is_taken_as_it_is_or_refused(name: str, value: Any) -> None:
     allowed = RANGES[name]
     number = not isinstance(value, bool) and isinstance(value, int if allowed.whole else (int, float))
     right = number and not math.isnan(value) and allowed.least <= value <= allowed.most
+    right = right and (isinstance(value, float) or abs(value) <= sys.float_info.max)
     right = right and not (allowed.above and value == allowed.least)
     if name in ("small_loop", "big_loop") and right:
         right = value <= Options().big_loop if name == "small_loop" else value >= Options().small_loop

@@ -244,6 +244,38 @@ def test_on_spheres_the_start_is_as_good_as_gtsams(seed: int, noise: float) -> N
     assert ours <= 1.05 * theirs
 
 
+def gtsam_ends(batch: Batch) -> list[tuple[Variables, ...]]:
+    """Where GTSAM's Levenberg-Marquardt ends from composed odometry, and from its chordal start; diagonal weights."""
+    graph = gtsam.NonlinearFactorGraph()
+    for group in batch.factors:
+        for keys, z, packed in zip(group.keys.tolist(), group.measured, group.information, strict=True):
+            weights = packed[[0, 6, 11, 15, 18, 20]] * [1, 1, 1, 0.25, 0.25, 0.25]  # ours are of half angles
+            model = gtsam.noiseModel.Diagonal.Precisions(np.concatenate([weights[3:], weights[:3]]))
+            graph.add(gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(pose_matrix(z)), model))
+    (fixed,) = [g for g in batch.variables if g.fixed]
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    graph.add(gtsam.PriorFactorPose3(int(fixed.keys[0]), gtsam.Pose3(pose_matrix(fixed.values[0])), tight))
+    odometry = gtsam.Values()
+    for key, x in ((k, x) for g in batch.variables for k, x in zip(g.keys.tolist(), g.values, strict=True)):
+        odometry.insert(key, gtsam.Pose3(pose_matrix(x)))
+    ends = []
+    for start in (odometry, gtsam.InitializePose3.initialize(graph)):
+        end = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams()).optimize()
+        values = [np.array([pose_vector(end.atPose3(k).matrix()) for k in g.keys.tolist()]) for g in batch.variables]
+        ends.append(tuple(g if g.fixed else g._replace(values=x) for g, x in zip(batch.variables, values, strict=True)))
+    return ends
+
+
+@pytest.mark.parametrize("noise", [0.2, 0.25])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_on_spheres_of_much_noise_no_end_of_gtsams_is_lower(seed: int, noise: float) -> None:
+    """Nor do the values that are given make it worse, wherever they are."""
+    batch = whole(sphere(poses=300, seed=seed, ring=25, rings=12, sigma_rotation_rad=noise))
+    found = solve_batch(batch.variables, batch.factors)
+    for values in (*gtsam_ends(batch), scattered(batch, seed).variables):
+        assert solve_batch(values, batch.factors).chi2 == pytest.approx(found.chi2, rel=1e-6)
+
+
 def torus(ring: int, rings: int, seed: int, noise: float) -> Batch:
     """A spiral over a torus, each pose joined to the next and to the one a turn later."""
     rng = np.random.default_rng(seed)

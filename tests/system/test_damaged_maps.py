@@ -88,6 +88,56 @@ def test_a_damaged_map_can_be_seen_and_given_up(services: Callable[..., Services
         assert {row.name: row.state for row in bus.maps()} == {"hall": "open", "m": "open"}
 
 
+def spoil(folder: Path, how: str) -> None:
+    """What a disk may do to the files of a map."""
+    database = folder / NAME
+    if how == "gone":
+        database.unlink()
+    elif how == "log":
+        log = database.with_name(f"{NAME}-wal")
+        content = bytearray(log.read_bytes())
+        content[len(content) // 3] ^= 1
+        log.write_bytes(content)
+    elif how == "page":
+        with database.open("r+b") as file:
+            file.seek(4096)
+            file.write(bytes(4096))
+    else:
+        with sqlite3.connect(database) as connection:
+            connection.execute("DELETE FROM epoch")
+        connection.close()
+
+
+HOWS = {"gone": signal.SIGKILL, "log": signal.SIGKILL, "page": signal.SIGTERM, "rows": signal.SIGTERM}
+
+
+@pytest.mark.parametrize("how", HOWS)
+def test_whatever_a_disk_did_to_one_map_is_told_and_the_others_work(
+    services: Callable[..., Services], tmp_path: Path, how: str
+) -> None:
+    service = services(tmp_path / "journal")
+    with connect(service.start(), client="before", timeout_s=60) as bus:
+        for name in ("m", "hall"):
+            fill(bus, name, 30)
+    service.end(HOWS[how])
+    spoil(tmp_path / "journal" / "m", how)
+    checked = factorbus("journal", "check", "--journal", str(tmp_path / "journal"))
+    assert (checked.returncode, checked.stderr) == (1, "")
+    hall, m = checked.stdout.split("m: NOT SOUND\n")
+    assert hall == "hall: sound\n"
+    assert m.startswith("  ")
+    with connect(service.start(), client="after", timeout_s=60) as bus:
+        hall, m = bus.maps()
+        assert (hall.name, hall.state) == ("hall", "open")
+        assert hall.revision >= 30, "further steps may have come of themselves"
+        assert (m.name, m.state) == ("m", "damaged")
+        with bus.map("hall", mirror=False) as joined:
+            added = joined.insert(drafts(31)[30]).revision
+        bus.drop("m", damaged=True)
+        assert not (tmp_path / "journal" / "m").exists()
+        assert bus.fork("hall", "m").revision >= added
+
+
 def test_a_form_that_is_not_ours_is_another_state(services: Callable[..., Services], tmp_path: Path) -> None:
     service = services(tmp_path / "journal")
     with connect(service.start(), client="before", timeout_s=60) as bus:

@@ -76,8 +76,8 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.mark.parametrize(
     "fault",
     [
-        *BOTH, "refuses_the_graph", "chi2_negative", "chi2_nan", "chi2_other", "values_moved", "values_nan",
-        "one_missing", "other_keys", "one_twice", "other_kind_of_variable",
+        *BOTH, "refuses_the_graph", "chi2_negative", "chi2_nan", "chi2_other", "start_unknown", "values_moved",
+        "values_nan", "one_missing", "other_keys", "one_twice", "other_kind_of_variable",
     ],
 )  # fmt: skip
 def test_a_wrong_optimum_is_found_anew(bench: Bench, fault: str) -> None:

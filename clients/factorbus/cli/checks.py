@@ -75,10 +75,11 @@ def cache() -> Finding:
     """the cache of compiled kernels"""
     folder = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
     try:
-        make_private("the cache of compiled kernels", folder)
+        # What is made in it is looked at, as by those who load it: a volume of a container may itself be everybody's.
+        make_private("the cache of compiled kernels", folder / "kernels")
         for inside in (path for path in folder.glob("*/*") if path.is_dir()):
             check_folder("the cache of compiled kernels", inside)
-        tempfile.TemporaryFile(dir=folder).close()
+        tempfile.TemporaryFile(dir=folder / "kernels").close()
     except UnsafeFolder as unsafe:
         return Finding("kernel cache", "fail", unsafe.message, "compiled kernels are code: who can write there runs it")
     except OSError as error:

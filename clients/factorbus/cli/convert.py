@@ -50,9 +50,9 @@ def command(
     from factorbus.cli.screen import document, note
 
     graph = read_graph(source, dialect, strict)
-    files, notes = _written(graph, target, strict, robot, ids)
+    _check_any(graph, target)
+    files, notes, counts = _written(graph, target, strict, robot, ids)
     say(target, notes)
-    counts = {"poses": graph.poses, "landmarks": graph.landmarks, "factors": graph.batch.factor_count}
     if as_json:
         about = {"source": str(source), "read": graph.account(), "files": [str(file) for file in files]}
         document({**about, "notes": list(notes), **counts})
@@ -60,14 +60,38 @@ def command(
     note(f"{', '.join(map(str, files))}: {told}")
 
 
+def _check_any(graph: "GraphFile", target: Path) -> None:
+    """Raises FormatError where nothing of `graph` would be in `target`."""
+    from factorbus.formats import FormatError
+
+    if target.suffix == ".g2o" and not (graph.batch.variable_count or graph.batch.factor_count):
+        raise FormatError(
+            graph.path, None, "nothing that a .g2o would have", "at least one vertex or edge that is read"
+        )
+    if target.suffix != ".g2o" and not graph.poses:
+        raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
+
+
 def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
-) -> tuple[list[Path], tuple[str, ...]]:
-    """(the files, what was left out of them)."""
-    from factorbus.formats import write_g2o, write_kitti, write_tum
+) -> tuple[list[Path], tuple[str, ...], dict[str, int]]:
+    """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
+    from factorbus.formats import tum_notes, write_g2o, write_kitti, write_tum
+    from factorbus.formats.left_out import LeftOut
+    from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
 
+    counts = {"poses": graph.poses, "landmarks": graph.landmarks, "factors": graph.batch.factor_count}
     if target.suffix == ".g2o":
         same = graph.numbering if graph.numbering != "ids" else "auto"
-        return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids)
-    write = write_tum if target.suffix == ".tum" else write_kitti
-    return write(target, graph.batch, robot), ()
+        return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids), counts
+    form = target.suffix[1:].upper()
+    found = trajectories(graph.batch, form)
+    chosen = [one_trajectory(graph.batch, form, robot)] if robot is not None else list(found.values())
+    left = LeftOut(str(target))
+    for name in ("landmarks", "factors"):
+        left.drop(name, counts[name], "a trajectory has poses alone")
+    left.drop("poses", graph.poses - sum(map(len, chosen)), f"of other robots than {robot!r}")
+    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: ())
+    untold = sum(len(untimed(rows)) for rows in chosen) if form == "TUM" else 0
+    written = {"poses": sum(map(len, chosen)) - untold, "landmarks": 0, "factors": 0}
+    return write(target, graph.batch, robot), (*left.notes, *notes(graph.batch, robot)), written

@@ -60,21 +60,31 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
 @_FOLDER
 def check(names: tuple[str, ...], folder: Path) -> int:
     """Is it sound: the database, every insert's bytes, every client's numbers, every snapshot? Exit code 1: no."""
-    from factorbus.journal.snapshots import file_of, read_snapshot
-
     sound = True
-    for name, store in _stores(folder, names):
-        wrong = list(store.check())
-        for saved in store.snapshots():
-            try:
-                read_snapshot(file_of(store.path.parent, saved.fold))
-            except (OSError, ValueError) as error:
-                wrong.append(f"{error}; the map opens without it, and takes longer")
+    for name in _names(folder, names):
+        wrong = list(_wrong_with(folder / name))
         click.echo(f"{name}: {'sound' if not wrong else 'NOT SOUND'}")
         for each in wrong:
             click.echo(f"  {each}")
         sound = sound and not wrong
     return OK if sound else FAILED
+
+
+def _wrong_with(folder: Path) -> Iterator[str]:
+    """What is wrong with the journal in `folder`, also where it does not open."""
+    from factorbus.journal.snapshots import file_of, read_snapshot
+    from factorbus.proto.problems import Problem
+
+    try:
+        with _open(folder) as store:
+            yield from store.check()
+            for saved in store.snapshots():
+                try:
+                    read_snapshot(file_of(store.path.parent, saved.fold))
+                except (OSError, ValueError) as error:
+                    yield f"{error}; the map opens without it, and takes longer"
+    except Problem as problem:
+        yield str(problem.detail.get("what") or problem.message)
 
 
 @command.command()
@@ -111,17 +121,24 @@ def verify(names: tuple[str, ...], folder: Path) -> int:
 
 def _stores(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
     """Each of `names`, or each there is, with its journal open for reading.  Raises Problem."""
+    for name in _names(folder, names):
+        with _open(folder / name) as store:
+            yield name, store
+
+
+def _names(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """`names`, or those of all maps in `folder`.  Raises NoJournal."""
+    from factorbus.journal.folders import maps_in
     from factorbus.journal.problems import NoJournal
     from factorbus.journal.store import NAME
 
-    there = tuple(sorted(path.parent.name for path in folder.glob(f"*/{NAME}")))
+    there = tuple(maps_in(folder, NAME)) if folder.is_dir() else ()
     if not there:
         raise NoJournal(folder)
-    for name in names or there:
+    for name in names:
         if name not in there:
             raise NoJournal(folder / name, there)
-        with _open(folder / name) as store:
-            yield name, store
+    return names or there
 
 
 @contextmanager

@@ -40,7 +40,8 @@ def read_map(what: str, data: bytes, limits: Limits) -> Map:
     except (ValueError, TypeError, OverflowError) as error:
         if found := _TOO_MANY.match(str(error)):
             raise TooLarge(what, int(found[1]), limits.max_elements, "elements in one array or map") from None
-        raise BadMessage(what, f"not readable ({error})", "one MessagePack map, and nothing after it") from None
+        why = str(error) or "a byte 0xc1, which begins nothing in MessagePack"
+        raise BadMessage(what, f"not readable ({why})", "one MessagePack map, and nothing after it") from None
     if type(content) is not dict:
         raise BadMessage(what, f"is {_name(content)}", "a map")
     return content

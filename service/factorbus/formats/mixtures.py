@@ -24,8 +24,10 @@ from factorbus.proto.kinds import FACTOR_KINDS
 
 
 def best_components(file: str, mixed: Lead, vertices: Sequence[VertexColumns], left: LeftOut) -> EdgeColumns:
-    """The edges of `mixed`, each as its more likely component.  Raises FormatError for a weight below 0."""
+    """The edges of `mixed`, each as its more likely component.  Raises FormatError: a weight below 0, or strict."""
     columns, weight = mixed.columns, mixed.weight
+    if left.strict:
+        left.leave(mixed.name, columns.lines, "of whose components one is read")
     refuse_first(
         file, columns.lines, weight < 0, lambda row: f"{mixed.name} with the weight {weight[row]:g}", "one of 0 or more"
     )

@@ -14,8 +14,13 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def maps_in(folder: Path, file: str) -> list[str]:
-    """The maps in `folder`: names of folders that have `file`, in order."""
-    return sorted(p.parent.name for p in folder.glob(f"*/{file}") if _NAME.fullmatch(p.parent.name) and p.is_file())
+    """The maps in `folder`: names of folders that have `file`, or what is written beside it, in order."""
+    return sorted(path.name for path in folder.iterdir() if _NAME.fullmatch(path.name) and is_map(path, file))
+
+
+def is_map(folder: Path, file: str) -> bool:
+    """Whether `folder` has `file`, or what is written beside it."""
+    return any(path.is_file() for kind in (f"{file}*", "snapshot-*") for path in folder.glob(kind))
 
 
 def left_behind(folder: Path) -> list[Path]:

@@ -1,33 +1,28 @@
-"""A journal's database: the one file that touches SQLite.
+"""A journal's database: what is in its tables, and how it is written.
 
 Written by one process, and read by others at the same time (WAL).  One transaction takes in all folds that wait for it
 (group commit); it is there after a crash wholly or not at all.
 """
 
 import json
-import os
 import shutil
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from hashlib import blake2b
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from factorbus.journal import chain
+from factorbus.journal.connecting import APPLICATION, FORM, connected, connection_to, what_reading_failed_with
 from factorbus.journal.digest import digest_of
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
-from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
+from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
 from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
 from factorbus.ownership import private_file
 
 NAME = "journal.db"
-FORM = 3  # 2: the answer to what was accepted was not kept whole
-_APPLICATION = 0x46427573  # "FBus"
-_LOG_BYTES = 64 << 20  # what a log that was longer is cut to, once it is in the database
-# Ways to open it for reading.  The last: where no file can be made beside it, which the log of a database needs.
-_AS_IT_IS = "ro&immutable=1"
-_WAYS_TO_READ = ("ro", _AS_IT_IS)
-_SYNCHRONOUS = {"none": "OFF", "group": "FULL", "commit": "FULL"}
 _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
@@ -74,15 +69,13 @@ class Store:
     def header(self) -> Header:
         """What the journal says of itself.  Raises JournalDamaged."""
         with self._reading():
-            named = dict(self._db.execute("SELECT name, value FROM header"))
-            epochs = [Epoch(*row) for row in self._db.execute("SELECT epoch, fold, because FROM epoch ORDER BY number")]
-        try:
+            named, epochs = self._header(), self._epochs()
+            if named.get("seal") != _sealed(named, epochs):
+                raise JournalDamaged(self.path, "its header is not what was written")
             return Header(
                 named["map"], named["mode"], json.loads(named["options"]), tuple(epochs), named["durability"],
                 named["clean"] == "1",
             )  # fmt: skip
-        except (KeyError, ValueError) as missing:
-            raise JournalDamaged(self.path, f"its header lacks {missing}") from None
 
     def last(self) -> Last:
         """Where it ends.  Raises JournalDamaged."""
@@ -178,9 +171,10 @@ class Store:
     def begin(self, durability: str, epoch: Epoch | None = None) -> None:
         """Somebody is at work with it from now on, in a new epoch if there is one.  Raises JournalFailed."""
         with self._writing():
+            self._set({"clean": "0", "durability": durability})
             if epoch is not None:
                 self._add_epoch(epoch)
-            self._set({"clean": "0", "durability": durability})
+                self._seal()
 
     def end(self) -> None:
         """It is left in order: nothing that was answered is missing.  Raises JournalFailed."""
@@ -201,6 +195,7 @@ class Store:
             if saved is not None:
                 self._db.execute("INSERT INTO snapshot VALUES (?, ?, ?)", saved)
             self._set({"map": name, "clean": "1"})
+            self._seal()
 
     def probe(self) -> None:
         """Can something be written again, and some room be had?  Raises JournalFailed."""
@@ -208,6 +203,13 @@ class Store:
             self._db.execute("INSERT OR REPLACE INTO header VALUES ('probe', ?)", ("." * (256 << 10),))
         with self._writing():
             self._db.execute("DELETE FROM header WHERE name = 'probe'")
+
+    def check_form(self) -> None:
+        """That tables and index are what SQLite made, not yet what is in them.  Raises JournalDamaged."""
+        with self._reading():
+            (said,) = self._db.execute("PRAGMA integrity_check(1)").fetchone()
+        if said != "ok":
+            raise JournalDamaged(self.path, said)
 
     def check(self) -> Iterator[str]:
         """Everything that is wrong with it: by SQLite's own check, by inserts' bytes, by clients' numbers."""
@@ -221,9 +223,10 @@ class Store:
                 if fold.revision < revision:
                     yield f"fold {fold.number} goes back from revision {revision} to {fold.revision}"
                 revision = fold.revision
+            self.header()
         except JournalDamaged as damaged:
             yield str(damaged.detail["what"])
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             yield str(error)
 
     def copy_to(self, path: Path) -> None:
@@ -262,9 +265,20 @@ class Store:
             yield
         except sqlite3.DatabaseError as error:
             raise what_reading_failed_with(self.path, error) from None
+        except (ValueError, TypeError, OverflowError, IndexError) as error:
+            raise JournalDamaged(self.path, f"a row of it cannot be read ({error})") from None
 
     def _set(self, values: dict[str, str]) -> None:
         self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
+
+    def _header(self) -> dict[str, str]:
+        return dict(self._db.execute("SELECT name, value FROM header"))
+
+    def _epochs(self) -> list[Epoch]:
+        return [Epoch(*row) for row in self._db.execute("SELECT epoch, fold, because FROM epoch ORDER BY number")]
+
+    def _seal(self) -> None:
+        self._set({"seal": _sealed(self._header(), self._epochs())})
 
     def _add_epoch(self, epoch: Epoch) -> None:
         self._db.execute(
@@ -283,16 +297,18 @@ class Store:
         )
         entries: list[Entry] = []
         for row in rows:
-            entry = Entry(*row)
+            entry = self._checked(Entry(*row))
             if entries and entry.sequence != entries[-1].sequence - 1:
                 break  # a name that was forgotten and used again began at 1
             entries.append(entry)
+        if not entries:
+            raise JournalDamaged(self.path, f"client {name}, who is in its index, has no insert")
         return Sender(name, entries[0].sequence + 1, tuple(reversed(entries)))
 
     def _check_sequences(self) -> Iterator[str]:
         """Each client's numbers are 1, 2, 3, ... in every epoch."""
         begins = [fold for (fold,) in self._db.execute("SELECT fold FROM epoch ORDER BY number")]
-        for first, end in zip(begins, [*begins[1:], 1 << 62], strict=True):
+        for first, end in pairwise([*begins, 1 << 62]):
             rows = self._db.execute(
                 "SELECT client, sequence, sequence - LAG(sequence, 1, 0) OVER (PARTITION BY client ORDER BY number) "
                 "FROM entry WHERE fold >= ? AND fold < ?", (first, end),
@@ -323,30 +339,19 @@ def open_store(folder: Path, durability: str = "commit", read_only: bool = False
 
     Raises NoJournal, UnsafeJournal, JournalDamaged, JournalVersion, JournalUnreadable.
     """
-    path, ways = folder / NAME, _WAYS_TO_READ if read_only else ("rw", *_WAYS_TO_READ)
+    path = folder / NAME
     if not path.is_file():
         raise NoJournal(path)
     if not read_only:
         check_own(folder)
-    why = ""
-    for way in ways:
-        if way == _AS_IT_IS and _has_log(path):
-            continue
-        try:
-            connection = _connect(path, way, durability)
-            return Store(path, connection, way == "rw" and _is_writable(path, connection))
-        except sqlite3.DatabaseError as error:
-            if isinstance(problem := what_reading_failed_with(path, error), JournalDamaged):
-                raise problem from None
-            why = why or str(error)
-    raise JournalUnreadable(path, why)
+    return Store(path, *connected(path, durability, read_only))
 
 
-def what_reading_failed_with(path: Path, error: sqlite3.Error) -> JournalDamaged | JournalUnreadable:
-    """Is it the journal that is wrong, or what it is on?"""
-    if (getattr(error, "sqlite_errorcode", 0) & 0xFF) in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-        return JournalDamaged(path, str(error))
-    return JournalUnreadable(path, str(error))
+def _sealed(named: Mapping[str, str], epochs: Sequence[Epoch]) -> str:
+    """A digest of what makes a map's steps, and of its lives."""
+    rows = [[each.epoch, each.fold, each.because] for each in epochs]
+    content = json.dumps([named.get("mode"), named.get("options"), rows])
+    return blake2b(content.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
 
 
 def _replaced(fold: Fold) -> int:
@@ -358,7 +363,7 @@ def _replaced(fold: Fold) -> int:
 
 def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:
     open(path, "xb", opener=private_file).close()  # SQLite gives its log the same rights
-    store = Store(path, _connect(path, "rwc", durability), True)
+    store = Store(path, connection_to(path, "rwc", durability), True)
     try:
         with store._writing():
             for statement in _SCHEMA.split(";"):
@@ -367,53 +372,8 @@ def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int,
             store._set(
                 {"map": name, "mode": mode, "options": json.dumps(options), "durability": durability, "clean": "0"}
             )
-            store._db.execute(f"PRAGMA application_id = {_APPLICATION}")
+            store._seal()
+            store._db.execute(f"PRAGMA application_id = {APPLICATION}")
             store._db.execute(f"PRAGMA user_version = {FORM}")
     finally:
         store.close()
-
-
-def _has_log(path: Path) -> bool:
-    """Is there something that is not in the database yet?"""
-    try:
-        return path.with_name(f"{path.name}-wal").stat().st_size > 0
-    except OSError:
-        return False
-
-
-def _connect(path: Path, mode: str, durability: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, isolation_level=None, check_same_thread=False, timeout=10.0
-    )
-    try:
-        if mode in ("rw", "rwc"):
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute(f"PRAGMA synchronous = {_SYNCHRONOUS[durability]}")
-            connection.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
-        if mode != "rwc":
-            _check_form(path, connection)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _check_form(path: Path, connection: sqlite3.Connection) -> None:
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
-    (form,) = connection.execute("PRAGMA user_version").fetchone()
-    if application != _APPLICATION:
-        raise JournalDamaged(path, "it is a database of something else")
-    if form != FORM:
-        raise JournalVersion(path, form, FORM)
-
-
-def _is_writable(path: Path, connection: sqlite3.Connection) -> bool:
-    # SQLite opens for reading what cannot be opened for writing, and says nothing until something is written.
-    if not os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK):
-        return False
-    try:
-        connection.execute("BEGIN IMMEDIATE")
-        connection.execute("ROLLBACK")
-    except sqlite3.OperationalError:
-        return False
-    return True

@@ -152,11 +152,14 @@ def _value(kind: Any, value: Any, where: str) -> Any:
         if not isinstance(value, list):
             raise BadConfig(f"{where} is {value!r}; wanted an array")
         return tuple(_value(item, entry, where) for entry in value)
-    if kind is float and type(value) is int:
+    if kind is float and type(value) is int and abs(value) < _MOST_S:
         return float(value)
     if type(value) is not kind:
         raise BadConfig(f"{where} is {value!r}; wanted {_NAMES[kind]}")
+    if kind is float and not abs(value) < _MOST_S:
+        raise BadConfig(f"{where} is {value!r}; wanted a number below {_MOST_S:g}")
     return value
 
 
+_MOST_S = 1e9  # what clocks and waiting threads can count
 _NAMES = types.MappingProxyType({int: "a whole number", float: "a number", str: "a string", bool: "true or false"})

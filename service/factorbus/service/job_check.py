@@ -1,7 +1,8 @@
 """Whether what a worker answers can be the answer to its job: nothing of it is passed on before.  Pure.
 
     any job   its name and kind; a payload that can be read; seconds that are a time
-    batch     all free variables of the graph, once each, of their kind, finite; χ² is that of these values
+    batch     all free variables of the graph, once each, of their kind, finite; χ² is that of these values; a start
+              that there is
     idp       the features that were asked for, all arrays of the form with their shapes; y begins where the camera is
               and ends with the prior of ρ; finite
 
@@ -18,7 +19,7 @@ from factorbus.proto import codec
 from factorbus.proto.features import FEATURE, Ask, ShardDone
 from factorbus.proto.features_codec import decode_ask, decode_shard, decode_shard_done
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.messages import Job, JobDone, Variables
+from factorbus.proto.messages import STARTS, Job, JobDone, Variables
 from factorbus.proto.problems import Problem
 from factorbus.solver.errors import SolverError
 from factorbus.wording import counted
@@ -70,6 +71,8 @@ def _check_optimum(payload: bytes, answer: bytes) -> None:
     from factorbus.solver import chi2_at
 
     graph, optimum = codec.decode_graph(payload).batch, codec.decode_optimum(answer)
+    if optimum.start not in (*STARTS, ""):
+        raise WrongAnswer(f"answered a batch job from the start {optimum.start[:32]!r}; there are {', '.join(STARTS)}")
     _check_keys(_kinds(graph.variables), _kinds(optimum.variables), _kinds(graph.variables, fixed=False))
     if not math.isfinite(optimum.chi2) or not all(_is_finite(group) for group in optimum.variables):
         raise DoubtfulAnswer("answered a batch job with numbers that are not finite")

@@ -9,14 +9,15 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from factorbus.journal.folders import GONE, left_behind, maps_in, sync_folder
+from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
-from factorbus.journal.problems import JournalFailed, JournalOption
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
 from factorbus.journal.records import Epoch, Header
 from factorbus.journal.snapshots import remove_strangers
 from factorbus.journal.store import NAME, Last, Store, create, open_store
 from factorbus.proto.nearest import nearest
+from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
 from factorbus.service.core import MapCore, Restored
 from factorbus.service.fold import Folder
@@ -67,7 +68,7 @@ class Library:
 
     def has(self, name: str) -> bool:
         """Whether there is a map of this name."""
-        return (self._owned.folder / name / NAME).is_file()
+        return is_map(self._owned.folder / name, NAME)
 
     def is_taken(self, name: str) -> bool:
         """Whether a new map cannot have this name: there is one, or a folder that is something else."""
@@ -90,12 +91,20 @@ class Library:
 
     def open(self, name: str, limits: Limits) -> "Kept":
         """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
-        store = open_store(self._owned.folder / name, self._config.durability)
+        path = self._owned.folder / name
+        try:
+            store = open_store(path, self._config.durability)
+        except NoJournal:
+            raise JournalDamaged(path, f"{NAME} is missing beside what was written with it") from None
         try:
             return _reopened(store, limits, self._config)
-        except BaseException:
+        except Problem:
             store.close()
             raise
+        except Exception as fault:  # one map that nobody thought of keeps no other from coming back
+            store.close()
+            log.exception("%s: a fault while it was opened", path)
+            raise JournalDamaged(path, f"opening it ends in {type(fault).__name__} ({fault})") from fault
 
     def fork(self, source: str, target: str, fold: int, state: Mapping[str, Any], limits: Limits) -> "Kept":
         """A new map `target` with a journal, which is in `state` as `source` was after `fold`.  Raises Problem."""
@@ -194,7 +203,9 @@ def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> L
 def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
     from factorbus.solver import fingerprint
 
-    started, header = time.perf_counter(), store.header()
+    started = time.perf_counter()
+    store.check_form()
+    header = store.header()
     folder = make_folder(header.mode, header.options, header.epoch, limits)
     recovered = recover(store, folder, fingerprint())
     if store.writable:

@@ -1,6 +1,7 @@
 """Which values each number among the options may have: its type, the least and the most."""
 
 import math
+import sys
 import types
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +10,7 @@ from factorbus.solver.errors import BadOption
 
 # Counts go into float64 settings of the kernels, where whole numbers beyond this are no longer exact.
 _MOST_COUNT = 2**53
+_MOST_NUMBER = int(sys.float_info.max)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,8 @@ class Range:
         """Whether `value` is such a number."""
         if isinstance(value, bool) or not isinstance(value, int if self.whole else (int, float)):
             return False
+        if not self.whole and isinstance(value, int) and abs(value) > _MOST_NUMBER:
+            return False
         return (value > self.least if self.above else value >= self.least) and value <= self.most
 
 
@@ -38,20 +42,21 @@ def _count(least: int) -> Range:
     return Range(least, _MOST_COUNT, whole=True)
 
 
-_SHARE, _AMOUNT, _FACTOR = Range(0.0, 1.0), Range(), Range(above=True)
+_SHARE, _FINITE, _AMOUNT, _FACTOR = Range(0.0, 1.0), Range(most=1e9), Range(), Range(above=True)
 
-# An amount may be infinite: what it is the threshold of then never happens.
+# An amount may be infinite: what it is the threshold of then never happens.  Where that would be to solve nothing, and
+# to say that it has converged, it is a share, or finite.
 RANGES = types.MappingProxyType(
     {
-        "tolerance": _AMOUNT,
-        "tol": _AMOUNT,
+        "tolerance": _SHARE,
+        "tol": _FINITE,
         "small_loop": _count(0),
         "big_loop": _count(0),
-        "loop_share": _AMOUNT,
-        "negligible": _AMOUNT,
+        "loop_share": _FINITE,
+        "negligible": _SHARE,
         "max_iterations": _count(0),
         "nonmonotone_steps": _count(0),
-        "settle_tolerance": _AMOUNT,
+        "settle_tolerance": _SHARE,
         "settle_iterations": _count(0),
         "recent_poses": _count(1),
         "bent": _AMOUNT,
@@ -61,11 +66,11 @@ RANGES = types.MappingProxyType(
         "bent_most": _AMOUNT,
         "patience": _count(0),
         "rest": _count(0),
-        "reluctance": _AMOUNT,
+        "reluctance": _FINITE,
         "dear": _FACTOR,
         "rounds": _count(1),
         "converged_share": _AMOUNT,
-        "ripple": _AMOUNT,
+        "ripple": _SHARE,
         "recent_steps": _count(0),
         "heavy": _AMOUNT,
         "near": Range(0.0, 1e6),
