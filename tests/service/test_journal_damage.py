@@ -20,7 +20,7 @@ from factorbus.service.library import open_library
 
 PAGE, FRAME = 4096, 4096 + 24
 LOG, INDEX = f"{NAME}-wal", f"{NAME}-shm"
-OPTIONS = {"mode": "tree", "tol": 5e-5}
+OPTIONS = {"mode": "bayes-tree", "tol": 5e-5}
 
 
 def entry(client: str, sequence: int, message: bytes) -> Entry:
@@ -36,7 +36,7 @@ def fold(number: int) -> Fold:
 
 def written(folder: Path, durability: str = "commit", name: str = "m") -> Path:
     """Forty transactions, as a process that was killed leaves them: in the log, and counted by its index."""
-    made = create(folder / "alive" / name, name, "tree", OPTIONS, 77, durability)
+    made = create(folder / "alive" / name, name, "bayes-tree", OPTIONS, 77, durability)
     for number in range(1, 41):
         made.append([fold(number)])
     left = folder / name
@@ -200,7 +200,7 @@ def test_whatever_is_damaged_is_said_or_all_there(tmp_path: Path, left: Callable
         except (JournalDamaged, JournalVersion):
             found += 1
             continue
-        assert (header.map, header.mode, header.options) == ("m", "tree", OPTIONS), seed  # type: ignore[attr-defined]
+        assert (header.map, header.mode, header.options) == ("m", "bayes-tree", OPTIONS), seed  # type: ignore[attr-defined]
         assert header.epochs == (Epoch(77, 1, "created"),), seed  # type: ignore[attr-defined]
         assert [each._replace(chain=b"") for each in folds] == [fold(n)._replace(chain=b"") for n in range(1, 41)], (
             seed
@@ -216,7 +216,7 @@ def test_whatever_is_damaged_is_said_or_all_there(tmp_path: Path, left: Callable
         "UPDATE epoch SET epoch = 78",
         "UPDATE epoch SET because = x'ff'",
         "UPDATE header SET value = 'inc-l' WHERE name = 'mode'",
-        """UPDATE header SET value = '{"mode": "tree", "tol": 6e-5}' WHERE name = 'options'""",
+        """UPDATE header SET value = '{"mode": "bayes-tree", "tol": 6e-5}' WHERE name = 'options'""",
         "UPDATE header SET value = '[1]' WHERE name = 'options'",
         "UPDATE header SET value = CAST(x'ff' AS TEXT) WHERE name = 'mode'",
         "DELETE FROM header WHERE name = 'seal'",

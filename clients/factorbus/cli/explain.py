@@ -3,6 +3,7 @@
 import difflib
 import re
 import shutil
+import textwrap
 from pathlib import Path
 
 import click
@@ -35,7 +36,8 @@ def command(code: str | None) -> None:
     if code is None:
         width = shutil.get_terminal_size((120, 24)).columns
         for name, text in pages.items():
-            click.echo(click.wrap_text(f"{name:<22} {_summary(text)}", width, subsequent_indent=23 * " "))
+            line = f"{name:<22} {_summary(text)}"
+            click.echo(textwrap.fill(line, width, subsequent_indent=23 * " ", break_on_hyphens=False))
         return
     name = code_of(code)
     if name not in pages:
