@@ -265,8 +265,8 @@ class Store:
             yield
         except sqlite3.DatabaseError as error:
             raise what_reading_failed_with(self.path, error) from None
-        except (ValueError, TypeError, OverflowError, IndexError) as error:
-            raise JournalDamaged(self.path, f"a row of it cannot be read ({error})") from None
+        except (ValueError, TypeError, OverflowError, LookupError) as error:
+            raise JournalDamaged(self.path, f"a row of it is missing or cannot be read ({error})") from None
 
     def _set(self, values: dict[str, str]) -> None:
         self._db.executemany("INSERT OR REPLACE INTO header VALUES (?, ?)", list(values.items()))
