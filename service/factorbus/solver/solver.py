@@ -1,7 +1,8 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -301,6 +302,13 @@ class Solver:
         In the mode "tree" that is its R, linearised where it is; in the others one made here, at the estimate.
         """
         return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
+
+    def factoring(self) -> Callable[[], Factored]:
+        """What gives `factored` as of now, on any thread and later: R is copied here, or else what it is made from."""
+        if self._tree:
+            found = self.factored()
+            return lambda: found
+        return partial(factored_anew, self._graph.copied())
 
     def try_view(self) -> Factored | None:
         """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
