@@ -1,13 +1,51 @@
 """A drive whose heading has drifted, and the loop that closes then: too much turns for one step to finish."""
 
 import math
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from factorbus.client import Draft
+from processes import PATIENCE_S
+
+from factorbus.client import Draft, Map
 from factorbus.journal.store import create
-from factorbus.proto.messages import Batch
+from factorbus.proto.messages import Batch, Delta
+from factorbus.service.fold import GOES_ON
 from factorbus.solver import Options, Solver
+
+# The first finishes in a few steps, the second in hundreds of short ones.
+SHORT, LONG = (200, 90.0), (1000, 90.0)
+
+
+class Deltas:
+    """What is published of a map from now on."""
+
+    def __init__(self, joined: Map) -> None:
+        self.all: list[Delta] = []
+        self._more = threading.Condition()
+        joined.estimate.on_delta(self._take)
+
+    def _take(self, delta: Delta) -> None:
+        with self._more:
+            self.all.append(delta)
+            self._more.notify_all()
+
+    def wait_for_further(self, count: int) -> None:
+        with self._more:
+            assert self._more.wait_for(lambda: len(self.further()) >= count, PATIENCE_S)
+
+    def further(self) -> list[Delta]:
+        return [delta for delta in self.all if str(delta.report.get("because")).startswith(GOES_ON)]
+
+
+def turn(joined: Map, size: tuple[int, float]) -> Deltas:
+    """The drive, and then the loop; what comes from that on."""
+    poses, _ = size
+    joined.insert(in_one(*size))
+    joined.wait_converged(PATIENCE_S)
+    deltas = Deltas(joined)
+    joined.insert(closing(poses))
+    return deltas
 
 
 def drive(poses: int, degrees: float) -> Iterator[Batch]:

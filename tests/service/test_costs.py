@@ -112,7 +112,7 @@ def test_what_there_is_no_memory_for_is_refused_with_the_limit(
 @pytest.mark.parametrize("count", [3000, 30_000, 1_000_000])
 def test_many_keys_are_refused_before_r_is_copied(solver: Solver, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Known ones or not, a key given again and again among them."""
-    monkeypatch.setattr(Solver, "factored", lambda _: pytest.fail("R was copied"))
+    monkeypatch.setattr(Solver, "factoring", lambda _: pytest.fail("R was copied"))
     for keys in (np.arange(count), np.zeros(count, np.int64)):
         problem = refused(solver, "covariance", ask_joint(keys), Room(answer_bytes=64 << 20))
         assert (problem.code, problem.detail["limit"]) == ("too_large", 64 << 20)
@@ -143,7 +143,7 @@ def test_the_cost_is_not_below_the_answer() -> None:
     made = Solver(Options())
     made.stage(Batch((Variables("se2", np.arange(9), np.zeros((9, 3)), fixed=True),), ()))
     made.step()
-    blocks, here = Blocks(made.factored()), Uncertain(made.factored(), 7, 1, True, {})
+    blocks, here = Blocks(made.factored()), Uncertain(made.factoring(), 7, 1, True, {})
     rows, columns = np.arange(9), np.arange(4)
     asked: list[tuple[AskCovariance, costs.Cost]] = [
         (AskCovariance("joint", rows), costs.of_matrix(blocks, rows, rows)),

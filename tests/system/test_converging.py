@@ -2,7 +2,6 @@
 
 import asyncio
 import signal
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,14 +11,12 @@ import numpy as np
 import pytest
 from journalled import Services, rows
 from processes import PATIENCE_S
-from turned import closing, in_one, optimum, prepare
+from turned import LONG, SHORT, Deltas, closing, in_one, optimum, prepare, turn
 
 from factorbus.client import Bus, Draft, Map, aio, connect
 from factorbus.journal.records import Fold
 from factorbus.journal.store import open_store
-from factorbus.proto.messages import Delta
 from factorbus.service.config import Limits
-from factorbus.service.fold import GOES_ON
 from factorbus.service.library import make_folder
 from factorbus.service.recovery import verify
 from factorbus.simulate import WORLDS
@@ -27,39 +24,6 @@ from factorbus.solver import Options, Solver
 
 # With so many further steps, and more, for the map that is LONG and only goes downhill.
 MODES = {"all-batch": 20, "inc-l": 20, "bayes-tree": 0}
-# The first finishes in a few steps, the second in hundreds of short ones.
-SHORT, LONG = (200, 90.0), (1000, 90.0)
-
-
-class Deltas:
-    """What is published of a map from now on."""
-
-    def __init__(self, joined: Map) -> None:
-        self.all: list[Delta] = []
-        self._more = threading.Condition()
-        joined.estimate.on_delta(self._take)
-
-    def _take(self, delta: Delta) -> None:
-        with self._more:
-            self.all.append(delta)
-            self._more.notify_all()
-
-    def wait_for_further(self, count: int) -> None:
-        with self._more:
-            assert self._more.wait_for(lambda: len(self.further()) >= count, PATIENCE_S)
-
-    def further(self) -> list[Delta]:
-        return [delta for delta in self.all if str(delta.report.get("because")).startswith(GOES_ON)]
-
-
-def turn(joined: Map, size: tuple[int, float]) -> Deltas:
-    """The drive, and then the loop; what comes from that on."""
-    poses, _ = size
-    joined.insert(in_one(*size))
-    joined.wait_converged(PATIENCE_S)
-    deltas = Deltas(joined)
-    joined.insert(closing(poses))
-    return deltas
 
 
 def state(joined: Map) -> tuple[int, dict[int, bytes]]:

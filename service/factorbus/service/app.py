@@ -7,6 +7,7 @@ threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand o
           refusals         of inserts and questions
           desk             maps that come and go, jobs for workers
           answers 0..3     answers to questions, which can be large
+          computed 0, 1    answers to questions that take long to compute: covariances of many, repair, files
           in-place <kind>  jobs when there is no worker
           features         questions of filters: small ones done, large ones cut up and put together
           core 1..         what lends its core to eliminations that take long
@@ -121,7 +122,7 @@ class Shell:
         self._decoding = config.limits.message()
         self._desk = Lane("desk")
         self._senders = Senders(self._desk, bus.know)
-        self._delivery = Delivery(self._about, self._find_optimum, self._fork)
+        self._delivery = Delivery(config.limits.questions, self._about, self._find_optimum, self._fork)
         lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
         self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
         self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)

@@ -9,7 +9,6 @@ At most one Run is out at a time, so what the solver does next is decided when i
 """
 
 import math
-from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -40,6 +39,7 @@ from factorbus.service.events import (
     Tell,
 )
 from factorbus.service.questions import Question, parse
+from factorbus.service.reads import Reads
 
 _KEYFRAME = Read(Question("keyframe"))
 # A Run is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
@@ -68,7 +68,7 @@ class MapCore:
         self.revision = self.variables = self.factors = 0
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
-        self._reads: deque[Read] = deque()
+        self._reads = Reads()
         self._running: Run | None = None
         self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
         self._must_reload = self._must_tidy = False
@@ -322,12 +322,11 @@ class MapCore:
         room = self._has_room()
         further = self._may_go_on(now)
         if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room) or further:
-            reads, inserts = tuple(self._reads), self._admission.take(limits.fold) if room else ()
+            reads, inserts = self._reads.take(), self._admission.take(limits.fold) if room else ()
             short = self._is_short(reads, inserts, now)
             self._running = Run(reads, inserts, short, self._must_reload, further)
             if inserts or further:
                 self._converging.began(further)
-            self._reads.clear()
             self._must_reload = self._must_tidy = False
             self._unjudged += len(inserts)
             self._unjudged_bytes += sum([insert.size for insert in inserts])

@@ -30,6 +30,10 @@ def of_matrix(blocks: Blocks, rows: I64, columns: I64) -> Cost:
     dims = blocks.factored.dims
     height, width = int(dims[rows].sum()), int(dims[columns].sum())
     answer = _NUMBER * height * width
+    if blocks.prefers_columns(rows, columns):
+        # Blocks of one with all others, and what cut out of them is put together.
+        each = blocks.width * blocks.width * (max(len(rows), len(columns)) + 2 * blocks.factored.count)
+        return Cost(answer, _NUMBER * each + (2 + COPIES) * answer)
     different = np.unique(np.concatenate([rows, columns]))
     inner = int(dims[different].sum())
     substituted = (blocks.path_scalars(different) + inner) * (inner + 16)

@@ -3,7 +3,8 @@
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
 lanes a second, then Zenoh closes that client's transport.  Refusals have a lane of their own: of these a client can
-have filled its queue with tens of thousands before the first is taken.
+have filled its queue with tens of thousands before the first is taken.  So have answers that are still to be computed,
+which may take a minute: what is ready, such as stats, does not wait for them.
 """
 
 import logging
@@ -12,33 +13,36 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from factorbus.proto import codec
-from factorbus.proto.problems import Internal, Problem
+from factorbus.proto.problems import Busy, Internal, Problem
 from factorbus.service.bus import Place, refuse, reply
 from factorbus.service.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
 from factorbus.service.lane import Lane, Lanes
-from factorbus.service.questions import Question, Snapshot, answer, check_ready
+from factorbus.service.questions import Question, Snapshot, answer, check_ready, is_computed
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
 
 _AT_ONCE_BYTES = 64 << 10
-_ANSWERERS = 4
+_ANSWERERS, _COMPUTERS = 4, 2
+_RETRY_S = 1.0  # where many answers are still to be computed
 
 
 class Delivery:
-    """The outbox, the answering lanes, that of refusals, and what goes on which.
+    """The outbox, the lanes that answer, that compute answers, that of refusals, and what goes on which.
 
-    about: what this service adds to the stats of a map.  batch: finds batch optima; (asker, question, snapshot).
-    copied: the same with a copy of a map, which is to be another one.
+    most: answers that may wait to be computed.  about: what this service adds to the stats of a map.  batch: finds
+    batch optima; (asker, question, snapshot).  copied: the same with a copy of a map, which is to be another one.
     """
 
     def __init__(
         self,
+        most: int,
         about: Callable[[], dict[str, Any]],
         batch: Callable[[Asker, Question, Snapshot], None],
         copied: Callable[[Asker, Question, Snapshot], None],
     ) -> None:
         self.outbox, self.refusals, self._answers = Lane("outbox"), Lane("refusals"), Lanes("answers", _ANSWERERS)
+        self._computed, self._most = Lanes("computed", _COMPUTERS), most
         self._about, self._batch, self._copied = about, batch, copied
 
     def of_map(self, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
@@ -55,10 +59,12 @@ class Delivery:
 
     def settle(self) -> None:
         """Return when all answers that were handed in are sent."""
+        self._computed.settle()
         self._answers.settle()
 
     def close(self) -> None:
         """Return when everything is sent."""
+        self._computed.close()
         self._answers.close()
         self.refusals.close()
         self.outbox.close()
@@ -71,7 +77,12 @@ class Delivery:
 
     def read(self, place: Place, read: Read, taken: Snapshot) -> None:
         """Answer `read` from `taken`."""
-        self._answers.hand(self._read, place, read, taken)
+        if not is_computed(read.question, taken):
+            self._answers.hand(self._read, place, read, taken)
+        elif (waiting := self._computed.waiting) < self._most:
+            self._computed.hand(self._read, place, read, taken)
+        else:
+            self.refusals.hand(refuse, read.asker, Busy(waiting, _RETRY_S))
 
     def _read(self, place: Place, read: Read, taken: Snapshot) -> None:
         try:

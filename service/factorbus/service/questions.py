@@ -22,7 +22,7 @@ from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.service.lacking import NotInMap
 from factorbus.service.room import COPIES, Room
-from factorbus.service.uncertain import DECODE, Uncertain, check_keys, is_near
+from factorbus.service.uncertain import DECODE, Uncertain, check_keys, near_variables
 from factorbus.solver.errors import SolverError
 from factorbus.solver.repair import repair
 
@@ -133,7 +133,7 @@ def snapshot(
 ) -> Snapshot:
     """What `questions` need of `solver`, copied.  account: of its last step.  uncertain: R, if it is copied already.
 
-    room: what has no room is refused by itself.  Raises SolverError.
+    room: what has no room is refused by itself.
     """
     ready = _refused(solver, questions, uncertain is not None, room)
     questions = [question for question in questions if id(question) not in ready]
@@ -144,17 +144,14 @@ def snapshot(
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
     asked = [question for question in questions if question.name in DECODE]
-    view = solver.try_view() if any(is_near(question.ask) for question in asked) else None
-    near = [question for question in asked if view is not None and is_near(question.ask)]
+    view = solver.try_view() if any(near_variables(question.ask) for question in asked) else None
+    near = [question for question in asked if view is not None and near_variables(question.ask)]
     if view is not None:
-        here = Uncertain(view, epoch, revision, True, account, room)
+        here = Uncertain(lambda: view, epoch, revision, True, account, room)
         ready |= {id(question): _answer_or_problem(here, question) for question in near}
     if uncertain is None and len(near) < len(asked):
         keeps_steps = view is not None or solver.try_view() is not None
-        try:
-            uncertain = Uncertain(solver.factored(), epoch, revision, keeps_steps, account, room)
-        except SolverError as problem:  # of those questions only
-            ready |= {id(question): problem for question in asked if id(question) not in ready}
+        uncertain = Uncertain(solver.factoring(), epoch, revision, keeps_steps, account, room)
     content = solver.content() if "repair" in names else None
     groups = as_variables(variables), as_factors(factors)
     return Snapshot(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)
@@ -184,7 +181,7 @@ def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
         room.check(_REPAIR * solver.memory_bytes())
     elif name in DECODE:
         check_keys(question.ask, room)
-        if not has_copy and not (is_near(question.ask) and solver.try_view() is not None):
+        if not has_copy and not (near_variables(question.ask) and solver.try_view() is not None):
             room.check((1 if solver.try_view() is not None else _FRESH) * solver.memory_bytes())
 
 
@@ -204,6 +201,11 @@ def answer(question: Question, taken: Snapshot) -> bytes:
     if question.name != "keyframe":
         taken.room.fits("the answer", len(message))
     return message
+
+
+def is_computed(question: Question, taken: Snapshot) -> bool:
+    """Whether there is more to do for the answer than to put together what `taken` has."""
+    return id(question) not in taken.ready and (question.name in DECODE or question.name in ("repair", "export"))
 
 
 def check_ready(question: Question, taken: Snapshot) -> None:

@@ -27,11 +27,13 @@ from factorbus.solver.covariance.factored import Factored
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.why import why_factor, why_variable
+from factorbus.solver.graph import Graph
 from factorbus.solver.kernels import layout as at
 from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 
 # Measured on city10000: a path to the root takes 0.1 ms, a copy of R 5 ms.
-_NEAR = 8  # variables of a question that is answered from R where it lies
+NEAR = 8  # variables of the questions that are answered, between two steps, from R where it lies
+_ENDS = 2  # of a factor, at most
 _MOST = 100_000  # candidates, or pairs of sighting and landmark, in one question: some 100 MB of Jacobians
 _MOST_FACTORS = 10_000  # of a variable that is asked about: some seconds
 _OF_AN_ACCOUNT = 100  # numbers that an account of a factor comes to, with its names, at most
@@ -47,35 +49,54 @@ DECODE: Mapping[str, Callable[[bytes], Any]] = {
 }
 
 
-def is_near(ask: Any) -> bool:
-    """Whether the answer is sooner made between two steps than R is copied there."""
+def near_variables(ask: Any) -> int:
+    """How many variables the answer goes up from, where it is sooner made between two steps than R is copied there.
+
+    0: R is copied.
+    """
+    count = 0
     if isinstance(ask, asking.AskCovariance):
         named = [0 if keys is None else keys.size for keys in (ask.keys, ask.others)]
-        return ask.blocks == "last" or 0 < sum(named) <= _NEAR
-    if isinstance(ask, asking.AskGate | asking.AskGain):
-        return sum(len(group.keys) for group in ask.factors) <= _NEAR // 2
-    return isinstance(ask, asking.AskWhy) and ask.factor is not None
+        count = 1 if ask.blocks == "last" else sum(named)
+    elif isinstance(ask, asking.AskGate | asking.AskGain):
+        count = _ENDS * sum(len(group.keys) for group in ask.factors)
+    elif isinstance(ask, asking.AskWhy) and ask.factor is not None:
+        count = _ENDS
+    return count if count <= NEAR else 0
 
 
 class Uncertain:
     """R at one revision.  Threads take turns: candidates are put into the graph, and taken out again.
 
-    keeps_steps: the solver notes when each variable moved.  account: of the last step.  room: for answers.
+    make: gives R, when the first answer needs it.  keeps_steps: the solver notes when each variable moved.  account: of
+    the last step.  room: for answers.
     """
 
     def __init__(
         self,
-        factored: Factored,
+        make: Callable[[], Factored],
         epoch: int,
         revision: int,
         keeps_steps: bool,
         account: Mapping[str, Any],
         room: Room = _UNBOUNDED,
     ) -> None:
-        self._blocks, self._graph, self._room = Blocks(factored), factored.graph, room
+        self._make, self._room = make, room
+        self._made: Blocks | None = None
         self._when = epoch, revision
         self._keeps_steps, self._account = keeps_steps, account
         self._turn = threading.Lock()
+
+    @property
+    def _blocks(self) -> Blocks:
+        """Raises SolverError."""
+        if self._made is None:
+            self._made = Blocks(self._make())
+        return self._made
+
+    @property
+    def _graph(self) -> Graph:
+        return self._blocks.factored.graph
 
     def answer(self, ask: Any) -> bytes:
         """The bytes of the answer.  Raises Problem, SolverError."""

@@ -1,7 +1,8 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -131,12 +132,22 @@ class Solver:
         Raises Underconstrained or NotFinite; what was staged since the last step is taken back then, and the solver is
         as it was after that step, bit for bit.
         """
-        if self._tree:
+        return self._tree.step(settle) if self._tree else self._step(settle, self._options.place_new)
+
+    def _resume(self, settle: bool = False) -> StepReport:
+        """The first step of a solver that has taken over a map: it goes on from the estimate, none of which is new."""
+        if self._tree is None:
+            return self._step(settle, place_new=False)
+        with self._tree.tree.placing_none():
             return self._tree.step(settle)
+
+    def _step(self, settle: bool, place_new: bool) -> StepReport:
+        """One step of a mode without a tree."""
         watch = Stopwatch(self._options.clock)
         try:
             # 1. What is new goes to a good place; linearised there it is added to Λ and η.
-            self._place_new()
+            if place_new:
+                self._place_new()
             added = self._system.blocks.extend(self._graph, self._done.graph)
             watch.lap("linearise")
             # 2. Is every new variable held by something?
@@ -203,7 +214,7 @@ class Solver:
                 raise errors.KindMismatch(key, "turning features into points", seen, wanted)
         made = Solver(self._options)
         made._graph.take(with_points(self._graph, picked))
-        return made, made.step()
+        return made, made._resume()
 
     def with_changes(
         self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
@@ -222,7 +233,7 @@ class Solver:
         variables, factors = made.variable_count, made.factor_count
         first = made._graph.next_id if batch is None else made.stage(batch)
         new = made.variable_count - variables, made.factor_count - factors
-        report = made.step(settle)._replace(new_variables=new[0], new_factors=new[1])
+        report = made._resume(settle)._replace(new_variables=new[0], new_factors=new[1])
         return made, first, report, edits.counted
 
     def try_change(
@@ -249,7 +260,7 @@ class Solver:
         edits.stays[variables:] = False
         edits.kept[factors:] = False
         self._graph.take(edited(other._graph, edits))
-        return self.step()
+        return self._resume()
 
     def to_order_anew(self) -> State:
         """What `order_anew` needs, a copy: all of the map as of the last step, but not R.  Nothing may be staged."""
@@ -261,7 +272,7 @@ class Solver:
         That is a full elimination, for a thread of its own.  Raises as `step` does; this solver is of no use then.
         """
         load(self._graph, content, _VALUES)
-        return self.step()
+        return self._resume()
 
     def asleep(self) -> list[tuple[int, str, str]]:
         """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
@@ -306,6 +317,13 @@ class Solver:
         """
         return factored(self._graph, self._tree.tree) if self._tree else factored_anew(self._graph)
 
+    def factoring(self) -> Callable[[], Factored]:
+        """What gives `factored` as of now, on any thread and later: R is copied here, or else what it is made from."""
+        if self._tree:
+            found = self.factored()
+            return lambda: found
+        return partial(factored_anew, self._graph.copied())
+
     def try_view(self) -> Factored | None:
         """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
 
@@ -332,7 +350,7 @@ class Solver:
         """Good first values for the few variables that a step of a robot brings."""
         mark, counts = self._done.graph, self._graph.counts.tolist()
         few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
-        if few and self._mode.updates and self._options.place_new:
+        if few and self._mode.updates:
             settle_new(
                 mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS],
                 self._options.negligible, self._graph.var, self._graph.fac, self._graph.values, self._graph.payload,

@@ -3,6 +3,9 @@
 This is the memory of `kernels/tree_step.py`, which does the work in one call; here is what grows.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from factorbus.solver import pages
@@ -47,6 +50,15 @@ class Tree(Arenas):
         self.settings[[tl.P_WORTH, tl.P_RINGS, tl.P_DETOUR]] = options.worth, options.rings, options.detour
         self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
         self.clear()
+
+    @contextmanager
+    def placing_none(self) -> Iterator[None]:
+        """While inside, variables that are new to the tree stay at the values that they have."""
+        place, self.settings[tl.P_PLACE] = self.settings[tl.P_PLACE], -1
+        try:
+            yield
+        finally:
+            self.settings[tl.P_PLACE] = place
 
     def clear(self) -> None:
         """Let go of everything: the next step takes in the whole graph."""
