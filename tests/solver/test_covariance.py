@@ -80,7 +80,7 @@ def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
 @given(seed=st.integers(0, 2**32 - 1))
 def test_one_matrix_by_columns_is_that_of_the_joint_covariance(seed: int) -> None:
     """Of many variables columns are made: 1,900 of a map of 10,000 poses took 88 s of a core without."""
-    solver, rng = solved(seed, "tree", steps=12), np.random.default_rng(seed)
+    solver, rng = solved(seed, "bayes-tree", steps=12), np.random.default_rng(seed)
     joint, columns, n = Blocks(solver.factored()), Blocks(solver.factored()), solver.variable_count
     joint.prefers_columns = lambda *_: False  # type: ignore[method-assign]
     columns.prefers_columns = lambda *_: True  # type: ignore[method-assign]
@@ -101,7 +101,7 @@ def test_one_matrix_by_columns_is_that_of_the_joint_covariance(seed: int) -> Non
 
 
 def test_columns_are_made_for_many_variables_and_not_for_few() -> None:
-    solver = Solver(Options(mode="tree"))
+    solver = Solver(Options(mode="bayes-tree"))
     for step in manhattan(400, 4):
         solver.stage(step.batch)
         solver.step()

@@ -24,8 +24,8 @@ def assert_contiguous(deltas: list[Delta]) -> None:
     """Each follows the one before, or has everything; one that a mirror missed while it was away it has made good."""
     for before, after in pairwise(deltas):
         assert after.epoch == before.epoch
-        assert after.revision > before.revision
-        assert after.previous in (0, after.revision - 1)
+        whole = after.previous == 0  # all of an estimate, which may be what there was
+        assert after.revision >= before.revision if whole else after.previous == before.revision
 
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
