@@ -100,6 +100,22 @@ def test_cameras_that_lose_pixels_have_converged_where_they_say_so(seed: int) ->
     assert told > 3
 
 
+@pytest.mark.parametrize("angle_deg", [10, 20, 40, 60, 90])
+def test_a_turn_seen_from_a_fixed_pose_in_space_counts(angle_deg: float) -> None:
+    """Nothing turns at the first end: what the linear model misses is all of the second one, MATH (9.26)."""
+    solver, turn = Solver(Options(rounds=1)), math.radians(angle_deg) / 2
+    sigmas = (0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
+    put(solver, Draft().se3("y0", (0, 0, 0, 0, 0, 0, 1), fixed=True))
+    put(solver, Draft().se3("y1").between_se3("y0", "y1", (1, 0, 0, 0, 0, 0, 1), sigmas=sigmas))
+    other = Draft().se3("y2", (0, 0, 0, 0, 0, 0, 1), fixed=True)
+    seen = (1, 0, 0, 0, 0, math.sin(turn), math.cos(turn))
+    told = put(solver, other.between_se3("y2", "y1", seen, sigmas=tuple(2 * sigma for sigma in sigmas)))
+    optimum = settled_apart(solver)
+    assert not told.converged or told.chi2 <= 1.001 * optimum
+    finish(solver)
+    assert solver.chi2() == pytest.approx(optimum, rel=1e-6)
+
+
 @pytest.mark.parametrize(("drift_deg", "optimum"), [(36, 0.437877), (90, 2.736733), (120, 4.865304), (150, 7.602037)])
 def test_a_loop_that_turns_most_of_the_map(drift_deg: float, optimum: float) -> None:
     solver, report = ring(drift_deg)

@@ -233,10 +233,10 @@ class TreeSteps:
         told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
         nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, _, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
+        _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
         share = self._options.converged_share
-        converged = course.converged if course else error <= share * (chi2 + LEAST_CHI2)
+        converged = course.converged if course else error <= allowed
         if not course and self._tree.raised:
             converged &= self._is_within(share, chi2)
         bounded = converged

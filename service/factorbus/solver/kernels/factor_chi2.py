@@ -23,23 +23,23 @@ SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact t
 @inline_kernel
 def factor_chi2(
     f: int, kind: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, stiff: F64
-) -> tuple[float, float]:
-    """rᵀΩr, or ρ of it, of factor f at `values`, and between poses the square of the translation in r; kind: its
-    `L_KIND`; c, s: cosine and sine of its first, plane pose.
+) -> tuple[float, float, float]:
+    """rᵀΩr, or ρ of it, of factor f at `values`; between poses the square of the translation in r; and between those in
+    space the rotation's share of χ².  kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose.
     """
     if kind == at.BETWEEN_SE2:
         return between_se2_chi2(f, c, s, var, fac, values, payload, stiff)
     if kind == at.LANDMARK_SE2:
-        return landmark_se2_chi2(f, c, s, var, fac, values, payload), 0.0
+        return landmark_se2_chi2(f, c, s, var, fac, values, payload), 0.0, 0.0
     if kind == at.BETWEEN_SE3:
         return between_se3_chi2(f, var, fac, values, payload)
-    return any_chi2(f, var, fac, values, payload), 0.0
+    return any_chi2(f, var, fac, values, payload), 0.0, 0.0
 
 
 @inline_kernel
 def between_se2_chi2(
     f: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, stiff: F64
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """(3.2).  Where Ω is that of a disc and of an angle apart, the frame of the measurement does not matter."""
     x, y, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
     tx, ty = load(values, y) - load(values, x), load(values, y + 1) - load(values, x + 1)
@@ -47,12 +47,12 @@ def between_se2_chi2(
     turn = wrap(load(values, y + 2) - load(values, x + 2) - load(payload, k + 2))
     gap = ex * ex + ey * ey
     if stiff[f, tl.B_ROUND] != 0.0:
-        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap
+        return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap, 0.0
     cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex
     cross = load(payload, k + 4) * rx * ry + (load(payload, k + 5) * rx + load(payload, k + 7) * ry) * turn
     square = load(payload, k + 3) * rx * rx + load(payload, k + 6) * ry * ry + load(payload, k + 8) * turn * turn
-    return square + 2.0 * cross, gap
+    return square + 2.0 * cross, gap, 0.0
 
 
 @inline_kernel
@@ -65,7 +65,7 @@ def landmark_se2_chi2(f: int, c: float, s: float, var: I64, fac: I64, values: F6
 
 
 @part
-def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float, float]:
+def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float, float, float]:
     """(3.6)"""
     i, j, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
     z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation(p, k + 3)
@@ -84,8 +84,9 @@ def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float,
     total = r0 * (p[k] * r0 + 2.0 * (p[k + 1] * r1 + p[k + 2] * r2 + p[k + 3] * r3 + p[k + 4] * r4 + p[k + 5] * r5))
     total += r1 * (p[k + 6] * r1 + 2.0 * (p[k + 7] * r2 + p[k + 8] * r3 + p[k + 9] * r4 + p[k + 10] * r5))
     total += r2 * (p[k + 11] * r2 + 2.0 * (p[k + 12] * r3 + p[k + 13] * r4 + p[k + 14] * r5))
-    total += r3 * (p[k + 15] * r3 + 2.0 * (p[k + 16] * r4 + p[k + 17] * r5))
-    return total + r4 * (p[k + 18] * r4 + 2.0 * p[k + 19] * r5) + r5 * p[k + 20] * r5, gap
+    turned = r3 * (p[k + 15] * r3 + 2.0 * (p[k + 16] * r4 + p[k + 17] * r5))
+    turned += r4 * (p[k + 18] * r4 + 2.0 * p[k + 19] * r5) + r5 * p[k + 20] * r5
+    return total + turned, gap, turned
 
 
 @part

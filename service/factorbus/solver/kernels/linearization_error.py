@@ -18,6 +18,7 @@ from factorbus.solver.kernels.tree_bend import (
     add_sighting,
     bend_of,
     shift_between,
+    turn_between,
     turn_error,
     turn_of,
 )
@@ -34,7 +35,7 @@ MUCH = 8  # where more than one variable in so many has moved, all factors are g
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²
 ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
-FORCE = 0.5  # of φ |√Ω r|, (9.30)
+FORCE = 0.5  # of φ |√Ω r| and ψ |√Ω_θ r_θ|, (9.30)
 MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
@@ -148,10 +149,10 @@ def evaluate_factor(
             if error > bent:
                 await_ends(f, fac, var, node, pending, state)
     else:
-        chi2, gap = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
+        chi2, gap, turned = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
         if second >= 0 and how == MODEL:
             error, full = error_of(
-                f, v, kind, second, bent, gap, chi2, var, node, stiff, lin, delta, values, pending, state
+                f, v, kind, second, bent, gap, chi2, turned, var, node, stiff, lin, delta, values, pending, state
             )
     was = stiff[f, tl.B_CHI2]
     stiff[f, tl.B_CHI2] = chi2
@@ -166,8 +167,8 @@ def evaluate_factor(
 
 @inline_kernel
 def error_of(
-    f: int, v: int, kind: int, second: int, bent: float, gap: float, chi2: float, var: I64, node: I64, stiff: F64,
-    lin: F64, delta: F64, values: F64, pending: I64, state: I64,
+    f: int, v: int, kind: int, second: int, bent: float, gap: float, chi2: float, turned: float, var: I64, node: I64,
+    stiff: F64, lin: F64, delta: F64, values: F64, pending: I64, state: I64,
 ) -> tuple[float, float]:  # fmt: skip
     """How far factor f from v to `second` is from its linear model, as it counts and in full.  Where that is more than
     `bent`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
@@ -178,9 +179,10 @@ def error_of(
     bend = bend_of(root, d, phi, shift)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
         slip, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
-        if kind == at.BETWEEN_SE3 and phi > 0.0:
-            bend += turn_error(phi, x, y, values, lin, stiff[f, tl.B_TURN])
-            force = FORCE * phi * math.sqrt(chi2)
+        if kind == at.BETWEEN_SE3:
+            psi = turn_between(x, y, values, lin)
+            bend += turn_error(phi, psi, stiff[f, tl.B_TURN])
+            force = FORCE * (phi * math.sqrt(chi2) + psi * math.sqrt(max(turned, 0.0)))
         full, error = min(bend + slip + force, MOST_ERROR), min(bend + LINKS * slip, MOST_ERROR)
         both = LINKS * slip > bend
     else:

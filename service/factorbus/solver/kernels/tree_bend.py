@@ -29,9 +29,10 @@ Angles of the plane add up; turns in space do not.  With ψ the turn of j as see
     √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
 
 ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  And the force √Ω r(x)
-turns with i, by half of which the gradient is off on the way:
+turns with i, and that of the rotation alone, r_θ, with j as seen from i, by half of which the gradient is off on the
+way:
 
-    ½ φ |√Ω r(x)|                                                                             (9.30)
+    ½ φ |√Ω r(x)| + ½ ψ |√Ω_θ r_θ(x)|                                                         (9.30)
 
 That counts as a bound only.  How a sight is
 bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
@@ -105,12 +106,17 @@ def slip_weight(root: float, d: float, stiff_turn: float) -> float:
 
 
 @inline_kernel
-def turn_error(phi: float, i: int, j: int, values: F64, lin: F64, stiff_turn: float) -> float:
-    """(9.26) between poses in space at offsets i and j, the first turned by phi; stiff_turn is ω_θ of the angle."""
+def turn_between(i: int, j: int, values: F64, lin: F64) -> float:
+    """ψ of the poses in space at offsets i and j: by how much j has turned as seen from i."""
     now = relative_turn(i, j, values)
     was = relative_turn(i, j, lin)
     x, y, z, _ = quat_product(-was[0], -was[1], -was[2], was[3], now[0], now[1], now[2], now[3])
-    psi = 2.0 * math.sqrt(x * x + y * y + z * z)
+    return 2.0 * math.sqrt(x * x + y * y + z * z)
+
+
+@inline_kernel
+def turn_error(phi: float, psi: float, stiff_turn: float) -> float:
+    """(9.26), the first pose turned by phi; stiff_turn is ω_θ of the angle."""
     return math.sqrt(stiff_turn) * psi * (0.5 * phi + psi * psi / 24.0)
 
 

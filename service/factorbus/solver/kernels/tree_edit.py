@@ -173,7 +173,7 @@ def renew_factors(renewed: I64, graph: I64, tree: I64) -> bool:
         linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
         weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        stiff[f, tl.B_CHI2], _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
         account[tl.A_CHI2] += stiff[f, tl.B_CHI2] - was
         account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + was
         if not has_free(f, var, fac):

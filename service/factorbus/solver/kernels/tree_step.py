@@ -64,6 +64,8 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
+LARGE_GAIN = 0.05  # of χ², in one round,
+AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
 
@@ -99,6 +101,7 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
             return status
         account[tl.A_STIFFEST_BEFORE] = account[tl.A_STIFFEST]
         account[tl.A_UNIT], account[tl.A_BEFORE] = residual_unit(f1, account), account[tl.A_CHI2]
+        account[tl.A_GAINED] = 0.0
         state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
         nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
         state[tl.S_CONTINUES] = 1 if nothing_new else 0
@@ -151,6 +154,7 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
         chi2 = account[tl.A_CHI2]
+        account[tl.A_GAINED] = (before if state[tl.S_ROUNDS] > 1 else account[tl.A_BEFORE]) - chi2
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
@@ -185,6 +189,7 @@ def undo(
 def note_after(settings: F64, state: I64, account: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
     chi2 = account[tl.A_CHI2]
+    account[tl.A_ALLOWED] = converged_error(settings, state, account)
     state[tl.S_AFTER] = 0
     if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * account[tl.A_BEFORE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE
@@ -237,9 +242,18 @@ def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
 
 @inline_kernel
 def allowed(settings: F64, state: I64, account: F64) -> float:
-    """The Σ error² with which a step ends: what its report calls converged; FINISHED with nothing new."""
-    share = FINISHED if state[tl.S_CONTINUES] != 0 else settings[tl.P_CONVERGED]
-    return share * (account[tl.A_CHI2] + LEAST_CHI2)
+    """The Σ error² with which a step ends: what its report calls converged; FINISHED of χ² with nothing new."""
+    if state[tl.S_CONTINUES] != 0:
+        return FINISHED * (account[tl.A_CHI2] + LEAST_CHI2)
+    return converged_error(settings, state, account)
+
+
+@inline_kernel
+def converged_error(settings: F64, state: I64, account: F64) -> float:
+    """The Σ error² up to which the step has converged.  (9.32)"""
+    chi2 = account[tl.A_CHI2] + LEAST_CHI2
+    share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS], 1)
+    return share * chi2 * (AFTER_LARGE_GAIN if account[tl.A_GAINED] > LARGE_GAIN * chi2 else 1.0)
 
 
 @inline_kernel

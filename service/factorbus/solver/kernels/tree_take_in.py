@@ -77,7 +77,7 @@ def take_in_factors(
         account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
         if j >= 0:
             account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
-        stiff[f, tl.B_CHI2], _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
         stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
         account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
