@@ -65,7 +65,7 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
     """(9.22): with many variables that wait a large share is due, with few of them a small one."""
     shares: dict[bool, list[float]] = {True: [], False: []}
     for many in (10, 10**6):
-        solver = Solver(Options(many=many, bent_now=np.inf, bent_most=np.inf, converged_share=100.0))
+        solver = Solver(Options(many=many, bent_now=np.inf, bent_most=np.inf, converged_share=1e5))
         for tree, _, _ in drive(solver, (step.batch for step in manhattan(400, 11))):
             share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
             if tree.state[tl.S_DUE] and share > 0.0:  # 0: nothing that waits counts
