@@ -37,6 +37,8 @@ _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 _FINISHED_LEFT = 1e-7
 # By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
 _AT_END = 1e-6
+# Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
+_STILL = 0.1
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
@@ -241,7 +243,7 @@ class TreeSteps:
             converged &= self._is_within(share, chi2)
         bounded = converged
         if not course and not self._bounded:  # in a long valley a step gains hardly less than the one before
-            converged &= chi2_before - chi2 <= share * (chi2 + LEAST_CHI2)
+            converged &= chi2_before - chi2 <= _STILL * share * (chi2 + LEAST_CHI2)
         self._bounded = bounded
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.

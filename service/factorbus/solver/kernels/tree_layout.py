@@ -230,6 +230,6 @@ A_COUNTED = 9  # Σ error² as it counts for what is relinearized
 A_STIFFEST = 10  # the largest sum of the diagonals of Hessians of any scalar,
 A_STIFFEST_BEFORE = 11  # and before the step
 A_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
-A_GAINED = 13  # by how much the last round lowered χ²
+A_GAINED = 13  # by how much a round of the last step lowered χ², or all of it, at most
 A_UNIT = 14  # (9.6), as it was before the step
 A_SIZE = 15

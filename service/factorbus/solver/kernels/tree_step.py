@@ -64,7 +64,7 @@ LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
-LARGE_GAIN = 0.05  # of χ², in one round,
+LARGE_GAIN = 0.05  # of χ², in one round or all,
 AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
 PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
 
@@ -154,7 +154,9 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
         chi2 = account[tl.A_CHI2]
-        account[tl.A_GAINED] = (before if state[tl.S_ROUNDS] > 1 else account[tl.A_BEFORE]) - chi2
+        if state[tl.S_ROUNDS] > 1:
+            account[tl.A_GAINED] = max(account[tl.A_GAINED], before - chi2)
+        account[tl.A_GAINED] = max(account[tl.A_GAINED], account[tl.A_BEFORE] - chi2)
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
