@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from turned import closing, in_one
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service import inplace
 from factorbus.solver import SolverError
+from factorbus.solver.starts import descent
 from factorbus.workers import jobs
 from factorbus.workers.config import Config, checked
 
@@ -35,6 +37,21 @@ def test_the_service_in_place_finds_the_same_bits() -> None:
     payload = codec.encode_graph(triangle())
     done = inplace.do(Job("j", "batch", payload))
     assert done.payload == jobs.do("batch", payload)
+
+
+def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tries are counted: of a hard graph 500 do not lead to the optimum, of this one a single one does not."""
+    drive, loop = in_one(60, 90.0), closing(60)
+    payload = codec.encode_graph(Graph(1, 1, Batch(drive.variables, drive.factors + loop.factors)))
+    whole = codec.decode_optimum(jobs.do("batch", payload))
+    assert whole.converged
+    monkeypatch.setattr(descent, "_CHUNK", 1)
+    monkeypatch.setattr(descent, "_MOST", 1)
+    early = jobs.do("batch", payload)
+    found = codec.decode_optimum(early)
+    assert not found.converged
+    assert found.chi2 > 1.001 * whole.chi2
+    assert inplace.do(Job("j", "batch", payload)).payload == early
 
 
 def test_what_cannot_be_done_has_a_code() -> None:
