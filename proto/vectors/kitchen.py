@@ -72,7 +72,8 @@ def messages() -> dict[str, bytes]:
         "chi2": codec.encode_chi2(Chi2(EPOCH, 3, chi2)),
         "chi2_batch": codec.encode_chi2(Chi2(EPOCH, 3, chi2, optimum.chi2, "w1", _SECONDS)),
         "job": codec.encode_job(Job("j1", "batch", rounded(codec.encode_graph(graph)))),
-        "job_done": _done(replace(optimum, start="")),
+        "job_done": _done(replace(optimum, start=""), "j1"),
+        **_not_converged(graph, chi2),
         **_worse(),
         **_stamped_answers(),
         **_about_uncertainty(solver, reports[2]),
@@ -188,7 +189,7 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
         asking.AskGain: asked.encode_ask_gain, asking.AskAssociate: asked.encode_ask_associate,
         asking.AskWhy: asked.encode_ask_why,
     }  # fmt: skip
-    uncertain = Uncertain(solver.factored(), EPOCH, 3, False, report)
+    uncertain = Uncertain(solver.factoring(), EPOCH, 3, False, report)
     made = {name: uncertain.answer(ask) for name, (_, ask) in questions.items()}
     made |= {name: encode[type(ask)](ask) for name, ask in questions.values()}
     ask = asking.AskRepair(np.array([2, FALSE]), 0.95, values=True)
@@ -212,6 +213,18 @@ def _without_the_false_one() -> Graph:
     ids = {"between_se2": [0, 1, 2], "landmark_se2": [4, 5, 6]}
     groups = tuple(group._replace(ids=np.array(ids[group.kind])) for group in _factors(factors))
     return Graph(EPOCH, 4, Batch(_variables(variables), groups))
+
+
+def _not_converged(graph: Graph, chi2: float) -> dict[str, bytes]:
+    """A worker that ended after one iteration from composed odometry."""
+    solver = Solver(Options(mode="all-batch", max_iterations=1))
+    bare = tuple(each if each.fixed else Variables(each.kind, each.keys) for each in graph.batch.variables)
+    solver.stage(Batch(bare, graph.batch.factors))
+    report = solver.step()
+    groups, _ = solver.graph()
+    optimum = Optimum(report.chi2, report.iterations, _variables(groups), "odometry", report.converged)
+    told = Chi2(EPOCH, 3, chi2, optimum.chi2, "w1", _SECONDS, optimum.start, batch_converged=optimum.converged)
+    return {"job_done_not_converged": _done(optimum, "j1"), "chi2_not_converged": codec.encode_chi2(told)}
 
 
 def _worse() -> dict[str, bytes]:
@@ -239,7 +252,7 @@ def _worse() -> dict[str, bytes]:
         "chi2_better": codec.encode_chi2(
             Chi2(EPOCH, 1, told[0], told[1], "w1", _SECONDS, optimum.start, notice, optimum.variables)
         ),
-        "job_done_start": _done(optimum),
+        "job_done_start": _done(optimum, "j2"),
         "insert_adopt": rounded(codec.encode_insert(Insert(10, Batch(), settle=True, epoch=EPOCH, changes=(place,)))),
     }
 
@@ -258,8 +271,7 @@ def _stamped_answers() -> dict[str, bytes]:
     }
 
 
-def _done(optimum: Optimum) -> bytes:
-    job = "j1" if not optimum.start else "j2"
+def _done(optimum: Optimum, job: str) -> bytes:
     return codec.encode_job_done(JobDone(job, "batch", codec.encode_optimum(optimum), _SECONDS))
 
 

@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from factorbus.cli.columns import merged, position_errors, positions
+from factorbus.cli.demo import _rows
+from factorbus.cli.drive import Compared
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK
 from factorbus.proto.messages import Batch
 from factorbus.simulate import manhattan
@@ -42,6 +45,25 @@ def test_every_steps_estimate_reaches_everybody_and_is_as_good_as_a_batch(world:
     assert len(set(found["processes"].values()) | {os.getpid()}) == 5
     assert (tmp_path / found["plot"]).read_bytes().startswith(b"\x89PNG")
     assert "300/300" in ran.stderr
+
+
+def test_an_optimum_that_had_not_converged_is_told_at_the_end() -> None:
+    spread, times = {"rms": 0.1, "max": 0.2}, {"p50": 1.0, "p99": 2.0, "max": 3.0}
+    compared = [
+        Compared(revision, 2.0, 1.99, "worker1", 0.5, "rotations", batch_converged=converged)
+        for revision, converged in ((10, True), (20, False), (30, False))
+    ]
+    result: dict[str, Any] = {
+        "against_batch": [each.as_dict() for each in compared], "poses": 30, "landmarks": 0, "factors": 40,
+        "loop_closures": 3, "poses_per_s": 10.0, "seconds": 3.0, "steps": 30, "step_ms": times, "bus_ms": times,
+        "chi2": 2.0, "chi2_initial": 9.0, "error_m": spread, "error_odometry_m": spread, "error_landmarks_m": None,
+        "estimates_received": {"viewer": 30, "robot": 30}, "every_estimate_received": True, "plot": "demo.png",
+    }  # fmt: skip
+    told = dict(_rows(result))
+    assert "averaged rotations, not converged, the true optimum may be lower" in told["χ² / batch optimum"]
+    assert told["batch optimum"] == "2 times not converged, the true optimum may be lower"
+    result["against_batch"] = [compared[0].as_dict()]
+    assert "not converged" not in str(_rows(result))
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ import pytest
 
 from factorbus.cli.children import service
 from factorbus.cli.columns import merged
+from factorbus.cli.drive import Compared
 from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.local import LocalMap
 from factorbus.cli.main import main
@@ -24,6 +25,7 @@ from factorbus.datasets import CATALOGUE, named
 from factorbus.formats import read
 from factorbus.simulate import sphere
 from factorbus.solver import solve_batch
+from factorbus.solver.starts import descent
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
 POSES = 250
@@ -245,6 +247,34 @@ def test_what_the_batch_optimum_was_found_from_is_said(wound: Path, capsys: pyte
     assert "from the file's values" in " ".join(capsys.readouterr().out.split())
     assert main(["replay", str(wound), "--in-process", "--every", "16"]) == OK
     assert "from the map's own values" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_search_that_ended_before_it_had_converged_is_told(
+    town: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ["replay", str(town), "--in-process", "--every", "100"]
+    assert main(command) == OK
+    assert "not converged" not in capsys.readouterr().out
+    monkeypatch.setattr(descent, "_CHUNK", 1)
+    monkeypatch.setattr(descent, "_MOST", 1)
+    assert main([*command, "--json"]) == OK
+    told = [each["batch_converged"] for each in json.loads(capsys.readouterr().out)["against_batch"]]
+    assert False in told
+    assert main(command) == OK
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.count("not converged, the true optimum may be lower") == told.count(False)
+
+
+def test_an_adopted_optimum_that_had_not_converged_is_called_so(
+    wound: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Compared(1, 2.0, 1.0, "w1", 0.5, "rotations", batch_converged=False)
+    monkeypatch.setattr(LocalMap, "optimum", lambda _: found)
+    monkeypatch.setattr(LocalMap, "adopt", lambda target, _: target.settle())
+    assert main(["replay", str(wound), "--in-process"]) == OK
+    shown = capsys.readouterr()
+    for told in (shown.out, shown.err):
+        assert "averaged rotations, not converged, the true optimum may be lower" in " ".join(told.split())
 
 
 @pytest.mark.parametrize("seed", [1, 3])

@@ -11,6 +11,7 @@ from factorbus.cli.main import main
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
+from factorbus.solver.starts import descent
 from factorbus.viz import Course, drive_figure, map_figure, sparsity_figure, spread_of
 from factorbus.viz.ellipses import QUANTILE, outlines
 from factorbus.viz.geometry import view_of
@@ -145,6 +146,19 @@ def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, ca
         arguments[0]
     ] in text
     assert ("95 % of where it may be (9)" in text) == ("--ellipses" in arguments)
+
+
+def test_pictures_say_where_an_optimum_had_not_converged(town: Path, tmp_path: Path, monkeypatch) -> None:
+    """Also with the picture of a drive."""
+    svg = tmp_path / "picture.svg"
+    assert main(["plot", "map", "--solve", str(town), "--out", str(svg)]) == OK
+    assert "not converged" not in svg.read_text()
+    monkeypatch.setattr(descent, "_CHUNK", 1)
+    monkeypatch.setattr(descent, "_MOST", 1)
+    assert main(["plot", "map", "--solve", str(town), "--out", str(svg)]) == OK
+    assert "not converged, the true optimum may be lower" in svg.read_text()
+    assert main(["plot", "drive", "--every", "100", str(town), "--out", str(svg)]) == OK
+    assert "batch, not converged" in svg.read_text()
 
 
 def test_odometry_is_reckoned_and_not_the_files_values(town: Path, tmp_path: Path) -> None:

@@ -121,9 +121,22 @@ def test_panels_show_the_course() -> None:
     np.testing.assert_array_equal(chi2.lines[0].get_ydata(), course.chi2)
     np.testing.assert_array_equal(chi2.lines[1].get_xydata(), course.optimum)
     assert [text.get_text() for text in times.get_legend().get_texts()] == ["p50  2.5 ms", "p99  2.5 ms"]
+    assert [text.get_text() for text in chi2.get_legend().get_texts()] == ["after the step", "batch optimum"]
     figure.canvas.draw()
     assert len(map_figure(estimate=[square()], course=Course(chi2=np.ones(3))).axes) == 3
     assert len(map_figure(estimate=[square()], course=Course()).axes) == 2
+
+
+def test_an_optimum_that_had_not_converged_is_drawn_and_called_so() -> None:
+    early = np.array([[30, 41.0]])
+    course = Course(chi2=np.linspace(0, 90, 50), optimum=np.array([[25, 40.0]]), not_converged=early)
+    chi2 = map_figure(estimate=[square()], course=course).axes[2]
+    drawn = {line.get_label(): line for line in chi2.lines}
+    np.testing.assert_array_equal(drawn["batch, not converged"].get_xydata(), early)
+    assert drawn["batch, not converged"].get_marker() != drawn["batch optimum"].get_marker()
+    assert len(chi2.get_legend().get_texts()) == 3
+    alone = map_figure(estimate=[square()], course=Course(chi2=np.ones(50), not_converged=early)).axes[2]
+    assert [text.get_text() for text in alone.get_legend().get_texts()] == ["after the step", "batch, not converged"]
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -8,6 +8,7 @@ fault is `probe`.
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import zenoh
@@ -52,6 +53,7 @@ OPTIMA: dict[str, Damage] = {
     "chi2_nan": other_chi2(float("nan")),
     "chi2_other": other_chi2(0.5),
     "start_unknown": lambda right: Optimum(right.chi2, right.iterations, right.variables, "x\0"),
+    "early": lambda right: replace(right, converged=False),  # which is for it alone to know
     "values_moved": other_values(moved),
     "values_nan": other_values(to_nan),
     "one_missing": other_values(lambda g: Variables(g.kind, g.keys[1:], g.values[1:])),
@@ -89,6 +91,8 @@ def answer(job: Job, fault: str) -> bytes | Exception | None:
         result = codec.encode_optimum(OPTIMA[fault](codec.decode_optimum(result)))
     if fault in SHARDS:
         result = encode_shard_done(SHARDS[fault](decode_shard_done(result)))
+    if fault == "converged_no_bool":
+        result = codec.encode_map(codec.decode_map(result) | {"converged": "no"})
     if fault == "unreadable_payload":
         result = result[:-1]
     name = "another" if fault == "other_job" else job.job

@@ -194,10 +194,12 @@ MESSAGES = {
     "estimate": st.builds(Estimate, NUMBERS, NUMBERS, VALUES),
     "delta": st.builds(Delta, NUMBERS, NUMBERS, NUMBERS, VALUES, REPORTS),
     "graph": st.builds(Graph, NUMBERS, NUMBERS, BATCHES),
-    "chi2": st.builds(Chi2, NUMBERS, NUMBERS, st.floats(), st.floats(), NAMES, st.floats()),
+    "chi2": st.builds(
+        Chi2, NUMBERS, NUMBERS, st.floats(), st.floats(), NAMES, st.floats(), NAMES, batch_converged=st.booleans()
+    ),
     "job": st.builds(Job, NAMES, NAMES, st.binary(max_size=40)),
     "job_done": st.builds(JobDone, NAMES, NAMES, st.binary(max_size=40), st.floats()),
-    "optimum": st.builds(Optimum, st.floats(), NUMBERS, VALUES),
+    "optimum": st.builds(Optimum, st.floats(), NUMBERS, VALUES, NAMES, st.booleans()),
 }
 
 
@@ -210,6 +212,26 @@ def test_a_message_survives_the_wire_bit_for_bit(name: str, data: st.DataObject)
     arrived = DECODERS[name](sent)
     assert repr(arrived) == repr(message)
     assert ENCODERS[name](arrived) == sent  # the repr of an array is rounded, its bytes are not
+
+
+@pytest.mark.parametrize("converged", [True, False])
+def test_whether_an_optimum_has_converged_arrives_and_is_told_only_where_it_has_not(converged: bool) -> None:
+    optimum = codec.encode_optimum(Optimum(1.0, 2, (), "odometry", converged))
+    chi2 = codec.encode_chi2(Chi2(7, 3, 2.0, 1.0, "w1", 0.5, "odometry", batch_converged=converged))
+    assert codec.decode_optimum(optimum).converged is converged
+    assert codec.decode_chi2(chi2).batch_converged is converged
+    told = codec.decode_map(optimum).get("converged", "absent"), codec.decode_map(chi2).get("batch_converged", "absent")
+    assert told == (("absent", "absent") if converged else (False, False))
+
+
+@pytest.mark.parametrize("wrong", ["no", 0, 1, None, 0.0])
+def test_whether_an_optimum_has_converged_is_a_bool(wrong: Any) -> None:
+    optimum = codec.decode_map(codec.encode_optimum(Optimum(1.0, 2, ()))) | {"converged": wrong}
+    chi2 = codec.decode_map(codec.encode_chi2(Chi2(7, 3, 2.0, 1.0, "w1", 0.5))) | {"batch_converged": wrong}
+    with pytest.raises(BadMessage, match="converged"):
+        codec.decode_optimum(msgpack.packb(optimum))
+    with pytest.raises(BadMessage, match="batch_converged"):
+        codec.decode_chi2(msgpack.packb(chi2))
 
 
 @pytest.mark.parametrize("group", [{}, {"stamps": None}])

@@ -111,6 +111,20 @@ def test_a_job_is_answered_with_its_optimum(dense: DenseGraph) -> None:
     assert optimum.chi2 == pytest.approx(dense.chi2(), rel=1e-8)
 
 
+def test_a_search_that_ended_too_early_says_so(dense: DenseGraph) -> None:
+    job, done = codec.decode_job(read("job")), codec.decode_job_done(read("job_done_not_converged"))
+    assert done.job == job.job
+    optimum, told = codec.decode_optimum(done.payload), codec.decode_chi2(read("chi2_not_converged"))
+    there = stated(codec.decode_graph(job.payload).batch)
+    there.put(optimum.variables)
+    assert (told.batch, told.start) == (optimum.chi2, optimum.start)
+    assert optimum.chi2 == pytest.approx(there.chi2(), rel=1e-7)
+    assert (optimum.converged, told.batch_converged) == (False, False)
+    assert there.gauss_newton(1) > 1e-3, "a step would lead on"
+    assert told.chi2 == pytest.approx(dense.chi2(), rel=1e-8)
+    assert told.batch > 1.0001 * told.chi2
+
+
 def test_without_the_false_factor_it_is_another_optimum() -> None:
     graph = codec.decode_graph(read("graph_ids"))
     assert sorted(each for group in graph.batch.factors for each in group.ids.tolist()) == [0, 1, 2, 4, 5, 6]

@@ -63,6 +63,18 @@ def test_an_optimum_may_leave_out_what_is_fixed_and_may_not_move_it() -> None:
     assert judged(job, answer) is answer, "it is held where it is, whatever a worker says"
 
 
+def test_an_optimum_may_say_that_it_has_not_converged_and_says_it_with_a_bool() -> None:
+    job = graph_job()
+    right = codec.decode_map(do_here(job).payload)
+    assert "converged" not in right
+    early = done(job, codec.encode_map(right | {"converged": False}))
+    assert judged(job, early) is early
+    for wrong in ("no", 0, None):
+        answer = judged(job, done(job, codec.encode_map(right | {"converged": wrong})))
+        assert type(answer) is WrongAnswer
+        assert "converged" in answer.message
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_arrays_of_features_have_the_shapes_of_their_form(form: str) -> None:
     job = features_job(form)

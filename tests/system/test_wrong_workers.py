@@ -1,5 +1,7 @@
 """Workers that answer wrongly, each in its way: nothing of it reaches who asked, and they get no more jobs."""
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -77,7 +79,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     "fault",
     [
         *BOTH, "refuses_the_graph", "chi2_negative", "chi2_nan", "chi2_other", "start_unknown", "values_moved",
-        "values_nan", "one_missing", "other_keys", "one_twice", "other_kind_of_variable",
+        "values_nan", "one_missing", "other_keys", "one_twice", "other_kind_of_variable", "converged_no_bool",
     ],
 )  # fmt: skip
 def test_a_wrong_optimum_is_found_anew(bench: Bench, fault: str) -> None:
@@ -96,6 +98,18 @@ def test_one_that_answers_well_is_believed(bench: Bench) -> None:
     assert found.worker == name
     assert found.batch == pytest.approx(found.chi2, rel=1e-6)
     assert next(bench.rows(name))["wrong"] == 0
+
+
+def test_one_that_ended_before_it_had_converged_is_believed_and_that_is_told(bench: Bench) -> None:
+    name = bench.worker("early")
+    found = bench.optimum()
+    assert (found.worker, found.batch_converged, found.notice) == (name, False, None)
+    assert next(bench.rows(name))["wrong"] == 0
+    command = [sys.executable, "-m", "factorbus.cli", "change", "adopt", "m", "--connect", bench.endpoint]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    told = " ".join(ran.stdout.split())
+    assert "not converged, the true optimum may be lower" in told
+    assert "nothing: the map is not more than 1 % above that" in told
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+from turned import closing, in_one
 
+from factorbus.cli.columns import merged
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service import inplace
+from factorbus.simulate import sphere
 from factorbus.solver import SolverError
+from factorbus.solver.starts import descent
 from factorbus.workers import jobs
 from factorbus.workers.config import Config, checked
 
@@ -35,6 +39,33 @@ def test_the_service_in_place_finds_the_same_bits() -> None:
     payload = codec.encode_graph(triangle())
     done = inplace.do(Job("j", "batch", payload))
     assert done.payload == jobs.do("batch", payload)
+
+
+def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Much noise of rotation and few loops: some 800 iterations, where 500 tries are made."""
+    world = sphere(200, 1, ring=20, rings=20, sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
+    payload = codec.encode_graph(Graph(1, 1, merged(step.batch for step in world)))
+    early = codec.decode_optimum(jobs.do("batch", payload))
+    assert not early.converged
+    monkeypatch.setattr(descent, "_MOST", 5000)
+    whole = codec.decode_optimum(jobs.do("batch", payload))
+    assert whole.converged
+    assert early.chi2 > 1.0001 * whole.chi2
+
+
+def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a worker and in place; here after a single try of each start."""
+    drive, loop = in_one(60, 90.0), closing(60)
+    payload = codec.encode_graph(Graph(1, 1, Batch(drive.variables, drive.factors + loop.factors)))
+    whole = codec.decode_optimum(jobs.do("batch", payload))
+    assert whole.converged
+    monkeypatch.setattr(descent, "_CHUNK", 1)
+    monkeypatch.setattr(descent, "_MOST", 1)
+    early = jobs.do("batch", payload)
+    found = codec.decode_optimum(early)
+    assert not found.converged
+    assert found.chi2 > 1.0001 * whole.chi2
+    assert inplace.do(Job("j", "batch", payload)).payload == early
 
 
 def test_what_cannot_be_done_has_a_code() -> None:

@@ -11,7 +11,7 @@ from factorbus.cli.exits import FAILED, OK, input_file
 from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
 from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
-from factorbus.cli.starts import optimum_from
+from factorbus.cli.starts import NOT_CONVERGED, optimum_from
 
 _SHOWN = 20  # more false factors than these are told with --json only
 
@@ -234,7 +234,8 @@ def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: fl
     """How well the estimate fits: χ² = Σ rᵀΩr, with --batch over that of the optimum found from scratch.
 
     That is the lowest of three: from the map's own values, from composed odometry, from averaged rotations. Where the
-    map is above it by more than 1 % this says so, and `factorbus change adopt` puts the map there.
+    map is above it by more than 1 % this says so, and `factorbus change adopt` puts the map there. Where the search
+    ended before it had converged this says so (--json: batch_converged), and the true optimum may be lower.
 
     \b
     factorbus ask chi2 warehouse
@@ -246,14 +247,17 @@ def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: fl
         content = {"revision": found.revision, "chi2": found.chi2}
         if found.batch is not None:
             content |= {"batch": found.batch, "start": found.start, "worker": found.worker, "seconds": found.seconds}
+            content["batch_converged"] = found.batch_converged
             content["better_optimum"] = None if found.notice is None else found.notice.message
         document(content)
         return OK
     rows = [("χ²", f"{found.chi2:.9g}")]
     if found.batch is not None:
-        by = f"{optimum_from(found.start)}; {found.worker}, {found.seconds:.2f} s"
+        from_where = optimum_from(found.start, converged=found.batch_converged)
+        by = f"{from_where}; {found.worker}, {found.seconds:.2f} s"
         rows.append(("batch", f"{found.batch:.9g}  ({by})"))
-        rows.append(("χ² / batch", f"{found.chi2 / found.batch:.9f}" if found.batch else "-"))
+        ratio = f"{found.chi2 / found.batch:.9f}" if found.batch else "-"
+        rows.append(("χ² / batch", ratio if found.batch_converged else f"{ratio}  (batch: {NOT_CONVERGED})"))
     if found.notice is not None:
         rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {name}")))
     table(rows, title=f"At revision {found.revision}")

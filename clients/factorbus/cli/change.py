@@ -138,7 +138,8 @@ def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json
     """Put the map into the optimum found from scratch, if that is below its χ² by more than 1 %; and settle it.
 
     One step, as any change kept in the journal. Variables that came since the optimum was asked for go along with
-    what they hang on. To be able to go back, fork the map first.
+    what they hang on. To be able to go back, fork the map first. Where the search for the optimum ended before it had
+    converged this says so (--json: batch_converged), and the true optimum may be lower.
 
     \b
     factorbus ask chi2 warehouse --batch
@@ -159,11 +160,13 @@ def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json
     chi2 = found.chi2 if accepted is None else accepted.report.get("chi2")
     if as_json:
         told = {"revision": revision, "adopted": better, "chi2_before": found.chi2, "chi2": chi2}
-        document(told | {"batch": found.batch, "start": found.start})
+        document(told | {"batch": found.batch, "start": found.start, "batch_converged": found.batch_converged})
         return OK
-    rows = [("χ²", f"{found.chi2:.6g}"), ("batch", f"{found.batch:.6g}  ({optimum_from(found.start)})")]
+    by = optimum_from(found.start, converged=found.batch_converged)
+    rows = [("χ²", f"{found.chi2:.6g}"), ("batch", f"{found.batch:.6g}  ({by})")]
     if accepted is None:
-        rows.append(("adopted", "nothing: the map is where the optimum is, to 1 %"))
+        where = "where the optimum is, to 1 %" if found.batch_converged else "not more than 1 % above that"
+        rows.append(("adopted", f"nothing: the map is {where}"))
     else:
         rows.append(("adopted", f"χ² is {chi2:.6g} now"))
     table(rows, title=f"At revision {revision}")

@@ -11,7 +11,7 @@ import click
 
 from factorbus.cli.exits import require
 from factorbus.cli.options import WORLDS, json_option, out_option
-from factorbus.cli.starts import optimum_from
+from factorbus.cli.starts import NOT_CONVERGED, optimum_from
 from factorbus.wording import counted
 
 _COMPARISONS = 10
@@ -123,6 +123,7 @@ def demo(request: Request) -> dict[str, Any]:
         "seed": request.seed,
         "chi2": compared[-1].chi2,
         "chi2_batch": compared[-1].batch,
+        "batch_converged": compared[-1].batch_converged,
         "against_batch": [each.as_dict() for each in compared],
         **world.judge(estimate),
         "estimates_received": {"viewer": seen["deltas"], "robot": driven["deltas"]},
@@ -177,7 +178,8 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ratios = [each["ratio"] for each in result["against_batch"]]
     got = result["estimates_received"]
     last = result["against_batch"][-1]
-    by = f"{optimum_from(last['start'])}; {last['worker']}, {last['seconds'] * 1e3:.0f} ms"
+    found = optimum_from(last["start"], converged=last["batch_converged"])
+    by = f"{found}; {last['worker']}, {last['seconds'] * 1e3:.0f} ms"
     rows = [
         (
             "poses",
@@ -198,6 +200,8 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
             f"{_metres(result['error_m'])}; by odometry alone {_metres(result['error_odometry_m'])}",
         ),
     ]
+    if ended := sum(not each["batch_converged"] for each in result["against_batch"]):
+        rows.append(("batch optimum", f"{counted(ended, 'time')} {NOT_CONVERGED}"))
     if worse := sum(each["better_optimum"] for each in result["against_batch"]):
         rows.append(("better_optimum", f"the map was above it by more than 1 % {counted(worse, 'time')}"))
     if result["error_landmarks_m"]:

@@ -28,7 +28,8 @@ class Stepped:
 class Compared:
     """χ² at `revision` beside the optimum of the same graph found from scratch, by `worker` in `seconds`.
 
-    start: what led to that optimum; variables: the optimum, if it was asked for.
+    start: what led to that optimum; variables: the optimum, if it was asked for.  batch_converged: false where the
+    search for it ended before it had converged.
     """
 
     revision: int
@@ -38,15 +39,16 @@ class Compared:
     seconds: float
     start: str = ""
     variables: tuple[Variables, ...] = ()
+    batch_converged: bool = True
 
     @property
     def ratio(self) -> float:
-        """χ² over the batch optimum: 1.0 is as good as it gets."""
+        """χ² over the batch optimum: 1.0 is as good as it gets, if that has converged."""
         return self.chi2 / self.batch if self.batch else float(self.chi2 > 0) + 1.0
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        told = ("revision", "chi2", "batch", "ratio", "worker", "seconds", "start")
+        told = ("revision", "chi2", "batch", "ratio", "worker", "seconds", "start", "batch_converged")
         return {name: getattr(self, name) for name in told} | {"better_optimum": self.notice is not None}
 
     @property

@@ -51,7 +51,7 @@ class LocalMap:
         batch = solve_batch(*self._solver.graph())
         seconds, chi2 = time.perf_counter() - start, self._solver.chi2()
         values = _variables(batch.values)
-        return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values)
+        return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values, batch.converged)
 
     def adopt(self, found: Compared) -> Stepped:
         """Go to an optimum, and settle there."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorbus.cli.columns import merged
 from factorbus.cli.drive import Compared
+from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Batch, Variables
 from factorbus.viz import Course, Odometry, Spread, loops_of, save_map
 
@@ -48,13 +49,18 @@ def reckoned(graph: Batch) -> tuple[Variables, ...]:
 
 
 def course_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> Course:
-    """χ², time and work of every step, and χ² of the batch optimum where it was found."""
+    """χ², time and work of every step, and χ² of the batch optimum where it was found, those not converged apart."""
     names = ("new_variables", "eliminated", "relinearised")
     work = np.array([[report[name] for name in names] for report in reports], float).reshape(-1, 3)
     work[:, 0] = work[:, 0].cumsum()
     return Course(
         np.array([report["chi2"] for report in reports]),
         np.array([report["step_ms"] for report in reports]),
-        np.array([(each.revision, each.batch) for each in compared]).reshape(-1, 2),
+        _optima(each for each in compared if each.batch_converged),
         work,
+        _optima(each for each in compared if not each.batch_converged),
     )
+
+
+def _optima(compared: Iterable[Compared]) -> F64:
+    return np.array([(each.revision, each.batch) for each in compared], float).reshape(-1, 2)

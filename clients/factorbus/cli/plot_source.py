@@ -90,9 +90,8 @@ def solved(drawn: Drawn, on_file: bool = True) -> Drawn:
     groups = tuple(
         Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in result.values
     )
-    about = (
-        f"χ² {result.chi2:.6g}, {optimum_from(result.start, on_file)}, after {counted(result.iterations, 'iteration')}"
-    )
+    found = optimum_from(result.start, on_file, result.converged)
+    about = f"χ² {result.chi2:.6g}, {found}, after {counted(result.iterations, 'iteration')}"
     return Drawn(drawn.name, Batch(groups, drawn.graph.factors), about)
 
 

@@ -149,4 +149,13 @@ def _stepped(accepted: Accepted, seconds: float) -> Stepped:
 
 def _compared(answer: Chi2) -> Compared:
     batch = float("nan") if answer.batch is None else answer.batch
-    return Compared(answer.revision, answer.chi2, batch, answer.worker, answer.seconds, answer.start, answer.variables)
+    return Compared(
+        answer.revision,
+        answer.chi2,
+        batch,
+        answer.worker,
+        answer.seconds,
+        answer.start,
+        answer.variables,
+        answer.batch_converged,
+    )

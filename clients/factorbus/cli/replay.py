@@ -117,7 +117,8 @@ def command(as_json: bool, **asked: Any) -> None:
                    (staging and step); with --window above 1, from sending to the answer, queueing included
       chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
       against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
-                   (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest
+                   (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest;
+                   batch_converged false: its search ended before it had converged, the true optimum may be lower
       adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
     request = Request(**asked)
@@ -178,7 +179,8 @@ def _adopt(request: Request, target: Any, last: Any) -> tuple[Any, dict[str, Any
         return last, None
     last = target.adopt(found)
     told = f"better_optimum: χ² {found.chi2:.6g} where the map had settled; it is now at the"
-    note(f"{told} {optimum_from(found.start, request.use_values)}, χ² {last.report['chi2']:.6g}")
+    there = optimum_from(found.start, request.use_values, found.batch_converged)
+    note(f"{told} {there}; χ² {last.report['chi2']:.6g}")
     return last, {"code": found.notice.code, **found.as_dict(), "chi2_adopted": last.report["chi2"]}
 
 
@@ -334,16 +336,20 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
     rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
     for each in result["against_batch"]:
-        by = f"{optimum_from(each['start'], result['use_values'])}; {each['worker']}, {each['seconds']:.2f} s"
+        by = f"{_optimum(each, result)}; {each['worker']}, {each['seconds']:.2f} s"
         worse = "  better_optimum" if each["better_optimum"] else ""
         rows.append((f"χ² / batch at {each['revision']}", f"{each['ratio']:.9f}  ({by}){worse}"))
     if result["adopted"]:
-        was = f"{result['adopted']['chi2']:.8g}, {optimum_from(result['adopted']['start'], result['use_values'])}"
+        was = f"{result['adopted']['chi2']:.8g}, {_optimum(result['adopted'], result)}"
         rows.append(("better_optimum", f"adopted: χ² was {was}"))
     rows.append(("strategies", ", ".join(f"{name} {count}" for name, count in result["strategies"].items())))
     if result["kernels_compiled_s"] > 0.1:
         rows.append(("compiling", f"{result['kernels_compiled_s']:.1f} s, once on this machine"))
     return rows
+
+
+def _optimum(compared: dict[str, Any], result: dict[str, Any]) -> str:
+    return optimum_from(compared["start"], result["use_values"], compared["batch_converged"])
 
 
 def _times(times: dict[str, float]) -> str:

@@ -1,10 +1,16 @@
-"""Words for what a batch optimum was found from, and for what follows where it is better than the map."""
+"""Words for what a batch optimum was found from, and for one whose search ended before it had converged."""
 
 _WORDS = {"values": "the map's own values", "odometry": "composed odometry", "rotations": "averaged rotations"}
 
 
-def optimum_from(start: str, file_values: bool = False) -> str:
-    """ "optimum from averaged rotations".  file_values: the map began with the values of a file."""
-    if file_values and start == "values":
-        return "optimum from the file's values"
-    return f"optimum from {_WORDS.get(start, 'a start that is not told')}"
+# After the name of an optimum, or a ratio to it.
+NOT_CONVERGED = "not converged, the true optimum may be lower"
+
+
+def optimum_from(start: str, file_values: bool = False, converged: bool = True) -> str:
+    """ "optimum from averaged rotations".  file_values: the map began with the values of a file.
+
+    converged: whether the search for it had when it ended; if not, that is said.
+    """
+    words = "the file's values" if file_values and start == "values" else _WORDS.get(start, "a start that is not told")
+    return f"optimum from {words}" + ("" if converged else f", {NOT_CONVERGED}")

@@ -248,7 +248,8 @@ class Map:
         """Σ rᵀΩr of the estimate; with `batch` also of the optimum found from scratch, with `values` that itself.
 
         Where the map is above it by more than 1 % the answer's `notice` says so (`better_optimum`), and
-        `change(Changes().adopt(answer), settle=True)` puts the map there.  Raises Refused, Unavailable.
+        `change(Changes().adopt(answer), settle=True)` puts the map there.  `batch_converged` is false where the search
+        for the optimum ended before it had converged: it may be lower.  Raises Refused, Unavailable.
         """
         return self.ask.chi2(batch, timeout_s, values).result()
 

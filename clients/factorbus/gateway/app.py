@@ -6,7 +6,7 @@
 | /api/maps | the maps of the service |
 | /api/maps/NAME/estimate, /graph, /stats, /closures, /ellipses | JSON |
 | /api/maps/NAME/variables/KEY | what holds x12 where it is |
-| /api/maps/NAME/optimum | χ² beside that of the optimum found from scratch, and a notice where that is better |
+| /api/maps/NAME/optimum | χ² beside the optimum from scratch, whether that converged, a notice where it is better |
 | /api/maps/NAME/export?format=g2o | text, also `tum` and `kitti`, of several robots with `&robot=a` |
 | /api/maps/NAME/live | WebSocket: the estimate, then what each step changed |
 """
@@ -133,7 +133,8 @@ async def _stats(maps: Maps, request: Request) -> Response:
 async def _optimum(maps: Maps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         found = await asyncio.wrap_future(joined.map.ask.chi2(True, _OPTIMUM_S))
-    told = {name: getattr(found, name) for name in ("revision", "chi2", "batch", "start", "worker", "seconds")}
+    names = ("revision", "chi2", "batch", "start", "worker", "seconds", "batch_converged")
+    told = {name: getattr(found, name) for name in names}
     notice = None if found.notice is None else {"code": found.notice.code, "message": found.notice.message}
     return Document(told | {"notice": notice})
 

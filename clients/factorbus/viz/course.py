@@ -17,9 +17,11 @@ class Course:
 
     work: variables in the map, eliminated, relinearised.
     optimum (m, 2): steps and the χ² of the batch optimum at them.
+    not_converged (m, 2): the same where the search for it ended before it had converged.
     """
 
     chi2: F64 = field(default_factory=_none)
     step_ms: F64 = field(default_factory=_none)
     optimum: F64 = field(default_factory=lambda: np.empty((0, 2)))
     work: F64 = field(default_factory=lambda: np.empty((0, 3)))
+    not_converged: F64 = field(default_factory=lambda: np.empty((0, 2)))

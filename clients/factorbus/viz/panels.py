@@ -13,15 +13,18 @@ def chi2_panel(axes: Any, course: Course) -> None:
     """χ² after every step, with the batch optimum where it was computed."""
     steps = np.arange(1, len(course.chi2) + 1)
     axes.plot(steps, course.chi2, color=style.ESTIMATE, linewidth=1.4, label="after the step")
-    if len(course.optimum):
-        axes.plot(
-            *course.optimum.T,
-            "o",
-            markersize=4.5,
-            markerfacecolor="white",
-            markeredgecolor=style.INK,
-            label="batch optimum",
-        )
+    shown = (course.optimum, "o", "batch optimum"), (course.not_converged, "X", "batch, not converged")
+    for optima, marker, label in shown:
+        if len(optima):
+            axes.plot(
+                *optima.T,
+                marker,
+                markersize=4.5,
+                markerfacecolor="white",
+                markeredgecolor=style.INK,
+                label=label,
+            )
+    if any(len(optima) for optima, _, _ in shown):
         axes.legend(loc="upper left", handlelength=1.2)
     axes.set_title("χ² along the drive", loc="left")
     axes.set_xlabel("step")

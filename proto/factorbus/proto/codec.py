@@ -164,6 +164,8 @@ def encode_chi2(message: Chi2) -> bytes:
         content |= {"batch": message.batch, "worker": message.worker, "seconds": message.seconds}
     if message.start:
         content["start"] = message.start
+    if not message.batch_converged:
+        content["batch_converged"] = False
     if message.notice is not None:
         content["notice"] = _problem_map(message.notice)
     if message.variables:
@@ -185,6 +187,7 @@ def decode_chi2(data: bytes, limits: Limits = ANSWER_LIMITS) -> Chi2:
         start=fields.text("", content, "start", default=""),
         notice=_read_problem("notice", fields.mapping("", content, "notice")) if content.get("notice") else None,
         variables=read_values(content) if content.get("variables") else (),
+        batch_converged=fields.flag("", content, "batch_converged", default=True),
     )
 
 
@@ -221,14 +224,16 @@ def decode_job_done(data: bytes, limits: Limits = ANSWER_LIMITS) -> JobDone:
 
 def encode_optimum(message: Optimum) -> bytes:
     """The bytes of the result of a job of kind `batch`."""
-    return _pack(
-        {
-            "chi2": message.chi2,
-            "iterations": message.iterations,
-            "variables": variables_to_maps(message.variables),
-        }
-        | ({"start": message.start} if message.start else {})
-    )
+    content: dict[str, Any] = {
+        "chi2": message.chi2,
+        "iterations": message.iterations,
+        "variables": variables_to_maps(message.variables),
+    }
+    if message.start:
+        content["start"] = message.start
+    if not message.converged:
+        content["converged"] = False
+    return _pack(content)
 
 
 def decode_optimum(data: bytes, limits: Limits = ANSWER_LIMITS) -> Optimum:
@@ -239,6 +244,7 @@ def decode_optimum(data: bytes, limits: Limits = ANSWER_LIMITS) -> Optimum:
         iterations=fields.integer("", content, "iterations"),
         variables=read_values(content),
         start=fields.text("", content, "start", default=""),
+        converged=fields.flag("", content, "converged", default=True),
     )
 
 

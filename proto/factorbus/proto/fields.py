@@ -83,9 +83,9 @@ def word(where: str, fields: Map, name: str, known: Sequence[str], default: str)
     return value
 
 
-def flag(where: str, fields: Map, name: str) -> bool:
-    """A boolean that is false when absent.  Raises BadMessage."""
-    value = fields.get(name, False)
+def flag(where: str, fields: Map, name: str, default: bool = False) -> bool:
+    """A boolean that is `default` when absent.  Raises BadMessage."""
+    value = fields.get(name, default)
     if type(value) is bool:
         return value
     raise BadMessage(_place(where, name), _seen(fields, name), "true or false")

@@ -164,7 +164,8 @@ class Chi2:
 
     worker: who computed the batch optimum ("in-place": the service itself); seconds: how long it took there.
     start: what led to it, one of `STARTS` ("": not told).  notice: a BetterOptimum where the map is well above it.
-    variables: the optimum itself, if it was asked for.
+    variables: the optimum itself, if it was asked for.  batch_converged: false where the search ended before it had
+    converged: the optimum may be below `batch`.
     """
 
     epoch: int
@@ -176,6 +177,7 @@ class Chi2:
     start: str = ""
     notice: Problem | None = None
     variables: tuple[Variables, ...] = ()
+    batch_converged: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,10 +203,11 @@ class JobDone:
 class Optimum:
     """The payload that answers a job of kind `batch`: the graph optimised from scratch, its χ² and its values.
 
-    start: what led there, one of `STARTS`; "": not told.
+    start: what led there, one of `STARTS`; "": not told.  converged: false where the search ended before it had.
     """
 
     chi2: float
     iterations: int
     variables: tuple[Variables, ...]
     start: str = ""
+    converged: bool = True

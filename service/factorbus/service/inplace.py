@@ -21,7 +21,9 @@ def _batch(payload: bytes) -> bytes:
 
     graph = codec.decode_graph(payload)
     result = solve_batch(graph.batch.variables, graph.batch.factors)
-    return codec.encode_optimum(Optimum(result.chi2, result.iterations, as_variables(result.values), result.start))
+    values = as_variables(result.values)
+    optimum = Optimum(result.chi2, result.iterations, values, result.start, result.converged)
+    return codec.encode_optimum(optimum)
 
 
 def _idp(payload: bytes) -> bytes:

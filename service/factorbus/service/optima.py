@@ -57,5 +57,6 @@ class Optima:
             optimum.start,
             BetterOptimum.or_none(taken.chi2, optimum.chi2, optimum.start),
             optimum.variables if question.values else (),
+            optimum.converged,
         )
         self.reply(asker, codec.encode_chi2(chi2))

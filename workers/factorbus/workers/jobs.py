@@ -27,7 +27,8 @@ def batch(payload: bytes) -> bytes:
     graph = codec.decode_graph(payload).batch
     result = solve_batch(graph.variables, graph.factors)
     values = tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in result.values)
-    return codec.encode_optimum(Optimum(result.chi2, result.iterations, values, result.start))
+    optimum = Optimum(result.chi2, result.iterations, values, result.start, result.converged)
+    return codec.encode_optimum(optimum)
 
 
 def idp(payload: bytes) -> bytes:

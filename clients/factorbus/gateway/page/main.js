@@ -106,10 +106,13 @@ async function compare() {
   try {
     const found = await ask(`/api/maps/${name}/optimum`);
     const ratio = found.batch > 0 ? `, ${(found.chi2 / found.batch).toFixed(6)} of it` : "";
+    const converged = found.batch_converged;
+    const there = converged ? "The map is where the optimum is." : "The map is not more than 1 % above that.";
     panel.replaceChildren(
       element("h2", found.notice ? found.notice.code : "The optimum"),
       element("p", `χ² ${found.chi2.toPrecision(7)} at revision ${found.revision}; optimum from ${STARTS[found.start] ?? "a start"}: ${found.batch.toPrecision(7)}${ratio}`),
-      element("p", found.notice ? found.notice.message.replace("adopt MAP", `adopt ${name}`) : "The map is where the optimum is."),
+      element("p", found.notice ? found.notice.message.replace("adopt MAP", `adopt ${name}`) : there),
+      element("p", converged ? "" : "The search for the optimum ended before it had converged: the true optimum may be lower."),
     );
   } catch (error) {
     panel.replaceChildren(element("h2", "The optimum"), element("p", error.message));
