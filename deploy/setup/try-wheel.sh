@@ -45,15 +45,15 @@ light_client_works() {
     says "factorbus demo" venv/bin/factorbus --help
     says "factorbus 0." venv/bin/factorbus version
     says "leave a variable free to move" venv/bin/factorbus explain underconstrained
-    says "pip install 'factorbus[watch] @ file://\" venv/bin/factorbus watch town
-    says "pip install 'factorbus[gateway] @ file://\" venv/bin/factorbus gateway
-    says "pip install 'factorbus[ros2] @ file://\" venv/bin/factorbus ros2 town
+    says "pip install 'factorbus[watch] @ file://" venv/bin/factorbus watch town
+    says "pip install 'factorbus[gateway] @ file://" venv/bin/factorbus gateway
+    says "pip install 'factorbus[ros2] @ file://" venv/bin/factorbus ros2 town
     venv/bin/python -c 'import sys, factorbus.client; assert not {"numba", "scipy", "sksparse"} & set(sys.modules)'
 }
 
 service_says_what_it_needs() {
-    says "pip install 'factorbus[service] @ file://\" venv/bin/factorbus serve
-    says "pip install 'factorbus[service] @ file://\" venv/bin/factorbus demo
+    says "pip install 'factorbus[service] @ file://" venv/bin/factorbus serve
+    says "pip install 'factorbus[service] @ file://" venv/bin/factorbus demo
 }
 
 # Whether the output of a command holds a text; the whole output is read first, or the command would die of a closed pipe.
