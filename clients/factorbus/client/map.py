@@ -22,14 +22,15 @@ from factorbus.client.link import Link
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions, logged
+from factorbus.client.supported import check_changes, check_stamps
 from factorbus.client.ticket import Ticket
 from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Estimate, Graph, Insert
-from factorbus.proto.problems import ClosedHere, NotSupported, Problem, Refused, TooLarge, Unavailable
+from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
+from factorbus.proto.problems import ClosedHere, Problem, Refused, TooLarge, Unavailable
 from factorbus.wording import counted
 
 SUFFIX_LENGTH = 9  # characters that joining a map adds to the name of a client
@@ -190,12 +191,13 @@ class Map:
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
         """
         batch, settle = batch_of("batch", batch), flag("settle", settle)
-        self._check_stamps(batch)
+        listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
+        check_stamps(self._protocol, batch)
         timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
-            listed = self._known(changes) if changes is not None else ()
+            check_changes(self._protocol, listed)
             insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
             ticket = self._ticket(insert, timeout_s)
             with self._lock:
@@ -339,24 +341,6 @@ class Map:
         self._window: Window[Ticket] = Window(self._size)
         self._presence.close()
         self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
-
-    def _known(self, changes: Changes) -> tuple[Change, ...]:
-        """What is in `changes`.  Raises NotSupported for what the service would skip, or not know."""
-        listed, protocol = of_type("changes", changes, Changes, "a Changes").listed(), self._protocol
-        if protocol and listed:
-            told = protocol.get("changes") if "changes" in protocol.get("insert", ()) else ()
-            names = told if isinstance(told, list | tuple) else ()
-            for change in listed:
-                if change.change not in names:
-                    raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
-        return listed
-
-    def _check_stamps(self, batch: Batch) -> None:
-        """Raises NotSupported where the service would skip them."""
-        protocol = self._protocol
-        skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())
-        if skipped and any(group.stamps is not None for group in batch.variables):
-            raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
 
     def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
         window = self._window

@@ -162,18 +162,15 @@ class Mirror:
         if self._there(revision):
             return
         self._check_open()
-        state = "stale" if self.stale else "up to date"
-        hint = (
-            f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
-        )
+        state = f"{'stale' if self.stale else 'up to date'} at revision {self.revision}"
+        hint = f"the mirror is {state}, {self.age_s:.1f} s after it last heard of the service"
         raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
         """Until the values are the latest, the map has converged at them, and no further steps are to follow.
 
-        At them: to 1e-6 of χ², or within a thousandth where the map gave up coming nearer (`gave_up` of its stats).
-        Raises NotConverged when time is up, and at once where the map gave up before it had converged; Unavailable, at
-        once, on a closed map.
+        That is at its optimum to 1e-6 of χ², or within a thousandth where it gave up the rest (`gave_up` of its stats).
+        Raises NotConverged when time is up, at once where it gave up before; Unavailable, at once, on a closed map.
         """
         timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         self._try_wait(lambda: self._is_at_rest, timeout_s)
