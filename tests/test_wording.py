@@ -27,7 +27,7 @@ def test_a_plural_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("factors", "said"),
     [
-        ([], "x1 is not fixed as no factor is on it: add a prior"),
+        ([], "nothing holds x1: no factor is on it; add a prior"),
         (["f"], "x1 is not fixed by its 1 factor (f): add a prior"),
         (["f", "g"], "x1 is not fixed by its 2 factors (f, g): add a prior"),
         (["f"] * 9, "x1 is not fixed by its 9 factors (f, f, f, f, f, f, f, f, ...): add a prior"),

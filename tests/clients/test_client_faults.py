@@ -338,6 +338,9 @@ def test_a_delta_nobody_can_read_costs_the_whole_estimate_and_no_more(
 def test_names_are_checked(start: Callable[..., Service], endpoint: str) -> None:
     with pytest.raises(BadName, match="client"):
         connect(endpoint, client="a/b")
+    for given in ("my robot", "", "r" * 56):
+        with pytest.raises(BadName, match=f"client name '{given}' will not do: wanted 1 to 55 of"):
+            connect(endpoint, client=given)
     start()
     with connect(endpoint) as bus, pytest.raises(BadName, match="map"):
         bus.map("a b")

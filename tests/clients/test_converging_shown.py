@@ -69,7 +69,10 @@ def test_top_as_a_document(service: Service, tmp_path: Path, capsys: Any) -> Non
         (CONVERGED, "χ² 12.5, converged; 7 tree"),
         (CONVERGING, "χ² 12.5, not converged, converging, after 3 further steps; 7 tree"),
         (POLISHED, "χ² 12.5, converged, converging, after 2 further steps; 7 tree"),
-        (NOT_POLISHED, f"χ² 12.5, converged after 3 further steps: gave up, as {_REASON}; 7 tree"),
+        (
+            NOT_POLISHED,
+            f"converged to a thousandth of χ²; gave up coming nearer after 3 further steps, as {_REASON}; 7 tree",
+        ),
         (GAVE_UP, f"χ² 12.5, not converged after 3 further steps: gave up, as {_REASON}; 7 tree"),
     ],
 )

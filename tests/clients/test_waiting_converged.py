@@ -133,6 +133,7 @@ def test_a_map_that_has_converged_and_gave_up_to_be_polished_is_as_good_as_it_ge
     assert kitchen.estimate.converging is True
     kitchen.wait_converged(50)
     assert kitchen.estimate.converging is False
+    assert kitchen.stats()["gave_up"] == "20 further steps in a row did not lower χ²", "how the caller learns of it"
 
 
 @pytest.mark.parametrize("converged", [True, False])

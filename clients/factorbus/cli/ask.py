@@ -172,6 +172,8 @@ def why_command(
     pivots of a variable are those of the Cholesky factor R, and Λ is the information matrix: R²ᵢᵢ/Λᵢᵢ is 1 where no
     variable that was eliminated before depends on it, and near 0 where its estimate rests on those.
 
+    By how much χ² falls without a factor is told to first order, "about", and is never more than all of χ².
+
     A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
     both are told, unless --variable or --factor says which is meant.
 
@@ -219,9 +221,10 @@ def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
 def _tell(what: str, found: Any) -> None:
     if found.variable:
         table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
-        table([(_told(each), _factor_line(each)) for each in found.variable["factors"]], title="Its factors, by id")
+        rows = [(_told(each), _factor_line(each, found.step)) for each in found.variable["factors"]]
+        table(rows, title="Its factors, by id")
     else:
-        table([(_told(found.factor), _factor_line(found.factor))], title=f"At revision {found.revision}")
+        table([(_told(found.factor), _factor_line(found.factor, found.step))], title=f"At revision {found.revision}")
     step = found.step
     if step:
         table([("the last step", f"{step['strategy']}, because {step['because']}")])
@@ -329,11 +332,15 @@ def _variable_rows(account: Any) -> list[tuple[str, str]]:
     ]
 
 
-def _factor_line(account: Any) -> str:
+def _factor_line(account: Any, step: Any) -> str:
+    from factorbus.proto.why_text import fall_without
+
     if account.get("asleep"):
         return f"inactive: {account['asleep']}"
     without, loss = account["without"], account.get("loss")
-    fall = "no redundancy: nothing else measures it" if without is None else f"without it χ² falls by {without:.3g}"
+    fall = "no redundancy: nothing else measures it"
+    if without is not None:
+        fall = f"without it χ² falls by {fall_without(without, step)}"
     share = f"leverage {account['influence']:.2f} of {account['dims']}"
     if not loss:
         return f"χ² {account['chi2']:.3g}, {share}, {fall}"

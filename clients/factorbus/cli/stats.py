@@ -94,7 +94,11 @@ def _convergence(row: Mapping[str, Any]) -> str:
     so_far = f" after {counted(row['further_steps'], 'further step')}"
     if row["converging"]:
         return f"{state}, converging,{so_far}"
-    return f"{state}{so_far}: gave up, as {row['gave_up']}" if row["gave_up"] else state
+    if not row["gave_up"]:
+        return state
+    if row["converged"]:
+        return f"converged to a thousandth of χ²; gave up coming nearer{so_far}, as {row['gave_up']}"
+    return f"{state}{so_far}: gave up, as {row['gave_up']}"
 
 
 def _steps(strategies: Mapping[str, int]) -> str:

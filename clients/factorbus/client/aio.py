@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Doubt
+from factorbus.client.arguments import of_type, seconds
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
@@ -156,6 +157,7 @@ class Map:
         timeout_s: float | None = None,
     ) -> Accepted:
         """Make `changes`, add `batch` and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
+        timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)  # refused before anything is sent
         sent = await self.send(batch, settle=settle, points_below=points_below, changes=changes)
         return await self.result(sent, timeout_s)
 
@@ -180,9 +182,10 @@ class Map:
         timeout_s: float | None = None,
     ) -> Merged:
         """Take all of the map `other` into this one, as `factorbus.client.Map.merge`."""
-        graph = other if isinstance(other, Graph) else await other.graph(timeout_s)
+        if not isinstance(other, Graph):
+            other = await of_type("other", other, Map, "a Map, or the Graph of one").graph(timeout_s)
         fitted = fit_into(
-            await self.ask_estimate(timeout_s=timeout_s), graph,
+            await self.ask_estimate(timeout_s=timeout_s), other,
             anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute,
         )  # fmt: skip
         return Merged(await self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
@@ -207,7 +210,7 @@ class Map:
 
     async def result(self, ticket: Ticket, timeout_s: float | None = None) -> Accepted:
         """The answer to what was sent.  Raises Refused, NoAnswerYet."""
-        timeout_s = self._map.timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)
         try:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(ticket.future)), timeout_s)
         except TimeoutError:

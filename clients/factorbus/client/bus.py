@@ -2,19 +2,21 @@
 
 import secrets
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from os import PathLike
 from typing import Any
 
+from factorbus.client.arguments import flag, of_type, seconds
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.features import Features
 from factorbus.client.gathering import gather
 from factorbus.client.link import Link, open_link
-from factorbus.client.map import Map, MapRow
+from factorbus.client.map import SUFFIX_LENGTH, Map, MapRow
 from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.problems import Problem, Refused, UnknownMap
+from factorbus.proto.problems import BadOption, Problem, Refused, UnknownMap
 
 _LIST_S = 2.0  # to ask for the names of maps, where one was asked for that is not there
 
@@ -34,9 +36,11 @@ def connect(
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
     listening_s: give up after so long, and not `timeout_s`, where nobody listens at all; None: wait for whoever comes.
-    Raises Unavailable, BadEndpoint, BadName, BadSetting.
+    Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting.
     """
-    keys.checked_name("client", f"{client}-00000000")
+    keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
+    timeout_s = seconds("timeout_s", timeout_s, timeout_s)
+    listening_s = None if listening_s is None else seconds("listening_s", listening_s, listening_s)
     endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
     return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh), listening_s), client, timeout_s)
 
@@ -64,6 +68,9 @@ class Bus:
         it is there.  Raises Refused, Unavailable, BadName, UnknownMap.
         """
         keys.checked_name("map", name)
+        mirror, create = flag("mirror", mirror), flag("create", create)
+        if of_type("window", window, Integral, "a whole number, 1 or more") < 1:
+            raise BadOption("window", str(window), "a whole number, 1 or more")
         joined = Map(
             self._link,
             self._courier,
@@ -90,6 +97,7 @@ class Bus:
         rho, sigma_rho: prior of every feature's inverse distance (1/metre).  sigma_pixel: standard deviation of u and
         of v (pixels).  service: its name; empty: whichever is there.
         """
+        of_type("camera", camera, Camera, "a Camera")
         made = Features(
             self._link,
             self._courier,
@@ -105,7 +113,7 @@ class Bus:
 
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
         """The maps there are: of the service, or at a router of all services.  Raises Refused, Unavailable."""
-        told = gather(self._link, "maps", self.timeout_s if timeout_s is None else timeout_s)
+        told = gather(self._link, "maps", seconds("timeout_s", timeout_s, self.timeout_s))
         return [row for each in told for row in _rows(each)]
 
     def stats(self, timeout_s: float | None = None) -> list[dict[str, Any]]:
@@ -113,7 +121,7 @@ class Bus:
 
         Raises Refused, Unavailable.
         """
-        told = gather(self._link, "stats", self.timeout_s if timeout_s is None else timeout_s)
+        told = gather(self._link, "stats", seconds("timeout_s", timeout_s, self.timeout_s))
         return [codec.decode_map(each) for each in told]
 
     def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
@@ -151,7 +159,8 @@ class Bus:
         """
         asked: dict[str, Any] = {"map": keys.checked_name("map", name)}
         asked |= {} if revision is None else {"revision": revision}
-        asked |= {"damaged": True} if damaged else {}
+        asked |= {"damaged": True} if flag("damaged", damaged) else {}
+        missing_ok = flag("missing_ok", missing_ok)
         try:
             self._admin("drop", asked, codec.decode_map, timeout_s)
         except Refused as refused:
@@ -184,7 +193,7 @@ class Bus:
             return UnknownMap(name)
 
     def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
-        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         what = f"the service, asked for admin/{operation},"
         errand = Errand(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
         return self._courier.carry(errand).future.result()

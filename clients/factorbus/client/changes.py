@@ -13,8 +13,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import flag, of_type
 from factorbus.client.certainty import loss_of
-from factorbus.client.draft import Draft
+from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.asking import Repaired
@@ -25,7 +26,7 @@ from factorbus.proto.problems import BadLoss, BadShape
 class Changes:
     """Changes to be made together or not at all, in this order.  Every method returns the same object, to be chained.
 
-    Raises BadSymbol, BadShape, BadLoss.
+    Raises BadSymbol, BadShape, BadLoss, BadOption.
     """
 
     def __init__(self) -> None:
@@ -37,11 +38,12 @@ class Changes:
 
     def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> Changes:
         """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
-        return self._add(Change("remove_variables", keys=_keys(keys), alone=alone))
+        return self._add(Change("remove_variables", keys=_keys(keys), alone=flag("changes: alone", alone)))
 
     def undo(self, batch: Batch | Draft, accepted: Accepted) -> Changes:
         """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
-        batch = batch.batch() if isinstance(batch, Draft) else batch
+        batch = batch_of("changes: undo", batch)
+        accepted = of_type("changes: undo", accepted, Accepted, "the answer to the insert, an Accepted")
         brought = [group.keys for group in batch.variables]
         first = accepted.first_factor
         self._add(Change("remove_factors", np.arange(first, first + batch.factor_count)))
@@ -88,7 +90,12 @@ class Changes:
 
         carry: what is not in `groups`, and not fixed, goes along with what it hangs on.
         """
-        for group in groups:
+        carry, wanted = flag("changes: carry", carry), "groups of variables, as `variables` of an Estimate"
+        listed = [
+            of_type("changes: place", each, Variables, wanted)
+            for each in of_type("changes: place", groups, Iterable, wanted)
+        ]
+        for group in listed:
             self._add(Change("place", keys=group.keys, kind=group.kind, values=group.values, carry=carry))
         return self
 
@@ -99,12 +106,13 @@ class Changes:
         variable of the optimum is gone, or a feature has become a point: ask again.  `settle` it.  To undo it place
         what `Map.ask_estimate` said before.  Raises BadShape if the answer came without values.
         """
-        if not found.variables:
+        if not of_type("changes: adopt", found, Chi2, "an answer of chi2(batch=True, values=True)").variables:
             raise BadShape("changes: adopt", "an answer without variables", "chi2(batch=True, values=True)")
         return self.place(found.variables, carry=True)
 
     def repair(self, repaired: Repaired, loss: tuple[str, float] | str | None = None) -> Changes:
         """What is false goes, or gets a loss, ("dcs", 1.0) say; the map goes on from the repaired values."""
+        of_type("changes: repair", repaired, Repaired, "an answer of `Map.repair`")
         if loss is None:
             self.remove_factors(repaired.factors.tolist())
         else:

@@ -18,7 +18,7 @@ from factorbus.client.link import Link
 from factorbus.client.promise import Promise
 from factorbus.client.replies import Again, Reply, Silence, judge
 from factorbus.client.versions import LOOK_S, other_protocol
-from factorbus.proto.problems import Problem, Refused, Unavailable
+from factorbus.proto.problems import ClosedHere, Problem, Refused, Unavailable
 from factorbus.wording import counted
 
 # An unanswered try is repeated after this long: a step may take longer, but then repeating costs little.
@@ -77,7 +77,7 @@ class Courier:
             closed = self._closed
         errand.sent_at = time.perf_counter()
         if closed:
-            self._finish(errand, Unavailable(errand.what, 0.0, "this connection is closed; connect again"))
+            self._finish(errand, ClosedHere(errand.what, connection=True))
         else:
             self._try(errand)
         return errand

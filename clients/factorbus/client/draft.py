@@ -11,6 +11,7 @@ from typing import TypeAlias, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from factorbus.client.arguments import flag, of_type
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.linear import linear_pieces
@@ -34,7 +35,7 @@ class Draft:
     an int (`time.time_ns()`, or any other clock); the map keeps it, and gives it back with the value.
     Every factor needs a certainty: sigmas=, standard deviations in metres and radians (also of rotations in space), or
     information=, and may have a loss= (`factorbus.client.certainty.Certainty`).
-    Raises BadSymbol, BadShape, BadStamp, BadInformation, BadLoss, UnknownKind.
+    Raises BadSymbol, BadShape, BadStamp, BadInformation, BadLoss, BadOption, UnknownKind.
     """
 
     def __init__(self) -> None:
@@ -243,7 +244,7 @@ class Draft:
 
         sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
         """
-        measured = [*_row("pixel", pixel, 2), rho, *camera.lens()]
+        measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
         sigmas = [sigma_anchor] * 3 + [sigma_pixel] * 2 + [sigma_rho]
         return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=loss)
 
@@ -251,13 +252,13 @@ class Draft:
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
     ) -> Draft:
         """An idp seen again by the pose's camera: u v (pixels)."""
-        return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
+        return self.factor("idp_seen", (pose, feature), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
 
     def point_seen(
         self, pose: Key, point: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
     ) -> Draft:
         """A point3 seen by the pose's camera: u v (pixels)."""
-        return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *camera.lens()], **certainty)
+        return self.factor("point_seen", (pose, point), [*_row("pixel", pixel, 2), *_lens(camera)], **certainty)
 
     def variable(
         self,
@@ -273,8 +274,8 @@ class Draft:
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
         row = None if value is None else _row(where, value, size)
-        time = stamp_number(where, stamp)
-        keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
+        time, held = stamp_number(where, stamp), flag(f"{where}: fixed", fixed)
+        keys, rows, stamps = self._variables.setdefault((kind, row is not None, held), ([], [], []))
         keys.append(number)
         stamps.append(time)
         if row is not None:
@@ -336,6 +337,15 @@ class Draft:
                 *self._linear,
             ),
         )
+
+
+def batch_of(what: str, given: Batch | Draft) -> Batch:
+    """What is to go into a map, as columns.  Raises BadOption."""
+    return given.batch() if isinstance(given, Draft) else of_type(what, given, Batch, "a Draft or a Batch")
+
+
+def _lens(camera: Camera) -> list[float]:
+    return [*of_type("camera", camera, Camera, "a Camera").lens()]
 
 
 def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:

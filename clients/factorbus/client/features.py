@@ -15,6 +15,7 @@ from contextlib import ExitStack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import seconds
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.grown import Factored, Grown, factored, grown
 from factorbus.client.link import Link
@@ -124,7 +125,8 @@ class Features:
         return Sighting(self.camera, state, rows, seen, self.rho, self.sigma_rho, self.sigma_pixel)
 
     def _ask(self, ask: Ask, timeout_s: float | None) -> Errand:
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        self._link.check_open("features")
+        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         if answer_size(ask) > ANSWER_LIMITS.max_bytes:
             raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
         started = time.monotonic()

@@ -17,6 +17,8 @@ def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
     """
     end = time.monotonic() + timeout_s
     key, payload, attempt = keys.admin_key(operation), codec.encode_map({}), 0
+    what = f"the service, asked for admin/{operation},"
+    link.check_open(what)
     while (left := end - time.monotonic()) > 0:
         attempt += 1
         came: SimpleQueue[list[Reply]] = SimpleQueue()
@@ -24,6 +26,7 @@ def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         verdicts = [judge(reply, attempt) for reply in came.get() or [Silence()]]
         if answers := [verdict for verdict in verdicts if isinstance(verdict, bytes)]:
             return answers
+        link.check_open(what)
         for verdict in verdicts:
             if isinstance(verdict, Problem):
                 raise verdict
@@ -33,4 +36,4 @@ def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         # Whoever was busy has said for how long, and of nobody there is nothing to wait on.
         time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))
     hint = "nobody replies: is it running, and may this client ask?"
-    raise Unavailable(f"the service, asked for admin/{operation},", timeout_s, hint)
+    raise Unavailable(what, timeout_s, hint)

@@ -18,7 +18,7 @@ from factorbus.client.listening import heard
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet, keys
 from factorbus.proto.kept_state import keep_state
-from factorbus.proto.problems import BadEndpoint, BadSetting, NobodyListens, Unavailable
+from factorbus.proto.problems import BadEndpoint, BadSetting, ClosedHere, NobodyListens, Unavailable
 
 _ENDPOINT = re.compile(r"[a-z-]+/\S+")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
@@ -31,6 +31,7 @@ class Link:
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
+        self.closed = False
         self._declared: dict[str, zenoh.KeyExpr | str] = {}
 
     def ask(self, key: str, payload: bytes, timeout_s: float, done: Callable[[Reply], None]) -> None:
@@ -153,7 +154,13 @@ class Link:
 
     def close(self) -> None:
         """End the session; questions still out end in silence."""
+        self.closed = True
         self._session.close()
+
+    def check_open(self, what: str) -> None:
+        """Raises ClosedHere, of `what` was to go over it."""
+        if self.closed:
+            raise ClosedHere(what, connection=True)
 
 
 def open_link(

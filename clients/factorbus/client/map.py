@@ -13,23 +13,27 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import flag, of_type, seconds
 from factorbus.client.changes import Changes
 from factorbus.client.courier import Courier, Errand
-from factorbus.client.draft import Draft
+from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions, logged
+from factorbus.client.supported import check_changes, check_stamps
 from factorbus.client.ticket import Ticket
 from factorbus.client.uncertainty import Doubt, DoubtQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Accepted, Batch, Change, Chi2, Estimate, Graph, Insert
-from factorbus.proto.problems import NotSupported, Problem, Refused, TooLarge, Unavailable
+from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
+from factorbus.proto.problems import ClosedHere, Problem, Refused, TooLarge, Unavailable
 from factorbus.wording import counted
+
+SUFFIX_LENGTH = 9  # characters that joining a map adds to the name of a client
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +127,10 @@ class Map:
         points_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
         changes: are made first; all of it happens or none.
 
-        Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.
+        Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.  Raises as `send`.
         """
-        end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
-        left = end - time.monotonic()
+        end = time.monotonic() + seconds("timeout_s", timeout_s, self.timeout_s)
+        left = max(end - time.monotonic(), 0.0)
         ticket = self.send(batch, settle=settle, points_below=points_below, changes=changes, timeout_s=left)
         accepted = ticket.result(max(end - time.monotonic(), 0.0))
         self._catch_up(max(end - time.monotonic(), 0.0))
@@ -167,9 +171,10 @@ class Map:
         Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, TooLarge: nothing was sent.  Raises
         Refused (the map is as it was), Unavailable.
         """
-        graph = other if isinstance(other, Graph) else other.graph(timeout_s)
+        if not isinstance(other, Graph):
+            other = of_type("other", other, Map, "a Map, or the Graph of one").graph(timeout_s)
         here = self.ask_estimate(timeout_s=timeout_s)
-        fitted = fit_into(here, graph, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
+        fitted = fit_into(here, other, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
         return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
 
     def send(
@@ -183,15 +188,16 @@ class Map:
     ) -> Ticket:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
-        Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported: `batch` is then not sent.
+        Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
         """
-        batch = batch.batch() if isinstance(batch, Draft) else batch
-        self._check_stamps(batch)
-        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        batch, settle = batch_of("batch", batch), flag("settle", settle)
+        listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
+        check_stamps(self._protocol, batch)
+        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
-            listed = self._known(changes) if changes is not None else ()
+            check_changes(self._protocol, listed)
             insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
             ticket = self._ticket(insert, timeout_s)
             with self._lock:
@@ -204,7 +210,7 @@ class Map:
 
         Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
         """
-        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         with self._lock:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
@@ -218,15 +224,16 @@ class Map:
         self._catch_up(timeout_s)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
-        """Wait until everything sent is answered and the map, left alone since, is at its optimum to 1e-6 of χ².
+        """Wait until everything sent is answered and the map, left alone since, goes on no more by itself.
 
-        Nothing more is published then until the next insert, and the mirror has it.  Nothing is sent for it: a map goes
-        on by itself when nobody inserts, for a tenth of a second where it has not converged, else for a second.
-        `settle` demands it at once, as a step.
-        Raises NotConverged when time is up, or at once where the map gave up; as `flush` does; Unavailable for a map
-        opened with mirror=False.
+        It is at its optimum then, to 1e-6 of χ²; or, where `stats()["gave_up"]` says why it came no nearer, within a
+        thousandth.  Nothing more is published until the next insert, and the mirror has it.  Nothing is sent for it: a
+        map goes on by itself when nobody inserts, for a tenth of a second where it has not converged, else for a
+        second.  `settle` demands it at once, as a step.
+        Raises NotConverged when time is up, or at once where the map gave up before it had converged; as `flush` does;
+        Unavailable for a map opened with mirror=False.
         """
-        end = time.monotonic() + (self.timeout_s if timeout_s is None else timeout_s)
+        end = time.monotonic() + seconds("timeout_s", timeout_s, self.timeout_s)
         self.flush(max(end - time.monotonic(), 0.0))
         self.estimate.wait_converged(max(end - time.monotonic(), 0.0))
 
@@ -273,8 +280,9 @@ class Map:
 
     def clients(self, timeout_s: float | None = None) -> set[str]:
         """Names of the clients that have joined the map and not left it, of those that tell; this one is among them."""
+        self._link.check_open(f"map {self.name!r}, asked for its clients")
         came: SimpleQueue[set[str]] = SimpleQueue()
-        timeout_s = self.timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         self._link.ask_tokens(keys.any_client_token(self.name), timeout_s, came.put)
         return set(map(keys.client_of, came.get()))
 
@@ -334,24 +342,6 @@ class Map:
         self._presence.close()
         self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
 
-    def _known(self, changes: Changes) -> tuple[Change, ...]:
-        """What is in `changes`.  Raises NotSupported for what the service would skip, or not know."""
-        listed, protocol = changes.listed(), self._protocol
-        if protocol and listed:
-            told = protocol.get("changes") if "changes" in protocol.get("insert", ()) else ()
-            names = told if isinstance(told, list | tuple) else ()
-            for change in listed:
-                if change.change not in names:
-                    raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
-        return listed
-
-    def _check_stamps(self, batch: Batch) -> None:
-        """Raises NotSupported where the service would skip them."""
-        protocol = self._protocol
-        skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())
-        if skipped and any(group.stamps is not None for group in batch.variables):
-            raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
-
     def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
         window = self._window
 
@@ -381,7 +371,7 @@ class Map:
     def _wait_for_room(self, timeout_s: float) -> None:
         room = self._changed.wait_for(lambda: self._closed or not self._window.full, timeout_s)
         if self._closed:
-            raise Unavailable(f"map {self.name!r}", 0.0, "it was closed here; open it again")
+            raise ClosedHere(f"map {self.name!r}", connection=self._link.closed)
         if not room:
             hint = f"{counted(self._size, 'insert')} without an answer (window={self._size}); this one was not sent"
             raise Unavailable(f"map {self.name!r}", timeout_s, hint)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.draft import Draft
+from factorbus.client.draft import Draft, batch_of
 from factorbus.client.frames import (
     SPACES,
     compose,
@@ -119,15 +119,15 @@ def fit_into(
 ) -> Fitted:
     """What brings the map `other` into the one that is as `here`; see `factorbus.client.Map.merge`.
 
-    Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol.
+    Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, BadOption.
     """
     if absolute not in ABSOLUTE:
         raise CannotMerge(f"absolute is {absolute!r}; wanted one of {', '.join(ABSOLUTE)}")
+    given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
     renamed = _renamed(other.batch, letters or {})
     _check_keys(here, renamed)
     kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute)
-    given = anchors.batch() if isinstance(anchors, Draft) else anchors or Batch()
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
         return Fitted(_together(kept, given), T, {}, given.factor_count)

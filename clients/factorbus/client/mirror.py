@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
+from factorbus.client.arguments import of_type, seconds
 from factorbus.client.following import Following, tables_of
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
@@ -19,7 +21,7 @@ from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_ask
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta, Variables
-from factorbus.proto.problems import BadSymbol, NotConverged, Unavailable
+from factorbus.proto.problems import BadSymbol, ClosedHere, NotConverged, Unavailable
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
@@ -154,23 +156,23 @@ class Mirror:
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        of_type("revision", revision, Integral, "a whole number")
         self._try_wait(lambda: self._there(revision), timeout_s)
         if self._there(revision):
             return
         self._check_open()
-        state = "stale" if self.stale else "up to date"
-        hint = (
-            f"the mirror is {state} at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
-        )
+        state = f"{'stale' if self.stale else 'up to date'} at revision {self.revision}"
+        hint = f"the mirror is {state}, {self.age_s:.1f} s after it last heard of the service"
         raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
         """Until the values are the latest, the map has converged at them, and no further steps are to follow.
 
-        Raises NotConverged when time is up, and at once where the map gave up; Unavailable, at once, on a closed map.
+        That is at its optimum to 1e-6 of χ², or within a thousandth where it gave up the rest (`gave_up` of its stats).
+        Raises NotConverged when time is up, at once where it gave up before; Unavailable, at once, on a closed map.
         """
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         self._try_wait(lambda: self._is_at_rest, timeout_s)
         if self._is_at_rest and self.converged:
             return
@@ -242,7 +244,7 @@ class Mirror:
 
     def _check_open(self) -> None:
         if self._closing:
-            raise Unavailable(f"map {self._map!r}", 0.0, "it was closed here; open it again")
+            raise ClosedHere(f"map {self._map!r}", connection=self._link.closed)
 
     def _forget(self, callback: Callable[[Delta], None]) -> None:
         with self._lock:

@@ -2,6 +2,7 @@
 
 from concurrent.futures import Future
 
+from factorbus.client.arguments import seconds
 from factorbus.client.courier import Errand
 from factorbus.proto.messages import Accepted
 from factorbus.proto.problems import Unavailable
@@ -37,7 +38,7 @@ class Ticket:
         NoAnswerYet does not take the insert back: it goes on being sent with its number.  Wait again, or `flush`;
         do not insert it anew.
         """
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         try:
             return self.future.result(timeout_s)
         except TimeoutError:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import of_type, seconds
 from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
@@ -81,7 +82,7 @@ class DoubtQuestions:
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
-        timeout_s = self._timeout_s if timeout_s is None else timeout_s
+        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
 
 
@@ -158,11 +159,13 @@ def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
 
 
 def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, ...]:
-    """The factors of a draft or a batch.  Raises BadShape when there are variables in it."""
+    """The factors of a draft or a batch.  Raises BadShape when there are variables in it, BadOption."""
     if isinstance(candidates, Draft):
         candidates = candidates.batch()
     if not isinstance(candidates, Batch):
-        return tuple(candidates)
+        wanted = "a Draft, a Batch, or a sequence of Factors"
+        listed = of_type("candidates", candidates, Sequence, wanted)
+        return tuple(of_type("candidates", each, Factors, wanted) for each in listed)
     if candidates.variable_count:
         raise BadShape("candidates", f"{counted(candidates.variable_count, 'variable')} among them", "factors only")
     return candidates.factors

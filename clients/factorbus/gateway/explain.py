@@ -6,6 +6,7 @@ from typing import Any
 
 from factorbus.proto.asking import Why
 from factorbus.proto.symbols import format_symbol
+from factorbus.proto.why_text import fall_without
 from factorbus.wording import counted
 
 _WORDS = {
@@ -25,7 +26,7 @@ def explain(why: Why) -> dict[str, Any]:
     sigmas: standard deviations in its tangent space, metres and radians.  chi2: what its factors count in χ².  A factor
     has id, kind, keys, chi2 = rᵀ Ω r, loss, weight and rho, what it counts with its loss; misfit = √(chi2 / dim): about
     1 where the information is right; known: the share of what it measures that is known from it and not from the
-    others; without: by how much χ² would fall without it, null: nothing else measures it.
+    others; without: by how much χ² would fall without it, to first order; null: nothing else measures it.
     """
     account = why.variable
     rows = sorted(map(_row, account["factors"]), key=lambda row: -row["chi2"])
@@ -41,7 +42,7 @@ def explain(why: Why) -> dict[str, Any]:
         "chi2": sum(row["rho"] for row in rows),
         "factors": rows,
         "step": f"{why.step['strategy']}: {why.step['because']}" if why.step else "",
-        "text": _text(name, account, rows),
+        "text": _text(name, account, rows, why.step),
     }
 
 
@@ -60,7 +61,7 @@ def _row(factor: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]]) -> str:
+def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]], step: Mapping[str, Any]) -> str:
     """In a sentence or four."""
     what = f"{name} is {_WORDS.get(account['kind'], 'of kind ' + account['kind'])}"
     if account["fixed"]:
@@ -70,7 +71,7 @@ def _text(name: str, account: Mapping[str, Any], rows: list[dict[str, Any]]) -> 
     others = sorted({key for row in rows for key in row["keys"]} - {name})
     held = f"{what}, held by {counted(len(rows), 'factor')}"
     held += f" to {', '.join(others[:4])}{' and others' if len(others) > 4 else ''}." if others else "."
-    return f"{held} {_certainty(account)}{_fit(rows[0])}"
+    return f"{held} {_certainty(account)}{_fit(rows[0], step)}"
 
 
 def _leading(count: int) -> str:
@@ -87,10 +88,11 @@ def _certainty(account: Mapping[str, Any]) -> str:
     return f"Its place is known to {max(places):.2g} m{turned} (one standard deviation). "
 
 
-def _fit(worst: dict[str, Any]) -> str:
+def _fit(worst: dict[str, Any], step: Mapping[str, Any]) -> str:
     by = f"{worst['misfit']:.1f} of its standard deviations"
     if worst["misfit"] > _DOUBTFUL:
-        without = "" if worst["without"] is None else f"; without it χ² would fall by {worst['without']:.3g}"
+        fall = worst["without"]
+        without = "" if fall is None else f"; without it χ² would fall by {fall_without(fall, step)}"
         ends = ", ".join(worst["keys"])
         return f"{worst['kind']} ({ends}) contradicts the rest: it misses by {by}{without}."
     return f"All agree: the worst misses by {by}."

@@ -22,13 +22,14 @@ PREFIX = f"factorbus/{VERSION}"
 # The one key that is the same in every version, so that versions can be told apart.
 ANY_SERVICE_OF_ANY_VERSION = "factorbus/*/features/*/live"
 QUESTIONS = ("estimate", "chi2", "graph", "stats", "export", "covariance", "gate", "associate", "gain", "why", "repair")
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+LONGEST_NAME = 64
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
-def checked_name(what: str, name: str) -> str:
-    """`name`, if it may stand in a key.  Raises BadName; `what` says whose name it is."""
-    if not _NAME.fullmatch(name):
-        raise BadName(what, name)
+def checked_name(what: str, name: str, most: int = LONGEST_NAME) -> str:
+    """`name`, if it may stand in a key.  Raises BadName; `what` says whose name it is, `most` how long it may be."""
+    if not isinstance(name, str) or len(name) > most or not _NAME.fullmatch(name):
+        raise BadName(what, name, most)
     return name
 
 

@@ -10,7 +10,7 @@
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   ├── UnknownKind      unknown_kind         a kind of variable, factor or change that this version does not know
     │   ├── BadLoss          bad_loss             a loss that does not exist, a scale that is not positive
-    │   └── BadOption        bad_option           a parameter of the right type whose value is not one it takes
+    │   └── BadOption        bad_option           a parameter whose value, or type, is not one it takes
     ├── TooLarge             too_large            a message, an insert or a map over its limit
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
@@ -19,7 +19,8 @@
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
-    │   └── NobodyListens    unavailable          there is nothing at that address
+    │   ├── NobodyListens    unavailable          there is nothing at that address
+    │   └── ClosedHere       unavailable          this client itself has closed the connection, or left the map
     ├── NotConverged         not_converged        a map was waited for in vain (client side)
     ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── OtherProtocol        other_protocol       only services of another major version are there (client side)
@@ -73,9 +74,9 @@ class BadStamp(Problem):
 class BadName(Problem):
     code = "bad_name"
 
-    def __init__(self, what: str, name: str) -> None:
+    def __init__(self, what: str, name: str, most: int = 64) -> None:
         super().__init__(
-            f"{what} name {name!r} will not do: wanted 1 to 64 of the characters A-Z a-z 0-9 _ -", seen=name
+            f"{what} name {name!r} will not do: wanted 1 to {most} of the characters A-Z a-z 0-9 _ -", seen=str(name)
         )
 
 
@@ -227,6 +228,15 @@ class NobodyListens(Unavailable):
         Problem.__init__(
             self, f"nothing listens at {endpoint}; start a service there with `factorbus serve`, or check the address"
         )
+
+
+class ClosedHere(Unavailable):
+    """Nobody was asked: what it would go over was closed by this client."""
+
+    def __init__(self, what: str, *, connection: bool) -> None:
+        """connection: all of it is closed, and not only the map."""
+        closed = "this connection is closed; connect again" if connection else "it was closed here; open it again"
+        Problem.__init__(self, f"{what.rstrip(',')}: {closed}", waited_s=0.0)
 
 
 class BetterOptimum(Problem):

@@ -369,9 +369,9 @@ class Underconstrained(SolverError):
 
     def __init__(self, key: int, factors: Sequence[str], missing: str) -> None:
         listed = ", ".join(factors[:8]) + (", ..." if len(factors) > 8 else "")
-        by = f"by its {counted(len(factors), 'factor')} ({listed})" if factors else "as no factor is on it"
+        by = f"is not fixed by its {counted(len(factors), 'factor')} ({listed}): {missing}"
         super().__init__(
-            f"{printed(key)} is not fixed {by}: {missing}",
+            f"{printed(key)} {by}" if factors else f"nothing holds {printed(key)}: no factor is on it; {missing}",
             key=key,
             factors=list(factors),
             missing=missing,

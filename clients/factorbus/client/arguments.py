@@ -1,0 +1,43 @@
+"""What a call is given, held against what it takes: another type is refused by name, before it is sent."""
+
+import math
+import threading
+from numbers import Real
+from typing import Any, TypeVar
+
+import numpy as np
+
+from factorbus.proto.problems import BadOption
+
+T = TypeVar("T")
+_PLAIN = (str, bytes, int, float, complex, list, tuple, dict, type(None))
+
+
+def of_type(what: str, given: Any, kind: type[T], wanted: str) -> T:
+    """`given`, if it is of this kind.  Raises BadOption."""
+    if not isinstance(given, kind):
+        raise BadOption(what, seen(given), wanted)
+    return given
+
+
+def flag(what: str, given: Any) -> bool:
+    """True or False, numpy's too; no other value is taken for one of the two.  Raises BadOption."""
+    if not isinstance(given, (bool, np.bool_)):
+        raise BadOption(what, seen(given), "True or False")
+    return bool(given)
+
+
+def seconds(what: str, given: Any, usual: float) -> float:
+    """How long to wait; None: as long as usual.  Raises BadOption."""
+    if given is None:
+        return usual
+    number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
+    if not 0.0 <= number <= threading.TIMEOUT_MAX:
+        raise BadOption(what, seen(given), "seconds: a finite number, 0 or more; or None, for as long as usual")
+    return number
+
+
+def seen(given: Any) -> str:
+    """What it is, in a few words."""
+    name = type(given).__name__
+    return f"{given!r:.60} ({name})" if isinstance(given, (*_PLAIN, np.generic)) else f"an object of type {name}"

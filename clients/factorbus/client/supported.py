@@ -1,0 +1,24 @@
+"""What an older service would skip without a word: it is not sent, which is said."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from factorbus.proto.messages import Batch, Change
+from factorbus.proto.problems import NotSupported
+
+
+def check_changes(protocol: Mapping[str, Any], listed: tuple[Change, ...]) -> None:
+    """Raises NotSupported for what a service with this protocol would skip, or not know."""
+    if protocol and listed:
+        told = protocol.get("changes") if "changes" in protocol.get("insert", ()) else ()
+        names = told if isinstance(told, list | tuple) else ()
+        for change in listed:
+            if change.change not in names:
+                raise NotSupported(f"the change {change.change!r}", str(protocol.get("product", "")))
+
+
+def check_stamps(protocol: Mapping[str, Any], batch: Batch) -> None:
+    """Raises NotSupported where a service with this protocol would skip them."""
+    skipped = bool(protocol) and "stamps" not in protocol.get("variable_fields", ())
+    if skipped and any(group.stamps is not None for group in batch.variables):
+        raise NotSupported("time stamps of variables", str(protocol.get("product", "")))
