@@ -11,7 +11,7 @@ import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
 from factorbus.cli.options import SECONDS, Number, file_argument, json_option, mode_option, out_option, zenoh_option
-from factorbus.cli.reading import read_graph, reading_options
+from factorbus.cli.reading import COUNTED, read_graph, reading_options
 from factorbus.cli.starts import optimum_from
 from factorbus.wording import counted
 
@@ -316,10 +316,7 @@ def _chi2_initial(steps: Any) -> float | None:
 
 
 def _size(result: dict[str, Any]) -> str:
-    return ", ".join(
-        counted(result[many], one)
-        for many, one in (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))
-    )
+    return ", ".join(counted(result[many], one) for many, one in COUNTED)
 
 
 def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:

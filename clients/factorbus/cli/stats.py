@@ -98,7 +98,7 @@ def _convergence(row: Mapping[str, Any]) -> str:
 
 
 def _steps(strategies: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in strategies.items()) or "no step yet"
+    return ", ".join(f"{count} {strategy}" for strategy, count in strategies.items()) or "no step yet"
 
 
 def _codes(refusals: Mapping[str, int]) -> str:
