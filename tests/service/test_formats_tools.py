@@ -1,5 +1,6 @@
 """Files as other programs write them: each opens, and its optimum is that of g2o, which read it too."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +107,9 @@ def test_it_opens_at_the_right_optimum(tmp_path: Path, case: str) -> None:
     assert chi2(graph, use_values=False) == pytest.approx(right, rel=1e-8)
     assert graph.left_out == left_out
     for name, count in left_out.items():
-        assert any(f"{count} {name} left out: " in note for note in graph.notes)
+        assert any(
+            re.search(f"{count} {name[:4]}\\S* (left out|that a replay leaves out): ", note) for note in graph.notes
+        )
     if left_out:
         with pytest.raises(FormatError, match=r"nothing that would (have to )?be left out \(strict\)"):
             read(tmp_path / "a.g2o", strict=True)
