@@ -190,6 +190,7 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
     told = json.loads(shown.out)
     assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
     assert "a.g2o: 2 ROBOTLASER1 left out" in shown.err
+    assert " 4/4 " in shown.err, "the bar ends where the drive does"
     assert (told["written"], told["poses"]) == (["o.g2o", "t.tum"], 4)
     assert main([*asked, "--strict"]) == BAD_FILE
     assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {"file": "a.g2o", "line": 5}

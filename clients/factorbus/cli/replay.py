@@ -157,7 +157,7 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
     steps = graph.steps(use_values=request.use_values)
     with _target(request) as target:
         before = target.account()
-        with screen.progress(request.file.name, graph.poses) as show:
+        with screen.progress(request.file.name, steps.poses) as show:
             driven = drive(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
