@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from factorbus.formats.left_out import LeftOut
 from factorbus.solver.errors import Underconstrained
 from factorbus.wording import counted
 
@@ -64,3 +65,29 @@ def test_no_count_stands_before_a_bare_plural() -> None:
                 if plural.search(line):
                     found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
     assert found == []
+
+
+def test_no_name_for_many_stands_behind_a_count_as_it_is() -> None:
+    """`{count} {name}` says "1 poses" where the names are plurals, and "a {kind}" says "a se2"."""
+    found = []
+    for root in ("proto", "service", "workers", "clients"):
+        for path in sorted((ROOT / root / "factorbus").rglob("*.py")):
+            for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+                if re.search(r"\{count\} \{name\}|\ba \{[a-z.]*\bgroup\.kind\}|\ba se[23]\b", line):
+                    found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert found == []
+
+
+def test_what_is_left_out_of_a_file_has_its_noun() -> None:
+    """Every plural that `LeftOut` is given in the tree, once and twice."""
+    plurals = {"poses", "landmarks", "factors"}  # that come in a variable
+    for path in sorted((ROOT / "service" / "factorbus" / "formats").rglob("*.py")):
+        plurals |= set(re.findall(r"\.(?:drop|set_aside)\(\"([a-z ]+s)\"", path.read_text(encoding="utf-8")))
+    assert len(plurals) > 5
+    for name in sorted(plurals):
+        left = LeftOut("a.g2o")
+        left.drop(name, 1, "why")
+        left.drop(name, 2, "why")
+        one, many = left.notes
+        assert many == f"2 {name} left out: why"
+        assert not re.match(f"1 {name} ", one), one

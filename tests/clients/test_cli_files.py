@@ -48,9 +48,11 @@ def test_convert_says_what_it_leaves_out(folder: Path, capsys: pytest.CaptureFix
     assert main(["convert", "a.g2o", "b.g2o", "--json"]) == OK
     shown = capsys.readouterr()
     assert "a.g2o: 2 ROBOTLASER1 left out: " in shown.err
-    assert "a.g2o: 1 vertices left out: no edge names x9" in shown.err
+    assert "a.g2o: 1 vertex that a replay leaves out: no edge names 9" in shown.err
     told = json.loads(shown.out)
-    assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
+    assert "b.g2o: 5 poses, 0 landmarks, 4 factors" in shown.err
+    assert told["read"]["left_out"] == {"ROBOTLASER1": 2}
+    assert "VERTEX_SE2 9 0 0 0" in (folder / "b.g2o").read_text()
     assert told["read"]["notes"] == [line[7:] for line in shown.err.splitlines() if line.startswith("a.g2o: ")]
     assert (told["files"], told["poses"], told["factors"]) == (["b.g2o"], 5, 4)
 
@@ -65,7 +67,8 @@ def test_a_trajectory_is_converted_with_its_times(folder: Path, capsys: pytest.C
     assert len((folder / "c.kitti").read_text().splitlines()) == 2
     capsys.readouterr()
     assert main(["convert", "a.tum", "d.g2o"]) == OK
-    assert "d.g2o: 2 time stamps left out: g2o has no record for when a se3 was" in capsys.readouterr().err
+    said = "d.g2o: 2 time stamps left out: g2o has no record for the time of se3 variables"
+    assert said in capsys.readouterr().err
     assert read(folder / "d.g2o").poses == 2
     assert main(["convert", "a.tum", "e.g2o", "--strict"]) == BAD_FILE
     assert not (folder / "e.g2o").exists()
@@ -92,6 +95,18 @@ def test_strict_refuses_and_writes_nothing(folder: Path, capsys: pytest.CaptureF
     assert not (folder / "b.g2o").exists()
     assert main(["convert", "c.graph", "b.g2o"]) == OK
     assert "b.g2o: 1 bearing_range_se2 left out: g2o has no record for such factors" in capsys.readouterr().err
+
+
+def test_one_of_each_is_counted_as_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "a.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_XY 1 1 0\nEDGE_SE2_XY 0 1 1 0 1 0 1\n")
+    assert main(["convert", "a.g2o", "b.g2o"]) == OK
+    assert capsys.readouterr().err == "b.g2o: 1 pose, 1 landmark, 1 factor\n"
+    assert main(["convert", "a.g2o", "b.tum"]) == OK
+    assert capsys.readouterr().err.splitlines() == [
+        "b.tum: 1 landmark left out: a trajectory has poses alone",
+        "b.tum: 1 factor left out: a trajectory has poses alone",
+        "b.tum: 1 pose, 0 landmarks, 0 factors",
+    ]
 
 
 def test_a_trajectory_for_each_robot(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -146,7 +161,7 @@ def test_poses_without_a_time_among_others_are_said(folder: Path, capsys: pytest
     files, notes, counts = _written(graph, folder / "b.tum", False, None, "auto")
     assert ([file.name for file in files], counts["poses"]) == (["b.tum"], 2)
     assert len((folder / "b.tum").read_text().splitlines()) == 2
-    assert any("1 poses left out: others have a time stamp and a0 none" in note for note in notes)
+    assert any("1 pose left out: a0 has no time stamp, and others have one" in note for note in notes)
 
 
 def test_ids_come_out_as_they_went_in_unless_asked(folder: Path) -> None:
@@ -175,6 +190,7 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
     told = json.loads(shown.out)
     assert told["read"]["left_out"] == {"ROBOTLASER1": 2, "vertices": 1}
     assert "a.g2o: 2 ROBOTLASER1 left out" in shown.err
+    assert " 4/4 " in shown.err, "the bar ends where the drive does"
     assert (told["written"], told["poses"]) == (["o.g2o", "t.tum"], 4)
     assert main([*asked, "--strict"]) == BAD_FILE
     assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {"file": "a.g2o", "line": 5}

@@ -14,11 +14,13 @@ from processes import processes
 from factorbus.cli.bus import open_bus
 from factorbus.cli.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABLE, USAGE
 from factorbus.cli.main import main
+from factorbus.cli.starts import ratio_to
 from factorbus.client import Draft, connect
 from factorbus.proto.problems import NobodyListens
 from factorbus.proto.version import __version__
 
 FACTORBUS = str(Path(sys.executable).parent / "factorbus")
+RENAMED = ("--letter", "a=c", "--letter", "b=d", "--letter", "=e")
 SIGMAS = (0.1, 0.1, 0.02)
 
 
@@ -231,3 +233,53 @@ def test_a_map_of_a_file_without_vertices_is_drawn_from_odometry(
     assert "6 poses composed from odometry" in shown.err
     assert (tmp_path / "bare-map.png").stat().st_size > 5000
     assert main(["plot", "map", "nothing.g2o"]) == BAD_FILE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ask", "why", "yard", "--", "-5"], "the map has no -5; factorbus ask covariance yard lists those there are"),
+        (["ask", "why", "yard", "q5"], "the map has no q5; factorbus ask covariance yard lists those there are"),
+        (["ask", "covariance", "yard", "q5"], "the map has no q5; factorbus ask covariance yard lists"),
+        (["ask", "why", "yard", "99", "--factor"], "factorbus ask why yard KEY lists those on a variable"),
+        (["ask", "gate", "yard", "candidates.g2o"], "there is no variable x5; factorbus ask covariance yard lists"),
+        (["change", "remove", "yard", "q5"], "factorbus: there is no variable q5, or not any more; factorbus ask"),
+        (["change", "merge", "yard", "yard"], "letter of their own, such as --letter x=y [key_collision]"),
+        (["change", "merge", "yard", "yard", *RENAMED], "merged. --absolute leave-out merges it without them"),
+        (
+            ["change", "merge", "yard", "yard", *RENAMED, "--absolute", "leave-out"],
+            "(--anchor x5 y8 0,2,-1.57), or --frame",
+        ),
+    ],
+)
+def test_advice_is_that_of_the_command_line(
+    endpoint: str,
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "candidates.g2o").write_text("EDGE_SE2 5 6 1 0 0 1 0 0 1 0 1\n")
+    assert main([*arguments[:2], "--connect", endpoint, *arguments[2:]]) == REFUSED
+    assert said in capsys.readouterr().err
+
+
+def test_relative_wants_pairs(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ask", "covariance", "yard", "a1", "--relative", "--connect", endpoint]) == USAGE
+    assert "--relative wants KEYS in pairs, such as x12 x300; there is 1 key" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("chi2", "batch", "told"),
+    [
+        (0.0, 0.0, "-"),
+        (7e-25, 1e-24, "-"),
+        (2.0, 0.0, "-"),
+        (3.0, 2.0, "1.500000000"),
+        (1e-3, 1e-12, "1000000000.000000000"),
+    ],
+)
+def test_what_is_rounding_is_not_compared(chi2: float, batch: float, told: str) -> None:
+    assert ratio_to(chi2, batch) == told

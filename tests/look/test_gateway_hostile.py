@@ -16,7 +16,7 @@ from factorbus.gateway.documents import Document
 from factorbus.gateway.explain import explain
 from factorbus.proto.asking import Why
 from factorbus.proto.problems import BadSymbol
-from factorbus.proto.symbols import MAX_KEY, parse_symbol
+from factorbus.proto.symbols import MAX_KEY, MIN_KEY, parse_symbol
 
 pytest.importorskip("starlette")
 
@@ -129,11 +129,14 @@ def test_fuzzed_requests_get_documented_answers_and_leave_no_traceback(
     assert seen[404] > 10
 
 
-@pytest.mark.parametrize("text", ["9" * 5000, "x" + "9" * 5000, str(MAX_KEY + 1), "x" + "9" * 18])
+@pytest.mark.parametrize(
+    "text", ["9" * 5000, "x" + "9" * 5000, str(MAX_KEY + 1), str(MIN_KEY - 1), "-" + "9" * 5000, "x" + "9" * 18]
+)
 def test_numbers_too_long_to_read_are_no_keys(text: str) -> None:
     with pytest.raises(BadSymbol) as raised:
         parse_symbol(text)
     assert len(raised.value.message) < 300
+    assert [parse_symbol(str(key)) for key in (-5, MIN_KEY, MAX_KEY)] == [-5, MIN_KEY, MAX_KEY]
     assert parse_symbol("x" + "0" * 6000 + "12") == parse_symbol("x12")
 
 

@@ -1,5 +1,6 @@
 """Files as other programs write them: each opens, and its optimum is that of g2o, which read it too."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +107,9 @@ def test_it_opens_at_the_right_optimum(tmp_path: Path, case: str) -> None:
     assert chi2(graph, use_values=False) == pytest.approx(right, rel=1e-8)
     assert graph.left_out == left_out
     for name, count in left_out.items():
-        assert any(f"{count} {name} left out: " in note for note in graph.notes)
+        assert any(
+            re.search(f"{count} {name[:4]}\\S* (left out|that a replay leaves out): ", note) for note in graph.notes
+        )
     if left_out:
         with pytest.raises(FormatError, match=r"nothing that would (have to )?be left out \(strict\)"):
             read(tmp_path / "a.g2o", strict=True)
@@ -203,6 +206,6 @@ def test_isam_is_assumed_and_slampp_can_be_said(tmp_path: Path) -> None:
 def test_what_only_one_bearing_sees_is_in_no_step(tmp_path: Path) -> None:
     graph = read_text(tmp_path, loop() + "VERTEX_XY 9 1 1\nEDGE_BEARING_SE2_XY 0 9 0.5 100\n")
     assert graph.left_out == {"points": 1}
-    assert "bearings from a single pose do not place l9" in graph.notes[0]
+    assert "bearings from a single pose do not place 9" in graph.notes[0]
     assert chi2(graph) == pytest.approx(LOOP_CHI2, rel=1e-8)
     assert graph.batch.variable_count == 5

@@ -178,7 +178,7 @@ def test_g2o_has_no_record_for_a_time_and_says_so() -> None:
     batch = Batch((poses([1, NO_STAMP, 3]),))
     written = as_g2o(batch)
     assert written.left_out == {"time stamps": 2}
-    assert written.notes == ("2 time stamps left out: g2o has no record for when a se2 was",)
+    assert written.notes == ("2 time stamps left out: g2o has no record for the time of se2 variables",)
     assert written.text == as_g2o(Batch((poses(None),))).text
     with pytest.raises(FormatError, match="2 time stamps"):
         as_g2o(batch, strict=True)

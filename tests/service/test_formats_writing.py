@@ -192,7 +192,10 @@ def test_losses_and_antennas_beside_the_pose_are_left_out_and_said() -> None:
     written = as_g2o(Batch(batch.variables, (robust, sight, antenna)))
     assert written.text == g2o_text(batch)
     assert written.left_out == {"between_se2 loss": 1, "position_se2": 1}
-    assert "written without their huber" in written.notes[0]
+    assert written.notes[0] == "1 between_se2 loss left out: g2o has no losses: written without their huber"
+    keys, measured = np.repeat(edge.keys, 2, 0), np.repeat(edge.measured, 2, 0)
+    twice = Factors(edge.kind, keys, measured, np.repeat(edge.information, 2, 0), "huber", np.ones(2))
+    assert as_g2o(Batch(batch.variables, (twice, sight))).notes[0].startswith("2 between_se2 losses left out: ")
     with pytest.raises(FormatError, match="1 between_se2 loss"):
         g2o_text(Batch(batch.variables, (robust, sight)), strict=True)
 

@@ -7,11 +7,13 @@ from typing import Any, TypeVar
 
 import click
 
+from factorbus.cli.advice import advising, of_what_is_there
 from factorbus.cli.exits import FAILED, OK, input_file
 from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
 from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
-from factorbus.cli.starts import NOT_CONVERGED, optimum_from
+from factorbus.cli.starts import NOT_CONVERGED, optimum_from, ratio_to
+from factorbus.wording import counted
 
 _SHOWN = 20  # more false factors than these are told with --json only
 
@@ -74,6 +76,10 @@ def covariance_command(
 
     if blocks in ("joint", "relative") and not keys:
         raise click.UsageError(f"--{blocks} needs KEYS")
+    if blocks == "relative" and len(keys) % 2:
+        raise click.UsageError(
+            f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
+        )
     with _map(name, connect, zenoh, timeout_s) as asked:
         found = asked.doubt.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
     if found.covariance is not None:
@@ -259,7 +265,7 @@ def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: fl
         from_where = optimum_from(found.start, converged=found.batch_converged)
         by = f"{from_where}; {found.worker}, {found.seconds:.2f} s"
         rows.append(("batch", f"{found.batch:.9g}  ({by})"))
-        ratio = f"{found.chi2 / found.batch:.9f}" if found.batch else "-"
+        ratio = ratio_to(found.chi2, found.batch)
         rows.append(("χ² / batch", ratio if found.batch_converged else f"{ratio}  (batch: {NOT_CONVERGED})"))
     if found.notice is not None:
         rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {name}")))
@@ -378,6 +384,7 @@ def _map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> Iterator[Any
     from factorbus.cli.bus import open_bus
 
     with (
+        advising(of_what_is_there(name)),
         open_bus(endpoint, "ask", zenoh, timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):

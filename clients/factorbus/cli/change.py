@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import click
 
+from factorbus.cli.advice import advising_changes
 from factorbus.cli.exits import OK
 from factorbus.cli.merging import merge_command
 from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, json_option, zenoh_option
@@ -206,6 +207,7 @@ def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, s
     from factorbus.cli.bus import open_bus
 
     with (
+        advising_changes(name),
         open_bus(connect, "change", zenoh, timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.options import file_argument, json_option
-from factorbus.cli.reading import IDS, read_graph, reading_options, robot_option, say
+from factorbus.cli.reading import COUNTED, IDS, read_graph, reading_options, robot_option, say
+from factorbus.wording import counted
 
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
@@ -54,9 +55,9 @@ def command(
     files, notes, counts = _written(graph, target, strict, robot, ids)
     say(target, notes)
     if as_json:
-        about = {"source": str(source), "read": graph.account(), "files": [str(file) for file in files]}
+        about = {"source": str(source), "read": graph.account(whole=True), "files": [str(file) for file in files]}
         document({**about, "notes": list(notes), **counts})
-    told = ", ".join(f"{count} {name}" for name, count in counts.items())
+    told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
     note(f"{', '.join(map(str, files))}: {told}")
 
 

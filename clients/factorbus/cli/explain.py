@@ -48,14 +48,16 @@ def command(code: str | None) -> None:
 
 
 def code_of(word: str) -> str:
-    """The code that `word` means: itself, in brackets or not, or the name of an exception."""
+    """The code that `word` means: itself, in brackets or not, or the name of an exception; in whatever case."""
     spelt = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", word.strip("[] ").rpartition(".")[2]).lower()
-    return _CODES.get(spelt, spelt)
+    bare = {name.replace("_", ""): name for name in (*read_pages(), *_CODES)}
+    found = bare.get(spelt.replace("_", "").replace("-", ""), spelt)
+    return _CODES.get(found, found)
 
 
 def _summary(page: str) -> str:
     """The first sentence, whole: a page has lines of its own."""
-    return re.split(r"(?<=[.:]) (?=[A-Z`])", " ".join(page.split()), maxsplit=1)[0]
+    return re.split(r"(?<=[.]) (?=[A-Z`])", " ".join(page.split()), maxsplit=1)[0]
 
 
 def read_pages() -> dict[str, str]:

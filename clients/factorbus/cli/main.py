@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import click
 
 from factorbus.cli.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
+from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
 
 # name -> (module, one line).  The lines stand here so that `factorbus --help` imports none of the commands.
@@ -70,7 +71,8 @@ class _Commands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            ctx.fail(f"there is no command {args[0]!r}; wanted one of {', '.join(self.list_commands(ctx))}")
+            meant = nearest(args[0], self.list_commands(ctx))
+            ctx.fail(f"there is no command {args[0]!r}{meant or '; factorbus --help lists those there are'}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

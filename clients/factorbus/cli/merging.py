@@ -4,6 +4,7 @@ from typing import Any
 
 import click
 
+from factorbus.cli.advice import MERGING, advising
 from factorbus.cli.exits import OK
 from factorbus.cli.screen import document, table
 
@@ -62,7 +63,7 @@ def merge_command(
             there.map(other, mirror=False, create=False) as theirs,
         ):
             graph = theirs.graph(timeout_s)
-        with bus.map(name, mirror=False, create=False) as joined:
+        with advising(MERGING), bus.map(name, mirror=False, create=False) as joined:
             merged = joined.merge(graph, settle=settle, **how)
     _show(merged, as_json)
     return OK

@@ -13,6 +13,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # The graph formats that are read; `tests/clients/test_cli_files.py` holds them to the reader's own list.
 DIALECTS = ("g2o", "toro", "isam", "slam++", "tum")
+COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
 IDS = ("auto", "ids", "keys", "counted")
 
 

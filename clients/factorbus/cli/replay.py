@@ -11,8 +11,8 @@ import click
 
 from factorbus.cli.exits import REFUSED, Stopped, lacking, require
 from factorbus.cli.options import SECONDS, Number, file_argument, json_option, mode_option, out_option, zenoh_option
-from factorbus.cli.reading import read_graph, reading_options
-from factorbus.cli.starts import optimum_from
+from factorbus.cli.reading import COUNTED, read_graph, reading_options
+from factorbus.cli.starts import optimum_from, ratio_to
 from factorbus.wording import counted
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
@@ -126,6 +126,8 @@ def command(as_json: bool, **asked: Any) -> None:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
     if request.in_process and request.live:
         raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
+    if request.out is not None and request.out.suffix != ".g2o":
+        raise click.BadParameter(f"{request.out} does not end in .g2o", param_hint="--out")
     from factorbus.cli import screen
 
     def told(result: dict[str, Any]) -> None:
@@ -145,6 +147,9 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
 
     if request.plot:
         require("viz", "--plot")
+        from factorbus.viz import checked_ending
+
+        checked_ending(request.plot)
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
@@ -152,7 +157,7 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
     steps = graph.steps(use_values=request.use_values)
     with _target(request) as target:
         before = target.account()
-        with screen.progress(request.file.name, graph.poses) as show:
+        with screen.progress(request.file.name, steps.poses) as show:
             driven = drive(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
@@ -316,10 +321,7 @@ def _chi2_initial(steps: Any) -> float | None:
 
 
 def _size(result: dict[str, Any]) -> str:
-    return ", ".join(
-        counted(result[many], one)
-        for many, one in (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))
-    )
+    return ", ".join(counted(result[many], one) for many, one in COUNTED)
 
 
 def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
@@ -338,7 +340,7 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     for each in result["against_batch"]:
         by = f"{_optimum(each, result)}; {each['worker']}, {each['seconds']:.2f} s"
         worse = "  better_optimum" if each["better_optimum"] else ""
-        rows.append((f"χ² / batch at {each['revision']}", f"{each['ratio']:.9f}  ({by}){worse}"))
+        rows.append((f"χ² / batch at {each['revision']}", f"{ratio_to(each['chi2'], each['batch'])}  ({by}){worse}"))
     if result["adopted"]:
         was = f"{result['adopted']['chi2']:.8g}, {_optimum(result['adopted'], result)}"
         rows.append(("better_optimum", f"adopted: χ² was {was}"))

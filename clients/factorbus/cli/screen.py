@@ -27,8 +27,9 @@ def table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    lines = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, show_header=False, pad_edge=False)
+    lines = Table(box=box.SIMPLE_HEAD, show_header=False, pad_edge=False)
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
     for name, value in rows:
@@ -36,6 +37,8 @@ def table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=120)
+    if title:  # not the table's own, which would be no wider than its columns
+        console.print(Text(title, style="table.title"))
     console.print(lines)
 
 

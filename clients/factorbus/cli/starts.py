@@ -7,6 +7,14 @@ _WORDS = {"values": "the map's own values", "odometry": "composed odometry", "ro
 NOT_CONVERGED = "not converged, the true optimum may be lower"
 
 
+_ROUNDING = 1e-9  # a χ² below this is what rounding left of a fit without any residual
+
+
+def ratio_to(chi2: float, batch: float) -> str:
+    """χ² over that of the batch optimum; "-" where there is nothing but rounding to compare."""
+    return "-" if not batch or max(chi2, batch) < _ROUNDING else f"{chi2 / batch:.9f}"
+
+
 def optimum_from(start: str, file_values: bool = False, converged: bool = True) -> str:
     """ "optimum from averaged rotations".  file_values: the map began with the values of a file.
 

@@ -70,8 +70,8 @@ def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield f"map {row['name']}", _map(row)
     for row in account.get("unopened", ()):
         yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
-    for name, value in account.get("journal", {}).items():
-        yield f"journal {name}", str(value)
+    for name, value in _told(account.get("journal", {})):
+        yield f"journal {name}", value
 
 
 def _map(row: Mapping[str, Any]) -> str:
@@ -84,9 +84,18 @@ def _map(row: Mapping[str, Any]) -> str:
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
         f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
-        *(f"{name}: {value}" for name, value in row.get("journal", {}).items()),
+        *(f"journal {name}: {value}" for name, value in _told(row.get("journal", {}))),
     ]
     return "\n".join(lines)
+
+
+def _told(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Fields that have something to say: names in words, times to three digits."""
+    for name, value in fields.items():
+        if value not in ("", None):
+            is_long = isinstance(value, float) and abs(value) < 1000
+            shown = f"{value:.3g}" if is_long else f"{value:,.0f}" if isinstance(value, float) else str(value)
+            yield name.replace("_", " "), shown
 
 
 def _convergence(row: Mapping[str, Any]) -> str:
@@ -102,7 +111,7 @@ def _convergence(row: Mapping[str, Any]) -> str:
 
 
 def _steps(strategies: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in strategies.items()) or "no step yet"
+    return ", ".join(f"{count} {strategy}" for strategy, count in strategies.items()) or "no step yet"
 
 
 def _codes(refusals: Mapping[str, int]) -> str:

@@ -58,27 +58,27 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
             if as_json:
                 screen.document(seen)
             else:
-                console.print(_view(seen, endpoint))
+                console.print(_view(seen, endpoint, console))
             return
         from rich.live import Live
 
-        with Live(_view(seen, endpoint), console=console, screen=True, auto_refresh=False) as live:
+        with Live(_view(seen, endpoint, console), console=console, screen=True, auto_refresh=False) as live:
             while not stop.wait(every_s):
-                live.update(_view(gauges.read(), endpoint), refresh=True)
+                live.update(_view(gauges.read(), endpoint, console), refresh=True)
 
 
 def _console() -> Any:
     from rich.console import Console
 
     console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=120)
+    return console if console.is_terminal else Console(highlight=False, width=160)
 
 
 def _can_redraw(console: Any) -> bool:
     return console.is_terminal and not console.is_dumb_terminal
 
 
-def _view(seen: dict[str, Any], endpoint: str) -> "RenderableType":
+def _view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType":
     from rich.console import Group
     from rich.text import Text
 
@@ -87,15 +87,26 @@ def _view(seen: dict[str, Any], endpoint: str) -> "RenderableType":
         return Text(head + f"nobody answers: {seen['unavailable']}; asking again", style="bold")
     head += f"service {seen['service']} {seen['version']}, answers in {seen['answer_ms']:.1f} ms"
     closed = [Text(f"map {line}", style="bold red") for line in seen["unopened"]]
-    return Group(Text(head, style="bold"), Text(), *closed, _maps(seen), _clients(seen), _workers(seen))
+    tables = (_table(console, rows) for rows in (_maps(seen), _clients(seen)))
+    return Group(Text(head, style="bold"), Text(), *closed, *tables, *_gone(seen), _table(console, _workers(seen)))
 
 
-def _maps(seen: dict[str, Any]) -> "RenderableType":
-    table = _table(
+# Columns of each table, the first of which stays; where not all have room the last of these goes first.
+_MATTER = (
+    "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
+    "mode", "slots", "in flight", "trip ms",
+)  # fmt: skip
+_ANY_WIDTH = 10_000
+_LEFT = ("map", "mode")
+_Table = tuple[tuple[str, ...], list[tuple[str, ...]]]  # names of columns, rows
+
+
+def _maps(seen: dict[str, Any]) -> _Table:
+    names = (
         "map", "mode", "variables", "factors", "revision", "steps/s", "inserts/s", "step ms", "χ²", "waiting", "refused"
-    )
-    for row in seen["maps"]:
-        table.add_row(
+    )  # fmt: skip
+    rows = [
+        (
             row["name"],
             row["mode"],
             f"{row['variables']:,}",
@@ -108,45 +119,72 @@ def _maps(seen: dict[str, Any]) -> "RenderableType":
             f"{row['waiting']}" + (f" +{row['parked']}" if row["parked"] else ""),
             f"{row['refused']}" + (f", {row['busy']} busy" if row["busy"] else ""),
         )
-    return table
+        for row in seen["maps"]
+    ]
+    return names, rows
 
 
 def _convergence(row: dict[str, Any]) -> str:
     return " converging" if row["converging"] else " gave up" if row["gave_up"] else ""
 
 
-def _clients(seen: dict[str, Any]) -> "RenderableType":
-    table = _table("client", "map", "inserts", "inserts/s")
-    for row in seen["clients"]:
-        if row["here"]:
-            table.add_row(row["name"], row["map"], f"{row['inserts']:,}", f"{row['inserts_per_s']:.1f}")
+def _clients(seen: dict[str, Any]) -> _Table:
+    rows = [
+        (row["name"], row["map"], f"{row['inserts']:,}", f"{row['inserts_per_s']:.1f}")
+        for row in seen["clients"]
+        if row["here"]
+    ]
+    return ("client", "map", "inserts", "inserts/s"), rows
+
+
+def _gone(seen: dict[str, Any]) -> list["RenderableType"]:
+    from rich.text import Text
+
     gone = [row for row in seen["clients"] if not row["here"]]
-    if gone:
-        table.caption = f"{counted(len(gone), 'client')} gone, after {counted(_inserts(gone), 'insert')}"
-        table.caption_justify = "left"
-    return table
+    told = f"{counted(len(gone), 'client')} gone, after {counted(_inserts(gone), 'insert')}"
+    return [Text(told, style="table.caption")] if gone else []
 
 
 def _inserts(rows: list[dict[str, Any]]) -> int:
     return sum(row["inserts"] for row in rows)
 
 
-def _workers(seen: dict[str, Any]) -> "RenderableType":
-    table = _table("worker", "slots", "in flight", "trip ms")
+def _workers(seen: dict[str, Any]) -> _Table:
+    rows = []
     for row in seen["workers"]:
         trip = "" if row.get("trip_ms") is None else f"{row['trip_ms']:.2f}"
         trip = "distrusted" if row.get("distrusted") else trip
-        table.add_row(row["name"], str(row["slots"]), str(row["in_flight"]), trip)
-    return table
+        rows.append((row["name"], str(row["slots"]), str(row["in_flight"]), trip))
+    return ("worker", "slots", "in flight", "trip ms"), rows
 
 
-def _table(first: str, *columns: str) -> Any:
+def _table(console: Any, content: _Table) -> Any:
+    """As many columns as have room whole: a number without its last digits is another one."""
+    names, rows = content
+    shown, longest = list(names), None  # of a name in one line
+    while True:
+        table = _drawn(shown, [[row[names.index(name)] for name in shown] for row in rows], longest)
+        wanted = console.measure(table, options=console.options.update(max_width=_ANY_WIDTH)).maximum
+        if len(shown) == 1 or wanted <= console.width:
+            return table
+        if longest is None:
+            longest = max(12, console.width // 4)
+        else:
+            shown.remove(max(shown[1:], key=_MATTER.index))
+
+
+def _drawn(names: list[str], rows: list[list[str]], longest: int | None) -> Any:
     from rich import box
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    # In a narrow terminal a cell goes on in the next line: a number without its last digits is another one.
-    table.add_column(first, style="bold", overflow="fold")
-    for column in columns:
-        table.add_column(column, justify="left" if column in ("map", "mode") else "right", overflow="fold")
+    # A long name goes on in the next line; numbers do not.
+    table.add_column(names[0], style="bold", overflow="fold", max_width=longest)
+    for name in names[1:]:
+        if name in _LEFT:
+            table.add_column(name, overflow="fold", max_width=longest)
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
     return table

@@ -5,7 +5,6 @@ could keep the interpreter from exiting), so what is passed in here may only han
 """
 
 import json
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,10 +16,10 @@ from zenoh.handlers import Callback
 from factorbus.client.listening import heard
 from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet, keys
+from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.kept_state import keep_state
-from factorbus.proto.problems import BadEndpoint, BadSetting, ClosedHere, NobodyListens, Unavailable
+from factorbus.proto.problems import BadSetting, ClosedHere, NobodyListens, Unavailable
 
-_ENDPOINT = re.compile(r"[a-z-]+/\S+")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
 _TIMED_OUT = b"Timeout"
 _DECLARED = 64
@@ -210,8 +209,7 @@ def open_session(
 
 def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) -> zenoh.Config:
     for endpoint in endpoints:
-        if not _ENDPOINT.fullmatch(endpoint):
-            raise BadEndpoint(discreet.endpoint(endpoint))
+        checked_endpoint(endpoint)
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:

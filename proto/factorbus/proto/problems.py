@@ -83,10 +83,9 @@ class BadName(Problem):
 class BadEndpoint(Problem):
     code = "bad_endpoint"
 
-    def __init__(self, endpoint: str) -> None:
-        super().__init__(
-            f"endpoint {endpoint!r} cannot be read; wanted protocol/address, such as tcp/127.0.0.1:7447", seen=endpoint
-        )
+    def __init__(self, endpoint: str, more: str = "") -> None:
+        wanted = f"protocol/address{more and ' '}{more}, such as tcp/127.0.0.1:7447"
+        super().__init__(f"endpoint {endpoint!r} cannot be read; wanted {wanted}", seen=endpoint)
 
 
 class BadSetting(Problem):

@@ -7,7 +7,7 @@ from factorbus.proto.problems import BadSymbol
 
 _INDEX_BITS = 56
 MAX_INDEX = (1 << _INDEX_BITS) - 1
-MAX_KEY = (1 << 63) - 1
+MIN_KEY, MAX_KEY = -(1 << 63), (1 << 63) - 1
 _MOST_SHOWN = 80
 
 
@@ -23,8 +23,10 @@ def symbol(letter: str, index: int) -> int:
 def parse_symbol(text: str) -> int:
     """The key that prints as `text`: "x12", "l3", or "7" for a key without a letter.  Raises BadSymbol.
 
-    A number alone is the key itself, also one above MAX_INDEX, as a time stamp in nanoseconds is.
+    A number alone is the key itself, also one above MAX_INDEX, as a time stamp in nanoseconds is, or below 0.
     """
+    if text[:1] == "-":
+        return _below_0(text)
     letter, digits = (text[:1], text[1:]) if text[:1].isalpha() else ("", text)
     if not (digits.isascii() and digits.isdigit()):
         raise BadSymbol(text[:_MOST_SHOWN], "a letter and a number, such as x12, or a number")
@@ -32,6 +34,13 @@ def parse_symbol(text: str) -> int:
     if len(digits) > len(str(most)) or int(digits) > most:  # Python itself refuses to read very long numbers
         raise BadSymbol(text[:_MOST_SHOWN], f"{'an index' if letter else 'a number'} from 0 to {most}")
     return symbol(letter, int(digits)) if letter else int(digits)
+
+
+def _below_0(text: str) -> int:
+    digits = text[1:].lstrip("0") or "0"
+    if not (text[1:].isascii() and text[1:].isdigit()) or len(digits) > len(str(MIN_KEY)) or -int(digits) < MIN_KEY:
+        raise BadSymbol(text[:_MOST_SHOWN], f"a letter and a number, such as x12, or a number from {MIN_KEY}")
+    return -int(digits)
 
 
 def format_symbol(key: int) -> str:

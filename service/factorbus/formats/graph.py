@@ -11,6 +11,8 @@ from factorbus.formats.steps import Steps, planned, planned_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
 
+_IN_NO_STEP = ("vertices", "points")  # of `left_out`: these are in the batch
+
 
 @dataclass(frozen=True, slots=True)
 class GraphFile:
@@ -51,9 +53,10 @@ class GraphFile:
         """All steps as one insert, with the first pose fixed where the file leaves the choice.  Raises FormatError."""
         return planned_whole(self.path, *self._joined(), use_values)
 
-    def account(self) -> dict[str, object]:
-        """What a program is told of how the file was read."""
-        return {"dialect": self.dialect, "notes": list(self.notes), "left_out": dict(self.left_out)}
+    def account(self, whole: bool = False) -> dict[str, object]:
+        """What a program is told of how the file was read; whole: of all in `batch`, not of what a replay drives."""
+        left_out = {name: count for name, count in self.left_out.items() if not (whole and name in _IN_NO_STEP)}
+        return {"dialect": self.dialect, "notes": list(self.notes), "left_out": left_out}
 
     def _joined(self) -> tuple[Batch, tuple[I64, ...]]:
         """The graph, and the lines of its factors, without what nothing is known of.  Raises FormatError."""

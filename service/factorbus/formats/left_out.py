@@ -10,7 +10,10 @@ from factorbus.wording import counted
 
 _SHOWN = 5
 # Names that are nouns have a singular; names of records and kinds do not.
-_ONE = {"vertices": "vertex", "points": "point", "variables": "variable", "time stamps": "time stamp"}
+_ONE = {
+    "vertices": "vertex", "poses": "pose", "points": "point", "landmarks": "landmark", "variables": "variable",
+    "factors": "factor", "time stamps": "time stamp",
+}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -47,13 +50,19 @@ class LeftOut:
             self.counts[name] = self.counts.get(name, 0) + count
             self.notes.append(f"{_counted(count, name)} left out: {why}")
 
+    def set_aside(self, name: str, count: int, why: str) -> None:
+        """The same for what the graph keeps, and no step of a replay has.  Raises FormatError when strict."""
+        self.drop(name, count, why)
+        if count:
+            self.notes[-1] = f"{_counted(count, name)} that a replay leaves out: {why}"
+
     def say(self, note: str) -> None:
         """Nothing is left out, but somebody may want to know."""
         self.notes.append(note)
 
 
 def _counted(count: int, name: str) -> str:
-    return counted(count, _ONE.get(name, name), name)
+    return counted(count, _ONE.get(name, name), f"{name}es" if name.endswith(" loss") else name)
 
 
 def shown(names: list[str]) -> str:

@@ -23,7 +23,7 @@ from factorbus.formats.rotations import normalised_poses
 from factorbus.formats.sniff import named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.symbols import MAX_INDEX, format_symbol
+from factorbus.proto.symbols import MAX_INDEX, symbol_parts
 
 READS = (*DIALECTS, TUM)
 
@@ -69,12 +69,17 @@ def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     batch, lines = assembled(file, are_keys, chosen.one_numbering and not apart, vertices, edges, fixes)
     if apart:
         left.say("poses and points are numbered separately")
-    lone = [format_symbol(key) for key in unnamed(batch).tolist()] if batch.factors else []
-    left.drop("vertices", len(lone), f"no edge names {shown(lone)}")
-    lost = [format_symbol(key) for key in lone_bearings(batch).tolist()]
-    left.drop("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
+    lone = _ids_in_file(unnamed(batch), are_keys) if batch.factors else []
+    left.set_aside("vertices", len(lone), f"no edge names {shown(lone)}")
+    lost = _ids_in_file(lone_bearings(batch), are_keys)
+    left.set_aside("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
     numbering = "keys" if are_keys else "apart" if apart else "ids"
     return GraphFile(file, chosen.name, batch, lines, tuple(left.notes), dict(left.counts), numbering)
+
+
+def _ids_in_file(keys: I64, are_keys: bool) -> list[str]:
+    """As the file has them, so that one finds them there."""
+    return [str(key if are_keys else symbol_parts(key)[1]) for key in keys.tolist()]
 
 
 def _edges(

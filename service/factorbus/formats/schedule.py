@@ -57,7 +57,7 @@ def roster(file: str, batch: Batch) -> Roster:
     for group in batch.factors:
         at = np.minimum(np.searchsorted(keys[order], group.keys), max(len(keys) - 1, 0))
         if len(keys) == 0 or (keys[order][at] != group.keys).any():
-            raise FormatError(file, None, f"a {group.kind} of a variable that is not in the graph", "all its variables")
+            raise FormatError(file, None, f"{group.kind} of a variable that is not in the graph", "all its variables")
         ends.append(order[at])
     return Roster(
         keys=keys,

@@ -51,6 +51,11 @@ class Steps(Sequence[Batch]):
     def __len__(self) -> int:
         return self._count
 
+    @property
+    def poses(self) -> int:
+        """Number of poses in all of them: the file may have more, that no edge names."""
+        return sum(len(group.keys) for group in self._variables if group.kind in POSES)
+
     @overload
     def __getitem__(self, index: int) -> Batch: ...
     @overload

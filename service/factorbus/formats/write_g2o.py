@@ -109,7 +109,7 @@ def _writable(batch: Batch, left: LeftOut) -> Batch:
         else:
             left.drop(group.kind, len(group.keys), "g2o has no record for such variables")
         stamps = 0 if group.stamps is None else int((group.stamps != NO_STAMP).sum())
-        left.drop("time stamps", stamps, f"g2o has no record for when a {group.kind} was")
+        left.drop("time stamps", stamps, f"g2o has no record for the time of {group.kind} variables")
     gone = np.concatenate(
         [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in _VERTEX_NAMES)]
     )

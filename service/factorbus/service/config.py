@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
+from factorbus.proto.endpoints import checked_endpoint
+from factorbus.proto.keys import checked_name
 from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.problems import Problem
 
@@ -94,7 +96,7 @@ class Config:
 
 
 def load(path: str | Path, **overrides: Any) -> Config:
-    """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, OSError."""
+    """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, BadEndpoint, BadName, OSError."""
     with Path(path).open("rb") as file:
         try:
             content = tomllib.load(file)
@@ -104,7 +106,11 @@ def load(path: str | Path, **overrides: Any) -> Config:
 
 
 def checked(config: Config) -> Config:
-    """`config`, if it can work.  Raises BadConfig."""
+    """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
+    for endpoint in (*config.listen, *config.connect):
+        checked_endpoint(endpoint)
+    for name in config.create:
+        checked_name("map", name)
     if config.mode not in ("peer", "router", "client"):
         raise BadConfig(f"mode is {config.mode!r}; wanted peer, router or client")
     if config.mode == "client" and not config.connect:
