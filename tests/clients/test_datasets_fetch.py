@@ -145,7 +145,7 @@ def test_another_file_is_refused(site: Site, tmp_path: Path) -> None:
 
 def test_a_cut_connection_is_told(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL, length=len(SMALL) + 100))
-    says = f"cut after {len(SMALL)} bytes; wanted {len(SMALL) + 100} bytes"
+    says = f"cut after {len(SMALL):,} bytes; wanted {len(SMALL) + 100:,} bytes"
     assert refused(site, tmp_path, BrokenDownload, says).code == "broken_download"
 
 
