@@ -47,9 +47,8 @@ class Graph(Arenas):
         self.payload: F64 = np.empty(8192)
         self.counts: I64 = np.zeros(at.COUNTS, np.int64)
         self.table: I64 = np.zeros(1024, np.int64)
-        enter_keys(
-            0, self.table, self.keys
-        )  # none yet; but now it is loaded, and not in the step that needs a larger one
+        # No keys yet: it loads the kernel, which the step that needs a larger table would have to wait for.
+        enter_keys(0, self.table, self.keys)
         self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
         self.id_shift = 0  # of a later row: its id less its number
         self.holes = 0  # numbers of the payload that no factor has any more
