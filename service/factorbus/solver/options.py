@@ -92,7 +92,7 @@ class Options:
     dear: float = 5e8
     converged_share: float = 5e-4
     rounds: int = 3
-    ripple: float = 0.02
+    ripple: float = 0.01
     recent_steps: int = 2
     heavy: float = 1e5
     near: float = 1.4
