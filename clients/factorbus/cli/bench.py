@@ -13,7 +13,7 @@ from factorbus.cli.screen import document, note
 
 BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
 LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
-ASKED = ("ask",)  # a minute or two, most of it GTSAM's; on request
+ASKED = ("ask", "digest")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -43,6 +43,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
                --inserts, --minutes
+    digest     the account of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
     all        cholesky, bus, idp, ros2 and journal
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
