@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from factorbus.service.config import load
-from factorbus.service.histogram import Histogram
-from factorbus.service.metrics import families
+from factorbus.service.core.histogram import Histogram
+from factorbus.service.operations.metrics import families
 
 DEPLOY = Path(__file__).parent.parent / "deploy"
 BIN = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from walk import LANGUAGES, ROOT, agrees, blocks, walk, walker
 
-from factorbus.cli.explain import read_pages
+from factorbus.cli.commands.explain import read_pages
 
 sys.path.insert(0, str(ROOT / "docs" / "machinery"))
 TUTORIALS = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "tutorials").glob("*.md"))

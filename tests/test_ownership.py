@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from factorbus.cli.checks import cache
-from factorbus.cli.exits import REFUSED
+from factorbus.cli.doctor.checks import cache
+from factorbus.cli.output.exits import REFUSED
 from factorbus.journal.bundle import export_map, import_map
 from factorbus.journal.lock import own
 from factorbus.journal.problems import UnsafeJournal

@@ -106,7 +106,7 @@ def test_the_table_of_extras_says_what_commands_ask_for() -> None:
         re.findall(r"^\| `(\w+)` \| (.+) \|$", text[text.index("| extra |") : text.index("## What goes in")], re.M)
     )
     asked = set()
-    for path in (ROOT / "clients" / "factorbus" / "cli").glob("*.py"):
+    for path in (ROOT / "clients" / "factorbus" / "cli").rglob("*.py"):
         for extra, what in re.findall(r'require\("(\w+)", "([^"]+)"\)', path.read_text()):
             command = what.removeprefix("factorbus ") if what.startswith("factorbus ") else f"{path.stem} {what}"
             asked.add((extra, command))

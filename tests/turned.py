@@ -10,7 +10,7 @@ from processes import PATIENCE_S
 from factorbus.client import Draft, Map
 from factorbus.journal.store import create
 from factorbus.proto.messages import Batch, Delta
-from factorbus.service.fold import GOES_ON
+from factorbus.service.solving.apply import GOES_ON
 from factorbus.solver import Options, Solver
 
 # The first finishes in a few steps, the second in hundreds of short ones.

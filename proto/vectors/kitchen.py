@@ -35,9 +35,9 @@ from factorbus.proto.messages import (
 from factorbus.proto.problems import BetterOptimum
 from factorbus.proto.stamps import LEAST_STAMP, NO_STAMP
 from factorbus.proto.symbols import symbol
-from factorbus.service.uncertain import Uncertain
+from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
-from factorbus.solver.repair import repair
+from factorbus.solver.changes.repair import repair
 from factorbus.workers import jobs
 
 EPOCH = 7

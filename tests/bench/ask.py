@@ -34,7 +34,7 @@ from factorbus.proto.messages import Factors
 from factorbus.solver import Options, Solver, warm
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import judge_candidates
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.model import layout as at
 
 _CANDIDATES = 10_000
 _REPEAT = 5

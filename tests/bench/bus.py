@@ -52,7 +52,7 @@ from zenoh.handlers import Callback
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.service.settings import RUNTIME, RUNTIME_VARIABLE
+from factorbus.service.bus.zenoh_config import RUNTIME, RUNTIME_VARIABLE
 
 GOAL = 1.3
 POSES = 10
@@ -271,8 +271,8 @@ def ask(bus: zenoh.Session, key: zenoh.KeyExpr | str, on_reply: Callable[[zenoh.
 
 def echo() -> None:
     """The other side of the floor: nothing but Zenoh, as the service configures it."""
+    from factorbus.service.bus.zenoh_config import zenoh_settings
     from factorbus.service.config import Config
-    from factorbus.service.settings import zenoh_settings
 
     stop = threading.Event()
     settings = zenoh.Config()

@@ -41,10 +41,10 @@ from sksparse.cholmod import analyze as cholmod_analyze
 from factorbus.datasets import find
 from factorbus.formats import read
 from factorbus.solver import Options, Solver
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.kernels.simd import LANES
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import Symbolic, analyze
+from factorbus.solver.kernels.jit.simd import LANES
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
 GENERATED = {"grid2d": lambda: grid(80, 3), "grid3d": lambda: grid(50, 6)}
 DATASETS = ("city10000", "sphere2500", "manhattan3500", "victoria_park")

@@ -34,12 +34,12 @@ from factorbus.proto import codec, features_codec, keys
 from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.messages import Batch, Graph, Insert
 from factorbus.proto.problems import Problem, Refused
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.events import Answer, Arrived, Folded, Judged, Refuse, Run, Stepped
-from factorbus.service.fold import Folder
-from factorbus.service.questions import Question
+from factorbus.service.core.events import Answer, Arrived, Folded, Judged, Refuse, Run, Stepped
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.questions.answers import Question
+from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
 DECODERS: tuple[Callable[[bytes], Any], ...] = (

@@ -25,8 +25,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.idp_bus import process
 
-from factorbus.cli.ekf import CAMERA, Filter
-from factorbus.cli.visual import Settings, VisualFilter
+from factorbus.cli.demo.ekf import CAMERA, Filter
+from factorbus.cli.demo.visual import Settings, VisualFilter
 from factorbus.client import Camera, Features, connect
 
 _FIRST, _RATE_HZ = 90, 20.0  # before, the camera stands still and no depth can be seen

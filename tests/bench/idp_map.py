@@ -19,7 +19,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import Frame, MonocularWorld, monocular
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.model import layout as at
 
 LOSS = ("dcs", 4.0)
 _RHO, _SIGMA_RHO = 0.35, 0.25

@@ -37,7 +37,7 @@ from bench.replays.contestants import ENTRIES, OURS, PEER, STAND_IN, Entry
 from bench.replays.problems import ALL, Problem
 from bench.replays.samples import Sampling
 
-from factorbus.service.cores import core_count
+from factorbus.service.process.worker_threads import core_count
 
 PARTS = ("replays", "growth", "cores", "full-pass", "overhead")
 OUR_MODES = tuple(name for name, entry in ENTRIES.items() if entry.solver == OURS)

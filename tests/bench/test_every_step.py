@@ -23,7 +23,7 @@ from bench.replays.contestants import Failed
 from bench.replays.gtsam_factors import gtsam_factors, pose3
 from bench.replays.targets import MET, MISSED, NOT_MEASURED
 
-from factorbus.cli import bench
+from factorbus.cli.commands import bench
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Group, Options, Solver, StepReport

@@ -7,9 +7,9 @@ import pytest
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 
-from factorbus.cli.columns import merged
-from factorbus.cli.local import covariances_at
-from factorbus.cli.sparsity import last_loop, pattern_of
+from factorbus.cli.driving.columns import merged
+from factorbus.cli.driving.local import covariances_at
+from factorbus.cli.output.sparsity import last_loop, pattern_of
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.cli.exits import (
+from factorbus.cli.main import COMMANDS, main
+from factorbus.cli.output.exits import (
     BAD_FILE,
     FAILED,
     INTERRUPTED,
@@ -22,8 +23,7 @@ from factorbus.cli.exits import (
     report,
     require,
 )
-from factorbus.cli.installing import install_command, requirement
-from factorbus.cli.main import COMMANDS, main
+from factorbus.cli.output.installing import install_command, requirement
 from factorbus.proto.problems import BadName, Refused, Unavailable
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
@@ -143,7 +143,7 @@ def test_interrupted_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 
 def test_a_missing_extra_is_named_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "numba" else object())
+    monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda name: None if name == "numba" else object())
     assert lacking("service") == ["numba"]
     require("viz", "a picture")
     with pytest.raises(Stopped, match=r"factorbus serve needs numba.*: \S.* install .*\[service\]"):
@@ -169,7 +169,7 @@ def test_what_pip_is_to_install_is_where_this_copy_is_from(told: dict, wanted: s
 
 def test_the_command_that_installs_an_extra_is_for_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = {"url": tmp_path.as_uri(), "dir_info": {"editable": True}}
-    monkeypatch.setattr("factorbus.cli.installing.origin", lambda: told)
+    monkeypatch.setattr("factorbus.cli.output.installing.origin", lambda: told)
     monkeypatch.setattr("sys.executable", str(tmp_path / ".venv" / "bin" / "python"))
     monkeypatch.chdir(tmp_path)
     assert install_command("watch") == ".venv/bin/python -m pip install -e '.[watch]'"
@@ -213,20 +213,20 @@ def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
 
 
 def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    from factorbus.cli import checks
+    from factorbus.cli.doctor import checks
 
-    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda name: None if name == "rerun" else object())
+    monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda name: None if name == "rerun" else object())
     found = checks.extras()
     assert found.state == "ok"
     assert re.fullmatch(r"if wanted: \S.* install .*\[watch\]'", found.mend)
     assert "without watch" in found.seen
-    monkeypatch.setattr("factorbus.cli.exits.find_spec", lambda _: None)
+    monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda _: None)
     assert checks.extras().seen == "none installed; without service, viz, watch, record, gateway, ros2"
 
 
 @pytest.mark.parametrize(("answer", "state"), [(0, "ok"), (5, "warn"), (-1, "ok")])
 def test_doctor_asks_the_kernel_who_keeps_the_clock(answer: int, state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from factorbus.cli import checks
+    from factorbus.cli.doctor import checks
 
     class Libc:
         @staticmethod
@@ -241,7 +241,7 @@ def test_extras_are_those_of_the_project() -> None:
     """What the commands ask for is what `pip install 'factorbus[...]'` brings."""
     import tomllib
 
-    from factorbus.cli.exits import EXTRAS
+    from factorbus.cli.output.exits import EXTRAS
 
     project = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())["project"]
     distributions = {

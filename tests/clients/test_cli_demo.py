@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factorbus.cli.columns import merged, position_errors, positions
-from factorbus.cli.demo import _rows
-from factorbus.cli.drive import Compared
-from factorbus.cli.exits import FAILED, INTERRUPTED, OK
+from factorbus.cli.commands.demo import _rows
+from factorbus.cli.driving.columns import merged, position_errors, positions
+from factorbus.cli.driving.drive import Compared
+from factorbus.cli.output.exits import FAILED, INTERRUPTED, OK
 from factorbus.proto.messages import Batch
 from factorbus.simulate import manhattan
 

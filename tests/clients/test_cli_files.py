@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.cli import reading
-from factorbus.cli.columns import merged
-from factorbus.cli.convert import _written
-from factorbus.cli.exits import BAD_FILE, OK, REFUSED, USAGE
+from factorbus.cli.commands.convert import _written
+from factorbus.cli.driving.columns import merged
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import BAD_FILE, OK, REFUSED, USAGE
+from factorbus.cli.process import reading
 from factorbus.formats import IDS, READS, GraphFile, read
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.stamps import NO_STAMP

@@ -14,12 +14,12 @@ from typing import IO, Any
 
 import pytest
 
-from factorbus.cli.children import service
-from factorbus.cli.columns import merged
-from factorbus.cli.drive import Compared
-from factorbus.cli.exits import FAILED, INTERRUPTED, OK, REFUSED
-from factorbus.cli.local import LocalMap
+from factorbus.cli.driving.columns import merged
+from factorbus.cli.driving.drive import Compared
+from factorbus.cli.driving.local import LocalMap
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import FAILED, INTERRUPTED, OK, REFUSED
+from factorbus.cli.process.children import service
 from factorbus.client import connect
 from factorbus.datasets import CATALOGUE, named
 from factorbus.formats import read

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.cli.exits import BAD_FILE, Stopped
+from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.main import main
-from factorbus.cli.replay_source import source_of
+from factorbus.cli.output.exits import BAD_FILE, Stopped
 from factorbus.datasets import CATALOGUE, Places, named
 
 GRAPH = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"

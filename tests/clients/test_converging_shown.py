@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from faulty.service import MAP, Service, endpoint_in
 
-from factorbus.cli.exits import OK, REFUSED
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import OK, REFUSED
 
 _HISTOGRAM = {"bounds_s": [1.0], "counts": [0, 0], "sum_s": 0.0}
 _ROW = {

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.cli import ekf
+from factorbus.cli.demo import ekf
 
 
 @pytest.mark.parametrize("name", ["predict_1", "predict_2"])

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.cli.columns import merged
-from factorbus.cli.exits import OK
+from factorbus.cli.driving.columns import merged
+from factorbus.cli.output.exits import OK
 from factorbus.formats import write_kitti, write_tum
 from factorbus.proto.messages import Batch, Variables
 from factorbus.simulate import sphere

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.cli.exits import OK, USAGE
-from factorbus.cli.explain import code_of, read_pages
+from factorbus.cli.commands.explain import code_of, read_pages
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import OK, USAGE
 
 ROOT = Path(__file__).resolve().parents[2]
 # Bases of a tree of errors: never raised themselves.

@@ -9,13 +9,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from factorbus.cli.exits import INTERRUPTED
-from factorbus.cli.stopping import interrupt_on_sigterm, signalled
+from factorbus.cli.output.exits import INTERRUPTED
+from factorbus.cli.process.stopping import interrupt_on_sigterm, signalled
 
 # What the signals raise is lost.
 DEAF = """
 import signal, sys
-from factorbus.cli.stopping import interrupt_on_sigterm
+from factorbus.cli.process.stopping import interrupt_on_sigterm
 
 with interrupt_on_sigterm(float(sys.argv[1])):
     for number in (signal.SIGINT, signal.SIGTERM):

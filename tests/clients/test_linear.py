@@ -15,7 +15,7 @@ from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
-from factorbus.solver.joints import find_joints
+from factorbus.solver.graph.joints import find_joints
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 

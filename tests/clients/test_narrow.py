@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from factorbus.cli import screen, stats, top
+from factorbus.cli.commands import stats, top
+from factorbus.cli.output import console as screen
 
 MAP = {
     "name": "warehouse", "mode": "bayes-tree", "variables": 9780, "factors": 13214, "revision": 9780,

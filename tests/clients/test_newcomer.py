@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from processes import processes
 
-from factorbus.cli.bus import open_bus
-from factorbus.cli.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABLE, USAGE
 from factorbus.cli.main import main
-from factorbus.cli.starts import ratio_to
+from factorbus.cli.output.exits import BAD_FILE, FAILED, OK, REFUSED, UNAVAILABLE, USAGE
+from factorbus.cli.output.starts import ratio_to
+from factorbus.cli.process.bus import open_bus
 from factorbus.client import Draft, connect
 from factorbus.proto.problems import NobodyListens
 from factorbus.proto.version import __version__

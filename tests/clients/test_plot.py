@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.cli.columns import merged, positions
-from factorbus.cli.exits import BAD_FILE, OK, REFUSED
+from factorbus.cli.driving.columns import merged, positions
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import BAD_FILE, OK, REFUSED
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
@@ -25,9 +25,9 @@ def graph_of(steps) -> Batch:
 
 @pytest.mark.parametrize("world", [manhattan, city_trees], ids=["manhattan", "city-trees"])
 def test_pattern_has_the_nonzeros_that_the_solver_counts(world) -> None:
-    from factorbus.cli.sparsity import pattern_of
-    from factorbus.solver.ordering import order
-    from factorbus.solver.symbolic import analyze
+    from factorbus.cli.output.sparsity import pattern_of
+    from factorbus.solver.sparse.ordering import order
+    from factorbus.solver.sparse.symbolic import analyze
 
     graph = graph_of(world(poses=300, seed=3))
     pattern = pattern_of(graph)
@@ -52,7 +52,7 @@ def test_pattern_has_the_nonzeros_that_the_solver_counts(world) -> None:
 
 
 def test_fill_is_what_dense_elimination_of_the_pattern_gives() -> None:
-    from factorbus.cli.sparsity import pattern_of
+    from factorbus.cli.output.sparsity import pattern_of
 
     pattern = pattern_of(graph_of(manhattan(poses=80, seed=1)))
     there = np.zeros((pattern.n, pattern.n), bool)
@@ -65,7 +65,7 @@ def test_fill_is_what_dense_elimination_of_the_pattern_gives() -> None:
 
 
 def test_sparsity_is_drawn_block_by_block() -> None:
-    from factorbus.cli.sparsity import pattern_of
+    from factorbus.cli.output.sparsity import pattern_of
 
     pattern = pattern_of(graph_of(manhattan(poses=80, seed=1)))
     figure = sparsity_figure(pattern, "a title")
@@ -163,9 +163,9 @@ def test_pictures_say_where_an_optimum_had_not_converged(town: Path, tmp_path: P
 
 def test_odometry_is_reckoned_and_not_the_files_values(town: Path, tmp_path: Path) -> None:
     """A solved graph has its estimate in the vertices; the line of odometry must not follow it."""
-    from factorbus.cli.picture import reckoned
-    from factorbus.cli.plot_source import graph_of as source_of
-    from factorbus.cli.plot_source import solved
+    from factorbus.cli.driving.picture import reckoned
+    from factorbus.cli.driving.plot_source import graph_of as source_of
+    from factorbus.cli.driving.plot_source import solved
 
     drawn = solved(source_of(str(town), None))
     (alone,) = reckoned(drawn.unsolved())

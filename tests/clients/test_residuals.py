@@ -6,7 +6,7 @@ from naive.dense_factors import residual
 from naive.random_graphs import random_steps
 from naive.random_others import other_steps
 
-from factorbus.cli.columns import merged
+from factorbus.cli.driving.columns import merged
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Factors, Variables
 from factorbus.solver import Options, Solver

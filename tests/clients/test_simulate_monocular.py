@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from naive.random_sightings import CAMERAS
 
-from factorbus.cli.sightseeing import Sightseer, verdict
+from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
 from factorbus.client.grown import Grown
 from factorbus.idp import lenses, minimal, see
 from factorbus.proto.camera import Camera

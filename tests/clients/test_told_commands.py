@@ -75,9 +75,9 @@ def parse(words: list[str]) -> None:
 @pytest.fixture(autouse=True)
 def _somewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("factorbus.cli.options.os.path.isdir", lambda _: True)
+    monkeypatch.setattr("factorbus.cli.process.options.os.path.isdir", lambda _: True)
     monkeypatch.setattr(Path, "is_dir", lambda path: "." not in path.name)  # folders that examples write to
-    monkeypatch.setattr("factorbus.cli.options.os.access", lambda *_: True)
+    monkeypatch.setattr("factorbus.cli.process.options.os.access", lambda *_: True)
 
 
 @pytest.mark.parametrize(("where", "command"), in_documents() + in_help())

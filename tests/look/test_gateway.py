@@ -14,8 +14,8 @@ from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
 from turned import closing, in_one
 
-from factorbus.cli.exits import OK, USAGE
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import OK, USAGE
 from factorbus.client import Draft, connect
 from factorbus.proto.messages import Delta, Variables
 from factorbus.proto.stamps import NO_STAMP

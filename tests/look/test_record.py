@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from processes import Process
 
-from factorbus.cli.columns import merged
-from factorbus.cli.exits import FAILED, OK
+from factorbus.cli.driving.columns import merged
 from factorbus.cli.main import main
+from factorbus.cli.output.exits import FAILED, OK
 from factorbus.client import connect
 from factorbus.proto.messages import Variables
 from factorbus.proto.stamps import NO_STAMP

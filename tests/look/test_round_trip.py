@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.cli.columns import merged
+from factorbus.cli.driving.columns import merged
 from factorbus.client import connect
 from factorbus.formats import g2o_text, read, write_g2o
 from factorbus.proto.messages import Batch

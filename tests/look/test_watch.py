@@ -14,7 +14,7 @@ from browser import free_port, needs_browser, page_of, picture_of, share_of
 from processes import Process
 from turned import closing, in_one
 
-from factorbus.cli.exits import OK
+from factorbus.cli.output.exits import OK
 from factorbus.client import connect
 from factorbus.proto.messages import Variables
 from factorbus.proto.ports import PortTaken

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.sparse import coo_array
 
-from factorbus.solver.kernels import block_rows as br
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.model import layout as at
 
 
 def dense_r(rows, sparse: bool = False):

@@ -3,9 +3,9 @@
 import numpy as np
 from naive.block_systems import grid, random_system
 
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 
 def check() -> float:

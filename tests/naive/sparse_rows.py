@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from factorbus.solver.kernels import block_rows as br
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.model import layout as at
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.tree import Tree
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
 
 _DIM = {at.SE2: 3, at.SE3: 6, at.POINT2: 2, at.POINT3: 3, at.IDP: 6}
 

@@ -7,9 +7,9 @@ import pytest
 from naive.tree_records import assert_is_a_tree, tree_of
 
 from factorbus.solver import Solver
-from factorbus.solver.blocks import Blocks
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.blocks import Blocks
 
 
 def assert_solves(solver: Solver) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import ros
 from processes import Process
 
-from factorbus.cli.ros2 import command
+from factorbus.cli.commands.ros2 import command
 from factorbus.ros2.settings import Floors, Settings
 
 README = (Path(__file__).parents[2] / "deploy" / "ros2" / "README.md").read_text(encoding="utf-8")

@@ -9,9 +9,9 @@ import words
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.cli.exits import USAGE
+from factorbus.cli.commands.ros2 import DISTRIBUTIONS
 from factorbus.cli.main import main
-from factorbus.cli.ros2 import DISTRIBUTIONS
+from factorbus.cli.output.exits import USAGE
 from factorbus.client import Snapshot
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol

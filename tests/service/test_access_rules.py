@@ -3,7 +3,7 @@
 import pytest
 import zenoh
 
-from factorbus.service.access import access_control, read_grants
+from factorbus.service.bus.access import access_control, read_grants
 from factorbus.service.config import BadConfig
 
 GOOD = '[front_end]\nrobot1 = ["kitchen", "site7-*"]\n[worker]\nw1 = []\n[operator]\nops = ["*"]\n'

@@ -1,6 +1,6 @@
 """What a map has done: what is noted is counted when somebody asks, and is in no answer twice."""
 
-from factorbus.service.account import Account, Done
+from factorbus.service.core.account import Account, Done
 
 
 def done(chi2: float) -> Done:

@@ -9,9 +9,9 @@ from hypothesis import given
 
 from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import ShuttingDown, UnknownMap
-from factorbus.service.admission import Admission
 from factorbus.service.config import Limits
-from factorbus.service.events import Answer, Arrived, Effect, Refuse
+from factorbus.service.core.admission import Admission
+from factorbus.service.core.events import Answer, Arrived, Effect, Refuse
 
 EPOCH = 77
 

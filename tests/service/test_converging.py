@@ -8,11 +8,9 @@ import pytest
 
 from factorbus.proto.messages import Batch, Insert
 from factorbus.proto.problems import Internal
-from factorbus.service import converging
-from factorbus.service.admin import MovedOn
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore, Restored
-from factorbus.service.events import (
+from factorbus.service.core import converging
+from factorbus.service.core.events import (
     Alone,
     Arrived,
     Asked,
@@ -26,6 +24,8 @@ from factorbus.service.events import (
     Run,
     Stepped,
 )
+from factorbus.service.core.map_state import MapCore, Restored
+from factorbus.service.questions.admin import MovedOn
 
 LATER = converging.CONVERGE_IDLE_S
 

@@ -8,8 +8,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Internal, UnknownMap
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.events import (
+from factorbus.service.core.events import (
     Answer,
     Arrived,
     Asked,
@@ -24,6 +23,7 @@ from factorbus.service.events import (
     Stepped,
     Tell,
 )
+from factorbus.service.core.map_state import MapCore
 
 
 @pytest.fixture

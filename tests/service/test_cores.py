@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.service import control_groups, cores
-from factorbus.service.cores import LentCores
-from factorbus.solver.kernels.tree_step import tree_step
-from factorbus.solver.lending import can_lend, count_free
+from factorbus.service.process import control_groups
+from factorbus.service.process import worker_threads as cores
+from factorbus.service.process.worker_threads import LentCores
+from factorbus.solver.kernels.bayes_tree.step import tree_step
+from factorbus.solver.sparse.lending import can_lend, count_free
 from factorbus.solver.warm import iter_compile
 
 pytestmark = pytest.mark.skipif(

@@ -10,11 +10,11 @@ from factorbus.proto.asking import AskAssociate, AskCovariance, AskGain, AskGate
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.proto.repair_codec import encode_ask_repair
-from factorbus.service import costs
-from factorbus.service.memory import Memory, OutOfMemory
-from factorbus.service.questions import Snapshot, answer, parse, snapshot
-from factorbus.service.room import COPIES, Room
-from factorbus.service.uncertain import Uncertain
+from factorbus.service.process.memory import Memory, OutOfMemory
+from factorbus.service.questions import costs
+from factorbus.service.questions.answers import Snapshot, answer, parse, snapshot
+from factorbus.service.questions.question_memory import COPIES, Room
+from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import Blocks
 
@@ -96,7 +96,7 @@ def test_what_there_is_no_memory_for_is_refused_with_the_limit(
     solver: Solver, asked: str, memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, payload = ASKED[asked]
-    monkeypatch.setattr("factorbus.service.room._LITTLE", 0)
+    monkeypatch.setattr("factorbus.service.questions.question_memory._LITTLE", 0)
     memory.limit = 64 << 10  # what this process has is above it, and a quarter of it is 16 KiB
     problem = refused(solver, name, payload, Room(memory))
     assert isinstance(problem, OutOfMemory)

@@ -8,7 +8,7 @@ from hypothesis import given
 
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import Refused, Unavailable
-from factorbus.service.dispatch import IN_PLACE, TRIES, Dispatch, Distrusted, Effect, Ended, InPlace, Send
+from factorbus.service.jobs.dispatch import IN_PLACE, TRIES, Dispatch, Distrusted, Effect, Ended, InPlace, Send
 
 TIMEOUT = Unavailable("worker", 1.0, "")
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from factorbus.service.exposure import Exposed, refuse_exposed
-from factorbus.service.key_files import UnsafeKeys, refuse_unsafe_keys
+from factorbus.service.bus.bind_address_check import Exposed, refuse_exposed
+from factorbus.service.bus.key_files import UnsafeKeys, refuse_unsafe_keys
 
 SAFE: dict[str, Any] = {
     "transport/link/tls": {"enable_mtls": True},

@@ -14,11 +14,11 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import parse_symbol
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
-from factorbus.service.fold import Folder
-from factorbus.service.questions import Question
+from factorbus.service.core.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
+from factorbus.service.questions.answers import Question
+from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
 EPOCH = 9

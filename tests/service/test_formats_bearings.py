@@ -10,10 +10,10 @@ from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import format_symbol, symbol
 from factorbus.solver import Options, Solver, solve_batch
-from factorbus.solver.admission import admit
 from factorbus.solver.errors import Uninitialised
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.model import layout
 
 INFO3 = "400 0 0 400 0 2500"
 

@@ -17,20 +17,20 @@ from factorbus.journal.store import Store, create, open_store
 from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Delta, Insert
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.converging import CONVERGE_IDLE_S
-from factorbus.service.core import MapCore
-from factorbus.service.events import Answer, Arrived, Drained, Effect, Folded, Publish, Stepped
-from factorbus.service.fold import GOES_ON, Folder
-from factorbus.service.host import Host
-from factorbus.service.questions import Question
-from factorbus.service.recovery import recover, verify
-from factorbus.service.writing import written
+from factorbus.service.core.converging import CONVERGE_IDLE_S
+from factorbus.service.core.events import Answer, Arrived, Drained, Effect, Folded, Publish, Stepped
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.journal.recovery import recover, verify
+from factorbus.service.journal.writing import written
+from factorbus.service.maps.host import Host
+from factorbus.service.questions.answers import Question
+from factorbus.service.solving.apply import GOES_ON, Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver, fingerprint
 from factorbus.solver.errors import NotFinite
-from factorbus.solver.kernels.bounds import MOST_NUMBER
+from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 
 EPOCH, PATIENCE_S = 7, 120.0
 POSES, DEGREES = 100, 120.0

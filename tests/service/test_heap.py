@@ -10,7 +10,7 @@ import pytest
 HELD_IN_PLACE = """
 import sys, threading
 import numpy as np
-from factorbus.service.heap import lay_out_heaps
+from factorbus.service.process.heap import lay_out_heaps
 
 if sys.argv[1] == "laid out":
     assert lay_out_heaps()

@@ -12,14 +12,14 @@ from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import parse_symbol
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.digest import digest_of
-from factorbus.service.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
-from factorbus.service.fold import Folder
-from factorbus.service.host import Host
-from factorbus.service.lane import Lane
+from factorbus.service.core.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
+from factorbus.service.core.insert_digest import digest_of
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.maps.host import Host
+from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
 PATIENCE_S = 120.0

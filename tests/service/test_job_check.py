@@ -12,10 +12,10 @@ from factorbus.proto.features import Ask, Shard, ShardDone
 from factorbus.proto.features_codec import decode_shard_done, encode_ask, encode_shard, encode_shard_done
 from factorbus.proto.messages import Batch, Factors, Graph, Job, JobDone, Optimum, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.service import jobs as service_jobs
-from factorbus.service.dispatch import Ended
-from factorbus.service.job_check import DoubtfulAnswer, WrongAnswer, judged
-from factorbus.service.jobs import Jobs, do_here
+from factorbus.service.jobs import running as service_jobs
+from factorbus.service.jobs.dispatch import Ended
+from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, judged
+from factorbus.service.jobs.running import Jobs, do_here
 
 N, FIRST, LAST = 7, 2, 5
 FORMS = ("rows", "half", "factored")

@@ -14,9 +14,9 @@ from factorbus.journal.log_frames import lost_from
 from factorbus.journal.problems import JournalDamaged, JournalUnreadable, JournalVersion
 from factorbus.journal.records import ACCEPTED, Entry, Epoch, Fold
 from factorbus.journal.store import NAME, create, open_store
-from factorbus.service import library
 from factorbus.service.config import Config, Limits
-from factorbus.service.library import open_library
+from factorbus.service.journal import library
+from factorbus.service.journal.library import open_library
 
 PAGE, FRAME = 4096, 4096 + 24
 LOG, INDEX = f"{NAME}-wal", f"{NAME}-shm"

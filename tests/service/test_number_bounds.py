@@ -14,11 +14,11 @@ from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.events import Arrived, Judged, Stepped
-from factorbus.service.fold import Folder
-from factorbus.service.questions import Question
+from factorbus.service.core.events import Arrived, Judged, Stepped
+from factorbus.service.questions.answers import Question
+from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
 POINT = symbol("l", 0)

@@ -17,15 +17,15 @@ from factorbus.proto.limits import REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.stamps import NO_STAMP
-from factorbus.service.arrival import read_insert, try_locate
-from factorbus.service.digest import digest_of
-from factorbus.service.events import Arrived, Located
+from factorbus.service.core.events import Arrived, Located
+from factorbus.service.core.insert_digest import digest_of
 from factorbus.service.kernels.words import LETTERS, LONGEST, WORDS
 from factorbus.service.kernels.write import write_messages
+from factorbus.service.solving.arrival import read_insert, try_locate
 from factorbus.solver import Options, Solver, SolverError
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LENS_AT
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LENS_AT
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.model import layout as at
 
 MANY = settings(max_examples=400, deadline=None)
 seeds = st.integers(0, 2**32 - 1)

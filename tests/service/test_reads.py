@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-import factorbus.service.delivery as delivery
+import factorbus.service.bus.delivery as delivery
 import factorbus.solver.solver as solver_of
 from factorbus.proto import asking, asking_codec, codec
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
+from factorbus.service.bus.delivery import Delivery
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.delivery import Delivery
-from factorbus.service.events import Arrived, Asked, Effect, Folded, Read, Run
-from factorbus.service.questions import Question, Snapshot, answer, parse, snapshot
-from factorbus.service.reads import Reads
-from factorbus.service.uncertain import NEAR
+from factorbus.service.core.events import Arrived, Asked, Effect, Folded, Read, Run
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.core.pending_questions import Reads
+from factorbus.service.questions.answers import Question, Snapshot, answer, parse, snapshot
+from factorbus.service.questions.uncertainty import NEAR
 from factorbus.solver import Options, Solver
 
 PATIENCE_S = 60.0

@@ -17,11 +17,11 @@ from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.messages import Accepted, Batch, Factors, Insert, Variables
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import BadMessage, Problem
-from factorbus.service.admission import Admission
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.events import Answer, Arrived, Effect, Folded, Judged, Outcome, Refuse, Run
+from factorbus.service.core.admission import Admission
+from factorbus.service.core.events import Answer, Arrived, Effect, Folded, Judged, Outcome, Refuse, Run
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.solving.arrival import read_insert
 from factorbus.solver.errors import DuplicateVariable
 
 EPOCH = 7

@@ -14,16 +14,16 @@ from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Change, Delta, Factors, Insert, Variables
 from factorbus.service import reordering
-from factorbus.service.arrival import read_insert
 from factorbus.service.config import Limits
-from factorbus.service.core import MapCore
-from factorbus.service.events import Arrived, Effect, Judged, Outcome, Publish, Run, Stepped
-from factorbus.service.fold import Folder
-from factorbus.service.host import Host
-from factorbus.service.questions import Question
-from factorbus.service.recovery import verify
+from factorbus.service.core.events import Arrived, Effect, Judged, Outcome, Publish, Run, Stepped
+from factorbus.service.core.map_state import MapCore
+from factorbus.service.journal.recovery import verify
+from factorbus.service.journal.writing import written
+from factorbus.service.maps.host import Host
+from factorbus.service.questions.answers import Question
 from factorbus.service.reordering import Reordering
-from factorbus.service.writing import written
+from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 

@@ -6,8 +6,8 @@ import pytest
 
 from factorbus.proto.keys import insert_key
 from factorbus.proto.problems import Problem
-from factorbus.service.lane import Lane
-from factorbus.service.senders import Senders
+from factorbus.service.bus.senders import Senders
+from factorbus.service.maps.serial_executor import Lane
 
 
 class Declared:

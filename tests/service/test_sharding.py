@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from factorbus.proto.features import Ask, Segment, answer_size
 from factorbus.proto.features_codec import encode_shard_done
-from factorbus.service.rates import example, measured
-from factorbus.service.sharding import Rates, Trip, Work, cuts, seconds, shards_for, work_of
+from factorbus.service.jobs.rates import example, measured
+from factorbus.service.jobs.sharding import Rates, Trip, Work, cuts, seconds, shards_for, work_of
 
 RATES = Rates(fixed_s=1e-4, feature_s=1e-7, number_s=2e-9, stored_s=1e-9)
 TRIP = Trip(fixed_s=3e-4, byte_s=1e-9)

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from factorbus.service import warm as together
+from factorbus.service.operations import warm as together
 
 _STUBS = """
 import sys
 from pathlib import Path
-from factorbus.service import warm as together
+from factorbus.service.operations import warm as together
 
 class Kernel:
     def __init__(self, name): self.__name__, self.__module__, self.py_func = name, "stub", lambda: None
@@ -58,14 +58,16 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
     def compiling(command: list[str], **how: Any) -> subprocess.Popen:
         asked.append(command)
         telling = f"for n in range(20_000): warm._tell('kernel {len(asked)} ' + str(n))"
-        return popen([sys.executable, "-c", f"from factorbus.service import warm\n{telling}"], **how)
+        return popen([sys.executable, "-c", f"from factorbus.service.operations import warm\n{telling}"], **how)
 
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
     monkeypatch.setattr(together, "core_count", lambda: 2)
     before, told = together.compiled_seconds(), []
     together.warm(told.append)
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
-    assert {tuple(command[:4]) for command in asked} == {(sys.executable, "-P", "-m", "factorbus.service.warm")}
+    assert {tuple(command[:4]) for command in asked} == {
+        (sys.executable, "-P", "-m", "factorbus.service.operations.warm")
+    }
     assert together.compiled_seconds() > before, "who waits for them says so"
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from factorbus.solver import Solver
-from factorbus.solver.arenas import Arenas, lines
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.places import WIDTH
+from factorbus.solver.graph.arenas import Arenas, lines
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.array_table import WIDTH
+from factorbus.solver.kernels.model import layout as at
 
 
 class Two(Arenas):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.solver.kernels.ascending import SPARSE, put_in_order, sort
+from factorbus.solver.kernels.jit.sorting import SPARSE, put_in_order, sort
 
 
 @given(st.lists(st.integers(-9, 9) | st.integers(-(2**62), 2**62)))

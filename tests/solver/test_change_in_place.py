@@ -18,8 +18,8 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
 
 WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "robots": lambda seed: random_steps(seed, steps=9),
@@ -251,7 +251,7 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
     change = [Change("remove_factors", np.array([first])), robust]
     with monkeypatch.context() as broken:
         if what == "soundness":
-            broken.setattr("factorbus.solver.changing._is_sound", lambda *_: False)
+            broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
             assert solver.try_change(change) is None
         else:
             assert solver._tree is not None

@@ -13,7 +13,7 @@ from factorbus.proto.kinds import CHANGES as WIRE_CHANGES
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.changes import CHANGES
+from factorbus.solver.changes.requested import CHANGES
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor
 

@@ -13,9 +13,9 @@ from naive.block_systems import BlockSystem, from_edges, from_g2o, grid, pack, r
 from scipy.sparse import csc_matrix
 from sksparse.cholmod import analyze as cholmod_analyze
 
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import Symbolic, analyze
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
 KEPT = Cholesky()  # all tests share it: what one leaves in the arenas must not reach the next
 

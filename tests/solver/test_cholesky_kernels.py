@@ -6,12 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive.elimination import partial_cholesky
 
-from factorbus.solver.kernels import _jit, simd_plain
-from factorbus.solver.kernels.dense import factor_front
-from factorbus.solver.kernels.fronts import GROUP, SCRATCH, padded, update_row, update_size
-from factorbus.solver.kernels.panels import DEPTH
-from factorbus.solver.kernels.simd import LANES, add_run, six, solve_rows, tile, zero
-from factorbus.solver.lending import BOARD
+from factorbus.solver.kernels.jit import compile as _jit
+from factorbus.solver.kernels.jit import simd_plain
+from factorbus.solver.kernels.jit.simd import LANES, add_run, six, solve_rows, tile, zero
+from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, padded, update_row, update_size
+from factorbus.solver.kernels.sparse.panels import DEPTH
+from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
+from factorbus.solver.sparse.lending import BOARD
 
 
 @given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))

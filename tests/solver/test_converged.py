@@ -17,9 +17,9 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver, StepReport
-from factorbus.solver.batch import solve_batch
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.divergence import copied
-from factorbus.solver.tree_steps import TreeSteps
+from factorbus.solver.starts.batch import solve_batch
 
 X = symbol("x", 0), symbol("x", 10**6)
 FLOOR = 1e-3  # χ² of which a share means nothing

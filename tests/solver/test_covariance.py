@@ -16,9 +16,9 @@ from factorbus.solver.covariance.candidates import judge_candidates
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.errors import UnknownFactor
-from factorbus.solver.factors import FACTOR_KINDS
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+from factorbus.solver.graph.factors import FACTOR_KINDS
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+from factorbus.solver.kernels.model import layout as at
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 DIM = {name: kind.dim for name, kind in VARIABLE_KINDS.items()}

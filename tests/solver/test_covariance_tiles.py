@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from factorbus.solver.covariance.kernels import tiles, tiles_plain
 from factorbus.solver.covariance.kernels.compile import DISABLED, F64, I64, kernel
-from factorbus.solver.kernels.simd import LANES
+from factorbus.solver.kernels.jit.simd import LANES
 
 pytestmark = pytest.mark.skipif(DISABLED, reason="without compilation these are the plain ones")
 

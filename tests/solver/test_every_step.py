@@ -22,9 +22,9 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
-from factorbus.solver.block_factor import BlockFactor
-from factorbus.solver.incremental import Where
-from factorbus.solver.kernels import block_rows as br
+from factorbus.solver.inc_l.block_factor import BlockFactor
+from factorbus.solver.inc_l.incremental import Where
+from factorbus.solver.kernels.inc_l import block_rows as br
 
 RELATIVE = 1e-9
 ROUNDING = 100  # times what refining changes of CHOLMOD's own: 37 has been seen, and it depends on the BLAS

@@ -11,12 +11,12 @@ from naive.random_sights import SIGHTS, random_sight
 
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver.admission import admit
-from factorbus.solver.factors import FACTOR_KINDS, FactorKind
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.candidates import evaluate_factors
-from factorbus.solver.variables import VARIABLE_KINDS
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KINDS, FactorKind
+from factorbus.solver.graph.variables import VARIABLE_KINDS
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 seeds = st.integers(0, 2**32 - 1)
 every_kind = pytest.mark.parametrize("kind", FACTOR_KINDS.values(), ids=str)

@@ -6,14 +6,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import I64, part
-from factorbus.solver.kernels.bits import MOST, count_bits, highest_bit, lowest_bit
-from factorbus.solver.kernels.tree_few import PLANES, analyze_few, join_few, order_few
-from factorbus.solver.kernels.tree_fronts import analyze_affected
-from factorbus.solver.kernels.tree_order import NEWEST, find_lowest, list_pairs, order_affected
-from factorbus.solver.variables import VARIABLE_KINDS
+from factorbus.solver.graph.variables import VARIABLE_KINDS
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.fronts import analyze_affected
+from factorbus.solver.kernels.bayes_tree.order import NEWEST, find_lowest, list_pairs, order_affected
+from factorbus.solver.kernels.bayes_tree.order_small import PLANES, analyze_few, join_few, order_few
+from factorbus.solver.kernels.jit.bit_sets import MOST, count_bits, highest_bit, lowest_bit
+from factorbus.solver.kernels.jit.compile import I64, part
+from factorbus.solver.kernels.model import layout as at
 
 STAMP, STEP, RECENT, FIRST = 7, 20, 5, 3  # variables of the map before the first that is affected
 KINDS = {at.POINT2: 2, at.SE2: 3, at.SE3: 6}

@@ -13,10 +13,10 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
-from factorbus.solver.elimination import constraint
-from factorbus.solver.fill_in import fill_in
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.elimination import constraint
+from factorbus.solver.sparse.fill_in import fill_in
 
 NEAR = 1.05
 PRICE = 1.05

@@ -11,10 +11,10 @@ from naive.random_others import other_steps
 from naive.tree_records import tree_of
 
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.linearise import evaluate_apart
-from factorbus.solver.kernels.sizes import dim_of, information_at, residual_dim
-from factorbus.solver.kernels.tree_exact import exact_error
+from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
 FAR = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, converged_share=1e9)
 

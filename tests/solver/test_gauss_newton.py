@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from factorbus.solver.gauss_newton import Rule, minimise
+from factorbus.solver.optimize.gauss_newton import Rule, minimise
 
 SETTLE = Rule(tolerance=1e-14, floor=1e-20, limit=200)
 

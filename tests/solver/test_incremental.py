@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from naive.block_rows import dense_lambda, dense_r
 from naive.random_graphs import factor, random_steps
 
-from factorbus.cli.options import MODES as CLI_MODES
+from factorbus.cli.process.options import MODES as CLI_MODES
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.elimination import constraint
-from factorbus.solver.fill_in import fill_in
-from factorbus.solver.incremental import Where
+from factorbus.solver.inc_l.incremental import Where
 from factorbus.solver.modes import MODES
+from factorbus.solver.sparse.elimination import constraint
+from factorbus.solver.sparse.fill_in import fill_in
 
 # What makes steps take one way of updating R as long as they can.
 WAYS = {

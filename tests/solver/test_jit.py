@@ -12,7 +12,9 @@ import pytest
 from numba.core import errors
 from numba.core.runtime import _nrt_python, rtsys
 
-from factorbus.solver.kernels import _compile_time, _jit, _lowering
+from factorbus.solver.kernels.jit import compile as _jit
+from factorbus.solver.kernels.jit import compile_time as _compile_time
+from factorbus.solver.kernels.jit import lowering as _lowering
 
 MAKERS = Path(_compile_time.__file__), Path(_jit.__file__), Path(_lowering.__file__)
 CALLER = """
@@ -241,14 +243,14 @@ def test_kernels_of_another_folder_have_a_cache_of_their_own_and_exact_ones_roun
     script = (
         "import numpy as np\n"
         "from pathlib import Path\n"
-        "from factorbus.solver.kernels import _jit\n"
+        "from factorbus.solver.kernels.jit import compile as _jit\n"
         "import others.sums\n"
         "a = np.array([3.0, 1e17, -1e17, 1.0])\n"
         "print(others.sums.total(a), _jit.compiled_seconds() > 0.0, others.sums.FOLDER.path().name)\n"
     )
     text = (
         "from pathlib import Path\n"
-        "from factorbus.solver.kernels import _jit\n"
+        "from factorbus.solver.kernels.jit import compile as _jit\n"
         "FOLDER = _jit.KernelFolder(Path(__file__).parent, 'sums', exact=True)\n"
         "@FOLDER.kernel('float64(float64[::1])')\n"
         "def total(a):\n"

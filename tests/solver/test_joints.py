@@ -14,12 +14,12 @@ from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changes.repair import find_loops, repair
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import judge_candidates
 from factorbus.solver.covariance.why import why_variable
-from factorbus.solver.groups import FactorGroup
-from factorbus.solver.joints import find_joints, negative_rows
-from factorbus.solver.repair import find_loops, repair
+from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.joints import find_joints, negative_rows
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 SIZE = {"se2": 3, "se3": 7}

@@ -14,12 +14,21 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.simulate.step import POSE
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import fronts as fr
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.dense import factor_front
-from factorbus.solver.kernels.lent_cores import MOST
-from factorbus.solver.kernels.tree_eliminate import ASSEMBLY, BOOKKEEPING, END, FIRST, LONG, PIECES, TURN, cut_subtrees
-from factorbus.solver.lending import BOARD, Lender, count_free
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.eliminate import (
+    ASSEMBLY,
+    BOOKKEEPING,
+    END,
+    FIRST,
+    LONG,
+    PIECES,
+    TURN,
+    cut_subtrees,
+)
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
+from factorbus.solver.kernels.sparse.task_queue import MOST
+from factorbus.solver.sparse.lending import BOARD, Lender, count_free
 
 pytestmark = pytest.mark.skipif(
     count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"

@@ -5,11 +5,11 @@ import pytest
 
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.linearization_error import MUCH, evaluate_moved
-from factorbus.solver.kernels.tree_move import MODEL
-from factorbus.solver.tree import Tree
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.linearization_error import MUCH, evaluate_moved
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL
+from factorbus.solver.kernels.model import layout as at
 
 # Nothing is relinearised, so a lot is bent.
 NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, converged_share=1e9)

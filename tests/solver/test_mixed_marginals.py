@@ -18,8 +18,8 @@ from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.joints import find_joints
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.graph.joints import find_joints
+from factorbus.solver.kernels.model import layout as at
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {

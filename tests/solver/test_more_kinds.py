@@ -8,8 +8,8 @@ from naive.random_others import OTHERS, other_steps
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.factors import FACTOR_KINDS
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.graph.factors import FACTOR_KINDS
+from factorbus.solver.kernels.model import layout as at
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 

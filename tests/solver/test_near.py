@@ -11,9 +11,9 @@ from factorbus.proto.messages import Batch
 from factorbus.simulate import manhattan, sphere
 from factorbus.solver import Options, Solver
 from factorbus.solver.errors import BadOption
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_near import MOST_RINGS
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
+from factorbus.solver.kernels.model import layout as at
 
 NEAR = 60
 ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3, "around": 0.0, "detour": math.inf}  # of more than 27 flops

@@ -9,8 +9,8 @@ from naive.elimination import minimum_degree_nonzeros, row_lengths
 from scipy.sparse import csc_matrix
 from sksparse.cholmod import analyze as cholmod_analyze
 
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 
 def ordered(system: BlockSystem, group=None) -> np.ndarray:

@@ -8,8 +8,8 @@ from naive.random_graphs import random_steps
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.packing import Packing
+from factorbus.solver.graph.packing import Packing
+from factorbus.solver.kernels.model import layout as at
 
 APART = np.zeros((2, 6))[:, ::2]
 EYE3 = np.array([[1.0, 0, 0, 1, 0, 1]])

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factorbus.solver import pages
-from factorbus.solver.kernels._jit import F64
+from factorbus.solver.graph import pages
+from factorbus.solver.kernels.jit.compile import F64
 
 
 @dataclass

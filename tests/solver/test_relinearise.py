@@ -5,9 +5,9 @@ import pytest
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_relinearise import SPARSE, linearise_around
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearise_around
+from factorbus.solver.kernels.model import layout as at
 
 
 @pytest.fixture(scope="module")

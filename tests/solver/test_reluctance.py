@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_step import reluctance
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.step import reluctance
 
 
 def test_so_soon_after_a_relinearisation_more_has_to_be_bent() -> None:

@@ -10,8 +10,8 @@ from naive.tree_solution import assert_solves
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan, sphere
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.tree import Tree
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.kernels.bayes_tree import layout as tl
 
 OFTEN = {"bent_soon": 1e-9, "bent_now": np.inf, "bent": 1e-6, "reluctance": 1.0, "converged_share": np.inf}
 WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}

@@ -10,8 +10,8 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch, Change, Factors
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.kernels._jit import DISABLED
-from factorbus.solver.repair import find_loops, repair, weigh
+from factorbus.solver.changes.repair import find_loops, repair, weigh
+from factorbus.solver.kernels.jit.compile import DISABLED
 
 POSES = 60 if DISABLED else 400
 

@@ -11,9 +11,9 @@ from scipy.linalg import expm
 from factorbus.proto.messages import Batch, Factors
 from factorbus.simulate import city_trees, manhattan, sphere
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
 
 FAR = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "converged_share": np.inf}
 WORLDS: dict[str, Callable[[], Iterator[Batch]]] = {

@@ -10,9 +10,9 @@ from naive.random_graphs import random_steps
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
-from factorbus.solver.graph import Graph, roomy
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.tree import Tree
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.graph.factor_graph import Graph, roomy
+from factorbus.solver.kernels.model import layout as at
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "stamps": 1, "values": 7, "fac": 1, "payload": 28}
 TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "turns": 1, "pending": 1}
@@ -46,8 +46,8 @@ def account(report: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("factorbus.solver.graph.roomy", lambda need, _size: need)
-    monkeypatch.setattr("factorbus.solver.tree.roomy", lambda need, _size: need)
+    monkeypatch.setattr("factorbus.solver.graph.factor_graph.roomy", lambda need, _size: need)
+    monkeypatch.setattr("factorbus.solver.bayes_tree.tree.roomy", lambda need, _size: need)
     grown, make_room = list[int](), Tree._make_room
     monkeypatch.setattr(Tree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
     tight, wide = cramped(), Solver(Options())

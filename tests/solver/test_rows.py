@@ -5,8 +5,8 @@ import pytest
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Solver, errors
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.rows import Rows
+from factorbus.solver.graph.rows import Rows
+from factorbus.solver.kernels.model import layout as at
 
 UNIT = [1.0, 0.0, 0.0, 1.0, 0.0, 1.0]
 

@@ -17,10 +17,10 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor, why_variable
-from factorbus.solver.factors import FACTOR_KINDS
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.candidates import evaluate_factors
-from factorbus.solver.kernels.sights import ASLEEP
+from factorbus.solver.graph.factors import FACTOR_KINDS
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import ASLEEP
+from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
 LEVEL = np.array([0.0, 0, 0, 0, 0, 0, 1])

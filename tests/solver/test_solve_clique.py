@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_solve import solve_rows
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.back_substitute import solve_rows
 
 ROWS_AT, GAP = 3, 4
 

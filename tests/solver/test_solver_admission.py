@@ -9,9 +9,9 @@ from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.blocks import Blocks
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.blocks import Blocks
 
 I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 I2 = np.array([[1.0, 0, 1]])

@@ -9,8 +9,8 @@ from naive.random_graphs import measured, random_information, random_steps, rand
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
-from factorbus.solver.factors import LENS_AT
-from factorbus.solver.kernels._jit import DISABLED
+from factorbus.solver.graph.factors import LENS_AT
+from factorbus.solver.kernels.jit.compile import DISABLED
 from factorbus.solver.lenses.layout import LIMIT
 from factorbus.solver.report import Shares
 

@@ -13,8 +13,8 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.packing import Packing
+from factorbus.solver.graph.packing import Packing
+from factorbus.solver.kernels.model import layout as at
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 seeds = st.integers(0, 9999)

@@ -15,10 +15,10 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan, sphere
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
-from factorbus.solver.admission import admit
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.chi2 import sum_chi2
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.starts.averaged import averaged
 
 POSES = ("se2", "se3")

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import fronts as fr
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.tree_step import LIGHT
-from factorbus.solver.kernels.tree_store import (
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.allocator import (
     AHEAD,
     FOLLOWING,
     PAGE,
@@ -20,7 +19,8 @@ from factorbus.solver.kernels.tree_store import (
     take_numbers,
     write_ahead,
 )
-from factorbus.solver.tree import Tree
+from factorbus.solver.kernels.bayes_tree.step import LIGHT
+from factorbus.solver.kernels.sparse import fronts as fr
 
 ROOM = 1 << 16
 

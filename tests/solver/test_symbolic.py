@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from naive.block_systems import BlockSystem, grid, random_system, systems
 from naive.elimination import row_lengths
 
-from factorbus.solver.kernels import fronts as fr
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import Symbolic, analyze
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
 
 @st.composite

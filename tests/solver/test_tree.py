@@ -17,8 +17,8 @@ from naive.tree_solution import assert_is_solution, assert_solves
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_batch
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.model import layout as at
 
 EXACT = {"mode": "bayes-tree", "ripple": 0.0}
 # Whole cliques only; as the default; every clique at every place; and a few variables moved to the root in every step.

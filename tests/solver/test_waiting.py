@@ -9,10 +9,10 @@ from naive.tree_records import tree_of
 from factorbus.proto.messages import Batch
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.linearization_error import burden, dearness
-from factorbus.solver.tree import Tree
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.linearization_error import burden, dearness
+from factorbus.solver.kernels.model import layout as at
 
 NEVER = {
     "bent_soon": np.inf,

@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from factorbus.solver import warm
-from factorbus.solver.kernels import _jit
+from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.warm import _iter_groups
 
 

@@ -13,7 +13,7 @@ import threading
 from factorbus import idp
 from factorbus.proto.features import Shard
 from factorbus.proto.features_codec import encode_ask, encode_shard
-from factorbus.service.rates import example
+from factorbus.service.jobs.rates import example
 from factorbus.workers import jobs
 from factorbus.workers.app import work
 from factorbus.workers.config import Config

@@ -11,7 +11,7 @@ import pytest
 from journalled import Services, check_journal, rows
 from processes import PATIENCE_S
 
-from factorbus.cli.journal import verify
+from factorbus.cli.commands.journal import verify
 from factorbus.client import Changes, Draft, connect
 from factorbus.client.map import Map
 from factorbus.proto.messages import Batch

@@ -17,8 +17,8 @@ from factorbus.client import Bus, Draft, Map, aio, connect
 from factorbus.journal.records import Fold
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
-from factorbus.service.library import make_folder
-from factorbus.service.recovery import verify
+from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.recovery import verify
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 

@@ -11,9 +11,9 @@ from processes import PATIENCE_S
 from factorbus.client import connect
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
-from factorbus.service.cores import core_count
-from factorbus.service.library import make_folder
-from factorbus.service.recovery import verify
+from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.recovery import verify
+from factorbus.service.process.worker_threads import core_count
 from factorbus.simulate import manhattan
 
 POSES = 3000

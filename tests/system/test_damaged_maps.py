@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from journalled import Services, drafts
 
-from factorbus.cli.service_checks import services as look_at
+from factorbus.cli.doctor.service_checks import services as look_at
 from factorbus.client import Problem, Refused, connect
 from factorbus.client.bus import Bus
 from factorbus.journal.store import NAME

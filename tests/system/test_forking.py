@@ -22,7 +22,7 @@ from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import BadName, UnknownMap
 from factorbus.service.config import Limits
-from factorbus.service.library import make_folder
+from factorbus.service.journal.library import make_folder
 
 SIGMAS = (0.1, 0.1, 0.02)
 

@@ -12,7 +12,7 @@ from factorbus.client import connect
 from factorbus.client.map import Map
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Refused
-from factorbus.service import memory
+from factorbus.service.process import memory
 
 Spawn = Callable[..., Process]
 POSES = 5000

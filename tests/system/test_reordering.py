@@ -11,8 +11,8 @@ from processes import PATIENCE_S
 from factorbus.client import connect
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
-from factorbus.service.library import make_folder
-from factorbus.service.recovery import verify
+from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.recovery import verify
 from factorbus.simulate import manhattan
 
 POSES = 1600

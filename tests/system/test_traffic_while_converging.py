@@ -11,7 +11,7 @@ from journalled import SIGMAS, Services, rows
 from processes import PATIENCE_S
 from turned import LONG, prepare, turn
 
-from factorbus.cli.journal import verify
+from factorbus.cli.commands.journal import verify
 from factorbus.client import Changes, Draft, connect
 from factorbus.client.map import Map
 from factorbus.proto.messages import Batch, Delta

@@ -225,7 +225,7 @@ def stats(endpoint: str) -> "subprocess.CompletedProcess[str]":
 
 
 def doctor(endpoint: str) -> str:
-    program = "import sys; from factorbus.cli.service_checks import services; print(*services(sys.argv[1], ''))"
+    program = "import sys; from factorbus.cli.doctor.service_checks import services; print(*services(sys.argv[1], ''))"
     ran = subprocess.run([sys.executable, "-c", program, endpoint], capture_output=True, text=True, timeout=PATIENCE_S)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from turned import closing, in_one
 
-from factorbus.cli.columns import merged
+from factorbus.cli.driving.columns import merged
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
-from factorbus.service import inplace
+from factorbus.service.jobs import inplace
 from factorbus.simulate import sphere
 from factorbus.solver import SolverError
 from factorbus.solver.starts import descent

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import click
 
-from factorbus.cli.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
+from factorbus.cli.output.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
 from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
 
@@ -32,7 +32,7 @@ COMMANDS = {
     "datasets": ("datasets", "The public data sets: what there is, where it is, and fetching it."),
     "journal": ("journal", "What a service keeps on disk: show it, check it, run it again."),
     "export": ("export", "Copy a map out of a service's journal into one file."),
-    "import": ("take_in", "Put an exported map into a service's journal."),
+    "import": ("import_command", "Put an exported map into a service's journal."),
     "drop": ("drop", "Take a map off its service, if it is at the revision that was copied."),
     "warm": ("warm", "Compile the kernels ahead."),
     "access": ("access", "Write who may do what as a Zenoh configuration: TLS, users, access control."),
@@ -65,7 +65,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        return importlib.import_module(f"factorbus.cli.{COMMANDS[cmd_name][0]}").command
+        return importlib.import_module(f"factorbus.cli.commands.{COMMANDS[cmd_name][0]}").command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

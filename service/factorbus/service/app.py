@@ -27,27 +27,27 @@ from factorbus.proto import codec, keys
 from factorbus.proto.problems import Busy, Internal, Problem, UnknownQuestion
 from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
-from factorbus.service.admin import NotHere, read_create, read_drop, read_fork
-from factorbus.service.arrival import read_insert
-from factorbus.service.bus import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
+from factorbus.service.bus.delivery import Delivery
+from factorbus.service.bus.senders import Senders
+from factorbus.service.bus.zenoh_session import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
 from factorbus.service.config import BadConfig, Config, checked
-from factorbus.service.cores import LentCores
-from factorbus.service.delivery import Delivery
-from factorbus.service.events import Asked, Asker, Refuse
-from factorbus.service.features import Features
-from factorbus.service.health import Health
-from factorbus.service.jobs import Jobs
-from factorbus.service.lane import Lane
-from factorbus.service.library import Library, log_owner, open_library
-from factorbus.service.maps import Maps
-from factorbus.service.metrics import open_metrics
-from factorbus.service.optima import Optima
-from factorbus.service.questions import Question, Snapshot
-from factorbus.service.room import Room
-from factorbus.service.senders import Senders
-from factorbus.service.start import ready_to_compute
-from factorbus.service.trips import Trips
-from factorbus.service.vitals import Vitals
+from factorbus.service.core.events import Asked, Asker, Refuse
+from factorbus.service.jobs.features import Features
+from factorbus.service.jobs.optima import Optima
+from factorbus.service.jobs.running import Jobs
+from factorbus.service.jobs.worker_latency import Trips
+from factorbus.service.journal.library import Library, log_owner, open_library
+from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.operations.health_report import Vitals
+from factorbus.service.operations.metrics import open_metrics
+from factorbus.service.operations.start import ready_to_compute
+from factorbus.service.process.health import Health
+from factorbus.service.process.worker_threads import LentCores
+from factorbus.service.questions.admin import NotHere, read_create, read_drop, read_fork
+from factorbus.service.questions.answers import Question, Snapshot
+from factorbus.service.questions.question_memory import Room
+from factorbus.service.registry import Maps
+from factorbus.service.solving.arrival import read_insert
 
 log = logging.getLogger(__name__)
 
@@ -239,7 +239,7 @@ class Shell:
             self._desk.hand(self._trips.left, worker)
 
     def _about(self) -> dict[str, Any]:
-        from factorbus.service.warm import compiled_seconds
+        from factorbus.service.operations.warm import compiled_seconds
 
         return {
             "service": self._service,

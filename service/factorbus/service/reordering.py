@@ -17,8 +17,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from factorbus.service.events import Arrived, Judged, Run, Stepped
-from factorbus.service.fold import Folder
+from factorbus.service.core.events import Arrived, Judged, Run, Stepped
+from factorbus.service.solving.apply import Folder
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)

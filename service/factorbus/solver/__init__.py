@@ -9,15 +9,15 @@
 """
 
 from factorbus.solver import errors
-from factorbus.solver.batch import BatchResult, solve_batch
 from factorbus.solver.errors import SolverError
-from factorbus.solver.evaluate import chi2_at
 from factorbus.solver.fingerprint import fingerprint
-from factorbus.solver.groups import FactorGroup, Group
-from factorbus.solver.kernels._jit import compiled_seconds
+from factorbus.solver.graph.groups import FactorGroup, Group
+from factorbus.solver.kernels.jit.compile import compiled_seconds
+from factorbus.solver.optimize.evaluate import chi2_at
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
+from factorbus.solver.starts.batch import BatchResult, solve_batch
 from factorbus.solver.warm import warm
 
 __all__ = [

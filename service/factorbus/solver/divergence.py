@@ -13,13 +13,13 @@ import math
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import I64
-from factorbus.solver.kernels.bounds import MOST_NUMBER, are_usual, find_escaped
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.jit.compile import I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.bounds import MOST_NUMBER, are_usual, find_escaped
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 
 
 def is_sound(changed: I64, graph: Graph, report: StepReport) -> bool:

@@ -8,37 +8,38 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.solver import errors, sights
-from factorbus.solver.admission import admit
-from factorbus.solver.anchors import find_unanchored, find_unheld
-from factorbus.solver.changes import ChangeLike, collect, unchanged
-from factorbus.solver.changing import try_in_place
+from factorbus.solver import errors
+from factorbus.solver.bayes_tree.steps import TreeSteps
+from factorbus.solver.changes.convert_to_points import find_ripe, is_held, with_points
+from factorbus.solver.changes.edited import edited
+from factorbus.solver.changes.in_place import try_in_place
+from factorbus.solver.changes.requested import ChangeLike, collect, unchanged
 from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
 from factorbus.solver.covariance.live import Live
 from factorbus.solver.covariance.upkeep import Upkeep
-from factorbus.solver.edited import edited
-from factorbus.solver.elimination import Elimination
-from factorbus.solver.gauss_newton import Course, glide, minimise
-from factorbus.solver.graph import Graph, Mark
-from factorbus.solver.groups import Addition, BatchLike, FactorGroup, Group
-from factorbus.solver.incremental import Incremental, Where
-from factorbus.solver.joints import check_joints, find_apart
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.admit_bytes import admit_bytes
-from factorbus.solver.kernels.settle_new import settle_new
+from factorbus.solver.graph import observations as sights
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.groups import Addition, BatchLike, FactorGroup, Group
+from factorbus.solver.graph.joints import check_joints, find_apart
+from factorbus.solver.graph.packing import Packing
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.inc_l.incremental import Incremental, Where
+from factorbus.solver.inc_l.strategy import Plan
+from factorbus.solver.kernels.graph.admit_bytes import admit_bytes
+from factorbus.solver.kernels.graph.local_init import settle_new
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import mode_named
+from factorbus.solver.optimize.gauss_newton import Course, glide, minimise
+from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
+from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
-from factorbus.solver.packing import Packing
 from factorbus.solver.report import StepReport, Stopwatch
-from factorbus.solver.ripening import find_ripe, is_held, with_points
-from factorbus.solver.rules import further_rule, ordinary_rule, settling_rule
+from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.elimination import Elimination
+from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.solver.state import State, dump, load
-from factorbus.solver.strategy import Plan
-from factorbus.solver.symbolic import Symbolic
-from factorbus.solver.system import System
-from factorbus.solver.tree_steps import TreeSteps
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
 from factorbus.wording import counted
 
 # A step of a robot brings no more variables than this, and some factors each.
@@ -117,8 +118,8 @@ class Solver:
     def try_stage(self, raw: bytes, groups: I64) -> int | None:
         """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
 
-        groups (n, layout.G_WIDTH): where they lie, as it is said in `kernels/layout.py`.  Offsets and sizes are the
-        caller's word: they are not checked again.
+        groups (n, layout.G_WIDTH): where they lie, as `kernels/model/layout.py` says.  Offsets and sizes are
+        the caller's word: they are not checked again.
         """
         first = admit_bytes(raw, groups, self._graph.places)
         if first == at.NO_ROOM:

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from factorbus.solver.arenas import lines
+from factorbus.solver.graph.arenas import lines
 
 State: TypeAlias = dict[str, Any]
 

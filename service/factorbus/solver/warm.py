@@ -8,7 +8,7 @@ from typing import Any
 
 from factorbus.solver import kernels
 from factorbus.solver.covariance import kernels as covariance_kernels
-from factorbus.solver.kernels._jit import compiled_seconds, is_on_disk, iter_compile
+from factorbus.solver.kernels.jit.compile import compiled_seconds, is_on_disk, iter_compile
 
 
 def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -> float:
@@ -40,12 +40,12 @@ def list_missing(*packages: ModuleType) -> list[Any]:
 
 def _iter_groups(package: ModuleType = kernels) -> Iterator[tuple[str, list[Any]]]:
     """(file, its kernels with declared signatures)."""
-    for entry in pkgutil.iter_modules(package.__path__):
-        module = importlib.import_module(f"{package.__name__}.{entry.name}")
+    for entry in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        module = importlib.import_module(entry.name)
         found = [
             thing
             for thing in vars(module).values()
             if getattr(thing, "factorbus_signatures", ()) and thing.__module__ == module.__name__
         ]
         if found:
-            yield entry.name, found
+            yield entry.name.removeprefix(f"{package.__name__}."), found

@@ -14,15 +14,15 @@ from bench.replays.columns import F64, I64
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group
-from factorbus.solver.admission import admit
-from factorbus.solver.blocks import Blocks
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.chi2 import sum_chi2
-from factorbus.solver.kernels.move import move
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import Symbolic, analyze
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.kernels.model.retract import move
+from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
 COARSE, FINE = 1e-5, 1e-10  # of χ²: where the model of one pass is good enough, and where an optimum is one
 _MOST_PASSES = 200

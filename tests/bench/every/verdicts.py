@@ -5,7 +5,7 @@ from typing import Any
 
 from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
 
-from factorbus.service.converging import POLISH_IDLE_S
+from factorbus.service.core.converging import POLISH_IDLE_S
 
 from .drives import WORLDS
 from .rows import FAR, NEAR, together

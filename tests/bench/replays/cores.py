@@ -16,7 +16,7 @@ import numpy as np
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Options, Solver, warm
-from factorbus.solver.lending import Lender
+from factorbus.solver.sparse.lending import Lender
 
 from .clock import percentiles
 from .feed import fed

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csc_matrix, tril
 from sksparse.cholmod import analyze as cholmod_analyze
 
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 from .columns import ENDS, I64, Columns
 

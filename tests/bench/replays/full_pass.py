@@ -20,10 +20,10 @@ from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, warm
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 from .columns import F64, Columns, columns_of
 from .problems import Problem, load

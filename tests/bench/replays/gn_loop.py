@@ -10,14 +10,14 @@ import numpy as np
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group, SolverError
-from factorbus.solver.admission import admit
-from factorbus.solver.blocks import Blocks
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels.move import move
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.retract import move
+from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 from .columns import Values
 from .contestants import Failed

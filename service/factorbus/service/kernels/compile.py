@@ -1,4 +1,6 @@
-"""How these kernels are compiled: exactly, and keeping the interpreter lock (`factorbus.solver.kernels._jit` says how).
+"""How these kernels are compiled: exactly, and keeping the interpreter lock.
+
+`factorbus.solver.kernels.jit.compile` says how.
 
 A call is done within a microsecond or two.  Were the lock given up for it, another thread could take it for half a
 millisecond.
@@ -9,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factorbus.solver.kernels import layout
-from factorbus.solver.kernels._jit import F64, I64, KernelFolder
+from factorbus.solver.kernels.jit.compile import F64, I64, KernelFolder
+from factorbus.solver.kernels.model import layout
 
 __all__ = ["F64", "I64", "U8", "inline_kernel", "kernel", "part"]
 

@@ -11,7 +11,7 @@ from factorbus.service.kernels import words as w
 from factorbus.service.kernels.compile import I64, U8, inline_kernel, kernel, part
 from factorbus.service.kernels.digest import digest_bytes
 from factorbus.service.kernels.words import look_up
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.model import layout as at
 
 # In place of where to read on: this is nothing usual.
 _LOST = -1

@@ -7,8 +7,8 @@ tables, so a new kind needs nothing here; sights are left out, whose lenses are 
 import numpy as np
 
 from factorbus.service.kernels.compile import I64, U8, inline_kernel
-from factorbus.solver.factors import FACTOR_KINDS, LENS_AT
-from factorbus.solver.variables import VARIABLE_KINDS
+from factorbus.solver.graph.factors import FACTOR_KINDS, LENS_AT
+from factorbus.solver.graph.variables import VARIABLE_KINDS
 
 # Columns of `WORDS`.
 W_ROLE = 0

@@ -4,7 +4,7 @@ import numpy as np
 
 from factorbus.service.kernels import words as w
 from factorbus.service.kernels.compile import F64, I64, U8, inline_kernel, kernel, part
-from factorbus.solver.kernels import layout as at
+from factorbus.solver.kernels.model import layout as at
 
 # No message is longer than this but for its columns and its report; nor is what a group adds to its columns.
 _MOST_HEAD, _MOST_GROUP = 128, 96

@@ -10,11 +10,11 @@ from factorbus.solver.covariance.candidates import admitted, judge_candidates, l
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.kernels.compatible import search
 from factorbus.solver.errors import KindMismatch, TooLarge, printed
-from factorbus.solver.factors import FACTOR_KINDS
-from factorbus.solver.groups import FactorGroup
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.graph.factors import FACTOR_KINDS
+from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 
 _BUDGET = 200_000  # pairs tried: some seconds at the very worst
 _MOST_PAIRS = 2000  # compatible ones: their joint covariance has that many rows, times two or three

@@ -1,6 +1,7 @@
 """Blocks of the covariance of a map: of one variable, of several together, between two.  MATH §10.1, §10.2.
 
-A block is in the tangent spaces of its variables: local increments, translation first (`factorbus.solver.variables`).
+A block is in the tangent spaces of its variables: local increments, translation first
+(`factorbus.solver.graph.variables`).
 Fixed variables have covariance zero.
 """
 
@@ -10,8 +11,8 @@ from factorbus.solver.covariance.factored import DIMS, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.whole import whole_blocks
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.compile import F64, I64
 
 # For fewer variables than this share of all, going up from each is sooner done than the recursion from the roots.
 _FEW = 1 / 64

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.admission import admit
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.factored import LARGEST
 from factorbus.solver.covariance.kernels.judge import judge
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE
-from factorbus.solver.graph import Graph
-from factorbus.solver.groups import FactorsLike
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.candidates import evaluate_factors
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.groups import FactorsLike
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 _CHUNK = 512  # factors whose Jacobians stay in the cache between two kernels
 

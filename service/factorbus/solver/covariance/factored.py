@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
+from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.covariance.kernels.recursion import list_cliques
 from factorbus.solver.covariance.kernels.rows import copy_rows, rows_size
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.variables import VARIABLE_KINDS
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.options import Options
-from factorbus.solver.tree import Tree
-from factorbus.solver.variables import VARIABLE_KINDS
 
 DIMS = np.zeros(1 + max(kind.code for kind in VARIABLE_KINDS.values()), np.int64)
 for _kind in VARIABLE_KINDS.values():
@@ -23,7 +23,7 @@ LARGEST = int(DIMS.max())
 
 @dataclass(frozen=True, slots=True)
 class Factored:
-    """R by cliques and the graph it is of; arrays as in `kernels/tree_layout.py`.
+    """R by cliques and the graph it is of; arrays as in `kernels/bayes_tree/layout.py`.
 
     dims (n,): of every variable   scalar (n,): where it starts in a column of Σ; −1: fixed
     order (c,): the cliques, depth first from the roots; none in a view   stamp: of the last elimination

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import chdtri
 
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.jit.compile import F64, I64
 
 
 def threshold(dims: I64, probability: float) -> F64:

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.covariance.factored import DIMS
 from factorbus.solver.covariance.kernels.paths import joint_block
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.tree import Tree
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 
 
 class Live:

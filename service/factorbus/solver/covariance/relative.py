@@ -11,12 +11,12 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import judge_candidates
-from factorbus.solver.factors import FACTOR_KINDS
-from factorbus.solver.graph import Graph
-from factorbus.solver.groups import FactorGroup
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.variables import SE2, SE3, VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KINDS
+from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.variables import SE2, SE3, VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 
 # What measures the second variable in the frame of the first.
 _MEASURED_BY = {

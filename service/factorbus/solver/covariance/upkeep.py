@@ -8,18 +8,18 @@ negligible; so that this and rounding errors do not add up, all blocks are compu
 
 import numpy as np
 
+from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.covariance.factored import DIMS, LARGEST
 from factorbus.solver.covariance.kernels.loops import DONE, work_in
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_roots
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE
-from factorbus.solver.graph import Graph
-from factorbus.solver.joints import negative_rows
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.candidates import evaluate_factors
-from factorbus.solver.tree import Tree
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.joints import negative_rows
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 # Loops of so many numbers in all, and so many new variables, are worked in; with more all is computed anew.
 _MOST_RANKS, _MOST_NEW = 12, 8

@@ -6,16 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.solver import errors, sights
+from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.candidates import Linear, judge_rows, linearised
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels._jit import F64
-from factorbus.solver.kernels.chi2 import sum_chi2
-from factorbus.solver.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.graph import observations as sights
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
 
 _NOTHING = 1e-9
 _STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)

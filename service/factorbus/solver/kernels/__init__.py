@@ -1,1 +1,1 @@
-"""Compiled kernels: arrays in, arrays filled.  `_jit` says how they are compiled and kept."""
+"""Compiled kernels: arrays in, arrays filled.  `compile` says how they are compiled and kept."""

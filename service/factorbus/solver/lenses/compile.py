@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from factorbus.solver.kernels._jit import F64, KernelFolder
+from factorbus.solver.kernels.jit.compile import F64, KernelFolder
 
 __all__ = ["F64", "FOLDER", "inline_kernel"]
 

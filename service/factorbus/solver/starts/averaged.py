@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.carried import carry, tied
 from factorbus.solver.starts.components import components_of, docked
 from factorbus.solver.starts.losses import narrowing, weights_of

@@ -4,9 +4,9 @@ MATH §12.3."""
 
 import numpy as np
 
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import Relations, Space
 from factorbus.solver.starts.rotation_matrices import turned_rays
 

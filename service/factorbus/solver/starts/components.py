@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.kernels.reach import join
+from factorbus.solver.kernels.graph.initialize import join
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations
 from factorbus.solver.starts.translations import placed

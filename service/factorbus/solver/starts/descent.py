@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.anchors import find_unanchored, find_unheld
-from factorbus.solver.elimination import Elimination
-from factorbus.solver.gauss_newton import Rule, minimise
-from factorbus.solver.graph import Graph
-from factorbus.solver.incremental import Incremental
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64
-from factorbus.solver.kernels.chi2 import sum_chi2
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.inc_l.incremental import Incremental
+from factorbus.solver.kernels.jit.compile import F64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.optimize.gauss_newton import Rule, minimise
+from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.system import System
+from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.elimination import Elimination
 
 VALUES, ODOMETRY, ROTATIONS = "values", "odometry", "rotations"
 # What is there is preferred, then what no order of the factors decides.

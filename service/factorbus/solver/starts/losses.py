@@ -6,8 +6,8 @@ is off, and narrows from round to round to what it is.
 
 import numpy as np
 
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 
 ROUNDS = 5
 

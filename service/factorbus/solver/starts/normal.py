@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 
-from factorbus.solver.cholesky import Cholesky
-from factorbus.solver.kernels._jit import F64, I64
-from factorbus.solver.ordering import order
-from factorbus.solver.symbolic import analyze
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import analyze
 
 
 class Normal:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorbus.solver.factors import FACTOR_KIND_OF_CODE
-from factorbus.solver.graph import Graph
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.rotation_matrices import matrices_of_angles, matrices_of_quaternions
 
 MAP = 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import F64
+from factorbus.solver.kernels.jit.compile import F64
 
 
 def matrices_of_angles(theta: F64) -> F64:

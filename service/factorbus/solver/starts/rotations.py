@@ -8,7 +8,7 @@ number, and the second row follows from the first.
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import F64, I64
+from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.starts.normal import Normal, summed
 from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations

@@ -8,7 +8,7 @@ d + 1 numbers, the same normal equations for each r.
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import F64
+from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.starts.normal import Normal, summed
 from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations

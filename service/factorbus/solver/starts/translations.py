@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import F64
+from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.starts.normal import Normal, summed
 from factorbus.solver.starts.relations import Relations
 from factorbus.solver.starts.rotation_matrices import angles_of, residuals_of

@@ -1,4 +1,4 @@
-"""How these kernels are compiled: as the solver's, but exactly (`factorbus.solver.kernels._jit` says how).
+"""How these kernels are compiled: as the solver's, but exactly (`factorbus.solver.kernels.jit.compile` says how).
 
 The same features may be computed by any worker, whole or in shards, or in place.  With fused or reordered sums the
 last bits would depend on where a loop was cut; without, only on the numbers.
@@ -6,7 +6,7 @@ last bits would depend on where a loop was cut; without, only on the numbers.
 
 from pathlib import Path
 
-from factorbus.solver.kernels._jit import DISABLED, F64, I64, KernelFolder
+from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, KernelFolder
 from factorbus.solver.lenses.compile import FOLDER as LENSES
 
 __all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]

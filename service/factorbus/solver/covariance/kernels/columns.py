@@ -10,9 +10,9 @@ import numpy as np
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.squares import padded
 from factorbus.solver.covariance.kernels.substitute import backward, fetch, forward
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, put, zero
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, put, zero
+from factorbus.solver.kernels.jit.simd import at as load
 
 
 @kernel(

@@ -15,9 +15,9 @@ from factorbus.solver.covariance.kernels.paths import list_paths
 from factorbus.solver.covariance.kernels.recursion import following, is_stirred
 from factorbus.solver.covariance.kernels.squares import padded
 from factorbus.solver.covariance.kernels.substitute import GROUP, backward, fetch, forward
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, put, zero
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, put, zero
+from factorbus.solver.kernels.jit.simd import at as load
 
 TOO_NEAR, DONE = 0, 1
 

@@ -11,10 +11,10 @@ from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel,
 from factorbus.solver.covariance.kernels.squares import padded
 from factorbus.solver.covariance.kernels.substitute import GROUP, forward
 from factorbus.solver.covariance.kernels.tiles import negative
-from factorbus.solver.kernels import layout as at
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, put
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.model import layout as at
 
 
 @kernel(

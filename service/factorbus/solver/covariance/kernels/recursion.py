@@ -20,8 +20,8 @@ from factorbus.solver.covariance.kernels.squares import (
     working_size,
 )
 from factorbus.solver.covariance.kernels.substitute import fetch
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import at as load
 
 
 @kernel("int64(int64[:,::1], int64[:,::1], int64[::1])")

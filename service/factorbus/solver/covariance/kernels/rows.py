@@ -1,9 +1,9 @@
 """R by itself: the rows of all cliques, copied out of the tree's arena one behind the other."""
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import at as load
-from factorbus.solver.kernels.simd import put
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
 
 
 @kernel("int64(int64[::1], int64[:,::1])")

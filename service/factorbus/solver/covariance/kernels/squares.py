@@ -16,9 +16,9 @@ from factorbus.solver.covariance.kernels.tiles import (
     transpose,
     transpose_negative,
 )
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS, put, zero
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, put, zero
+from factorbus.solver.kernels.jit.simd import at as load
 
 _DIMS = 6  # of the largest variable
 _TOGETHER = 3  # rows that are copied together: a variable of the plane has as many

@@ -13,8 +13,8 @@ from factorbus.solver.covariance.kernels.tiles import (
     solve_upper,
     subtract,
 )
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, TILE_ROWS, TILE_VECTORS
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS
 
 GROUP = TILE_VECTORS  # vectors of columns that are worked on together, at most
 

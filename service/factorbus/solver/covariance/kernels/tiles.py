@@ -1,6 +1,7 @@
 """Register tiles for covariances: products whose left factor may lie in another array, by rows or by columns.
 
-So R is read where it is and nothing has to be transposed first.  As those of `factorbus.solver.kernels.simd` there are
+So R is read where it is and nothing has to be transposed first.  As those of
+`factorbus.solver.kernels.jit.simd` there are
 three sets of these functions with one meaning: `tiles_llvm`, `tiles_checked` and `tiles_plain` (read that one first).
 """
 

@@ -2,7 +2,7 @@
 
 from factorbus.solver.covariance.kernels import tiles_llvm
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel
-from factorbus.solver.kernels._jit import vector_lanes
+from factorbus.solver.kernels.jit.compile import vector_lanes
 
 prefetch = tiles_llvm.prefetch  # reaches nothing
 _LANES = vector_lanes()

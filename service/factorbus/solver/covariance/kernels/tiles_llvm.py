@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from factorbus.solver.kernels import simd_llvm as simd
-from factorbus.solver.kernels._jit import cgutils, intrinsic, ir, types
+from factorbus.solver.kernels.jit import simd_llvm as simd
+from factorbus.solver.kernels.jit.compile import cgutils, intrinsic, ir, types
 
 _I64 = ir.IntType(64)
 _RUN = ir.VectorType(ir.DoubleType(), 4)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.kernels._jit import F64, I64, vector_lanes
+from factorbus.solver.kernels.jit.compile import F64, I64, vector_lanes
 
 _LANES = vector_lanes()
 _RUN = 4

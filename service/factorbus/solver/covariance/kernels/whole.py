@@ -22,9 +22,9 @@ from factorbus.solver.covariance.kernels.squares import (
 )
 from factorbus.solver.covariance.kernels.substitute import collect, distribute, fetch
 from factorbus.solver.covariance.kernels.tiles import negative
-from factorbus.solver.kernels import tree_layout as tl
-from factorbus.solver.kernels.simd import LANES, put
-from factorbus.solver.kernels.simd import at as load
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.simd import LANES, put
+from factorbus.solver.kernels.jit.simd import at as load
 
 AHEAD = 3  # cliques: it takes that long for rows to come into the cache
 

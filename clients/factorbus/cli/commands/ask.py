@@ -1,0 +1,391 @@
+"""`factorbus ask`: what a map on the bus says of its certainty, of a measurement, and of itself."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from factorbus.cli.output.advice import advising, of_what_is_there
+from factorbus.cli.output.console import document, table
+from factorbus.cli.output.exits import FAILED, OK, input_file
+from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
+from factorbus.cli.process.reading import read_graph
+from factorbus.wording import counted
+
+_SHOWN = 20  # more false factors than these are told with --json only
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@click.group()
+def command() -> None:
+    """Ask the map NAME on the bus. Answers are from one revision, and name it.
+
+    \b
+    factorbus ask covariance warehouse x12 x300
+    factorbus ask gate warehouse candidates.g2o
+    factorbus ask why warehouse x12
+    factorbus ask chi2 warehouse --batch
+    """
+
+
+def _asking(command: F) -> F:
+    """NAME, --connect, --timeout and --json."""
+    for option in (
+        json_option,
+        zenoh_option,
+        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
+        click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
+        click.argument("name"),
+    ):
+        command = option(command)
+    return command
+
+
+_probability = click.option(
+    "--probability",
+    type=Number(0, 1, min_open=True, max_open=True),
+    default=0.95,
+    show_default=True,
+    help="With which a right measurement passes.",
+)
+
+
+@command.command("covariance")
+@_asking
+@click.argument("keys", nargs=-1)
+@click.option("--joint", "blocks", flag_value="joint", help="Of all KEYS together, one matrix.")
+@click.option("--relative", "blocks", flag_value="relative", help="Of the second as seen from the first, pair by pair.")
+@click.option("--last", "blocks", flag_value="last", help="Of the pose that was inserted last.")
+def covariance_command(
+    name: str, keys: tuple[str, ...], blocks: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
+    """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
+
+    \b
+    factorbus ask covariance warehouse x12 l3
+    factorbus ask covariance warehouse x12 x300 --relative
+    factorbus ask covariance warehouse --last --json
+    """
+    import numpy as np
+
+    from factorbus.proto.symbols import format_symbol
+
+    if blocks in ("joint", "relative") and not keys:
+        raise click.UsageError(f"--{blocks} needs KEYS")
+    if blocks == "relative" and len(keys) % 2:
+        raise click.UsageError(
+            f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
+        )
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
+    if found.covariance is not None:
+        names = [format_symbol(int(key)) for key in found.keys]
+        if as_json:
+            document({"revision": found.revision, "keys": names, "covariance": found.covariance.tolist()})
+        else:
+            click.echo(np.array2string(found.covariance, precision=6, suppress_small=False))
+        return OK
+    rows = [
+        (" ".join(format_symbol(int(key)) for key in np.atleast_1d(one)), group.kind, block)
+        for group in found.groups
+        for one, block in zip(group.keys, group.covariance, strict=True)
+    ]
+    if as_json:
+        content = [{"keys": keys.split(), "kind": kind, "covariance": block.tolist()} for keys, kind, block in rows]
+        document({"revision": found.revision, "blocks": content})
+    else:
+        table(
+            [(keys, "  ".join(f"{sigma:.4g}" for sigma in np.sqrt(block.diagonal()))) for keys, _, block in rows],
+            title=f"Standard deviations at revision {found.revision}",
+        )
+    return OK
+
+
+@command.command("gate")
+@_asking
+@file_argument("candidates")
+@_probability
+def gate_command(
+    name: str, candidates: Path, probability: float, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
+    """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
+
+    The file is g2o, TORO, iSAM or SLAM++ text. Their keys are those of the map; vertices in the file are not looked at.
+
+    \b
+    factorbus ask gate warehouse candidates.g2o --probability 0.99
+    """
+    read = _read(candidates)
+    factors = read.batch.factors
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.gate(factors, probability, timeout_s).result()
+    columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
+    rows = [
+        {"factor": told, "distance": distance, "threshold": allowed, "plausible": plausible}
+        for told, distance, allowed, plausible in zip(_described(factors), *columns, strict=True)
+    ]
+    if as_json:
+        document({"revision": found.revision, "read": read.account(), "candidates": rows})
+    else:
+        table(
+            [
+                (row["factor"], f"d² {row['distance']:.4g} of {row['threshold']:.4g}: {_word(row['plausible'])}")
+                for row in rows
+            ],
+            title=f"At revision {found.revision}",
+        )
+    return OK if all(row["plausible"] for row in rows) else FAILED
+
+
+@command.command("gain")
+@_asking
+@file_argument("candidates")
+def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """How much information each of the factors in the file CANDIDATES would bring by itself, in nats, the most first.
+
+    \b
+    factorbus ask gain warehouse candidates.g2o
+    """
+    read = _read(candidates)
+    factors = read.batch.factors
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.doubt.ask.gain(factors, timeout_s).result()
+    rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
+    if as_json:
+        content = [{"factor": told, "gain": gain} for told, gain in rows]
+        document({"revision": found.revision, "read": read.account(), "candidates": content})
+    else:
+        table([(told, f"{gain:.4g}") for told, gain in rows], title=f"Nats at revision {found.revision}")
+    return OK
+
+
+@command.command("why")
+@_asking
+@click.argument("what")
+@click.option("--variable", "only", flag_value="variable", help="WHAT is a variable: of a key without a letter, 7.")
+@click.option("--factor", "only", flag_value="factor", help="WHAT is the id of a factor.")
+def why_command(
+    name: str, what: str, only: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+) -> int:
+    """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
+
+    Residuals and χ² are at the estimate. The leverage of a factor is the trace of its part of the hat matrix,
+    tr(Ω H Σ Hᵀ), from 0 (the others determine what it measures) to the dimension of its residual (it alone does). The
+    pivots of a variable are those of the Cholesky factor R, and Λ is the information matrix: R²ᵢᵢ/Λᵢᵢ is 1 where no
+    variable that was eliminated before depends on it, and near 0 where its estimate rests on those.
+
+    By how much χ² falls without a factor is told to first order, "about", and is never more than all of χ².
+
+    A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
+    both are told, unless --variable or --factor says which is meant.
+
+    \b
+    factorbus ask why warehouse x12
+    factorbus ask why warehouse 17 --json
+    factorbus ask why warehouse 7 --variable
+    """
+    if only == "factor" and not what.isdecimal():
+        raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        told = _accounts(asked, what, only)
+    if as_json:
+        content = {"revision": told[0].revision, "variable": {}, "factor": {}, "step": told[0].step}
+        for found in told:
+            content |= {kind: account for kind in ("variable", "factor") if (account := getattr(found, kind))}
+        document(content)
+        return OK
+    for found in told:
+        _tell(what, found)
+    return OK
+
+
+def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
+    """Of the variable, of the factor, or of both where WHAT may be either.  Raises Refused."""
+    from factorbus.client import Refused
+
+    if not what.isdecimal() or only == "variable":
+        return [asked.doubt.why(what)]
+    if only == "factor":
+        return [asked.doubt.why(factor=int(what))]
+    told, refused = [], None
+    for how in ({"key": what}, {"factor": int(what)}):
+        try:
+            told.append(asked.doubt.why(**how))
+        except Refused as problem:
+            if problem.code not in ("unknown_variable", "unknown_factor"):
+                raise
+            refused = problem
+    if refused is not None and not told:
+        raise refused
+    return told
+
+
+def _tell(what: str, found: Any) -> None:
+    if found.variable:
+        table(_variable_rows(found.variable), title=f"{what} at revision {found.revision}")
+        rows = [(_told(each), _factor_line(each, found.step)) for each in found.variable["factors"]]
+        table(rows, title="Its factors, by id")
+    else:
+        table([(_told(found.factor), _factor_line(found.factor, found.step))], title=f"At revision {found.revision}")
+    step = found.step
+    if step:
+        table([("the last step", f"{step['strategy']}, because {step['because']}")])
+
+
+@command.command("chi2")
+@_asking
+@click.option("--batch", is_flag=True, help="Also of the optimum found from scratch, which takes a while.")
+def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+    """How well the estimate fits: χ² = Σ rᵀΩr, with --batch over that of the optimum found from scratch.
+
+    That is the lowest of three: from the map's own values, from composed odometry, from averaged rotations. Where the
+    map is above it by more than 1 % this says so, and `factorbus change adopt` puts the map there. Where the search
+    ended before it had converged this says so (--json: batch_converged), and the true optimum may be lower.
+
+    \b
+    factorbus ask chi2 warehouse
+    factorbus ask chi2 warehouse --batch
+    """
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.chi2(batch, timeout_s)
+    if as_json:
+        content = {"revision": found.revision, "chi2": found.chi2}
+        if found.batch is not None:
+            content |= {"batch": found.batch, "start": found.start, "worker": found.worker, "seconds": found.seconds}
+            content["batch_converged"] = found.batch_converged
+            content["better_optimum"] = None if found.notice is None else found.notice.message
+        document(content)
+        return OK
+    rows = [("χ²", f"{found.chi2:.9g}")]
+    if found.batch is not None:
+        from_where = optimum_from(found.start, converged=found.batch_converged)
+        by = f"{from_where}; {found.worker}, {found.seconds:.2f} s"
+        rows.append(("batch", f"{found.batch:.9g}  ({by})"))
+        ratio = ratio_to(found.chi2, found.batch)
+        rows.append(("χ² / batch", ratio if found.batch_converged else f"{ratio}  (batch: {NOT_CONVERGED})"))
+    if found.notice is not None:
+        rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {name}")))
+    table(rows, title=f"At revision {found.revision}")
+    return OK
+
+
+@command.command("repair")
+@_asking
+@click.argument("factors", nargs=-1, type=int)
+@click.option("--apply", "applied", is_flag=True, help="Take what is false out of the map, and settle it.")
+@click.option("--loss", "loss", metavar="LOSS", default="", help="With --apply: keep it, with this robust loss.")
+@click.option(
+    "--probability",
+    type=Number(0, 1, min_open=True, max_open=True),
+    default=0.99,
+    show_default=True,
+    help="With which a right measurement is kept.",
+)
+def repair_command(
+    name: str,
+    factors: tuple[int, ...],
+    applied: bool,
+    loss: str,
+    probability: float,
+    connect: str,
+    zenoh: str,
+    timeout_s: float,
+    as_json: bool,
+) -> int:
+    """Which of the factors FACTORS (ids), or of all that close loops, are false. Changes nothing without --apply.
+
+    \b
+    factorbus ask repair warehouse
+    factorbus ask repair warehouse --apply
+    factorbus ask repair warehouse 17 18 --apply --loss dcs
+    """
+    from factorbus.client import Changes
+
+    with _map(name, connect, zenoh, timeout_s) as asked:
+        found = asked.repair(factors or None, probability=probability, timeout_s=timeout_s)
+        if applied and found.factors.size:
+            changes = Changes().repair(found, (loss, 1.0) if loss else None)
+            asked.change(changes, settle=True, timeout_s=timeout_s)
+    rows = list(zip(found.factors.tolist(), found.distance.tolist(), strict=True))
+    if as_json:
+        content = {"revision": found.revision, "suspects": found.suspects, "before": found.before, "after": found.after}
+        document(content | {"false": [{"factor": factor, "distance": s} for factor, s in rows], "applied": applied})
+        return OK
+    table(
+        [
+            ("looked at", str(found.suspects)),
+            ("false", f"{len(rows)}{', taken care of' if applied and rows else ''}"),
+            ("cost", f"{found.before:.6g}, without them {found.after:.6g}"),
+            *((str(factor), f"rᵀΩr {s:.4g}") for factor, s in rows[:_SHOWN]),
+        ],
+        title=f"At revision {found.revision}, in {found.seconds:.2f} s",
+    )
+    return OK
+
+
+def _variable_rows(account: Any) -> list[tuple[str, str]]:
+    return [
+        ("kind", account["kind"] + (", fixed" if account["fixed"] else "")),
+        *([("time stamp", f"{account['stamp']} ns")] if account.get("stamp") is not None else []),
+        ("value", "  ".join(f"{number:.6g}" for number in account["value"])),
+        ("sigmas", "  ".join(f"{number:.4g}" for number in account["sigmas"])),
+        ("smallest pivot of R", f"{account['pivot']:.4g}"),
+        ("smallest R²ᵢᵢ/Λᵢᵢ", f"{account['conditioning']:.2g}"),
+    ]
+
+
+def _factor_line(account: Any, step: Any) -> str:
+    from factorbus.proto.why_text import fall_without
+
+    if account.get("asleep"):
+        return f"inactive: {account['asleep']}"
+    without, loss = account["without"], account.get("loss")
+    fall = "no redundancy: nothing else measures it"
+    if without is not None:
+        fall = f"without it χ² falls by {fall_without(without, step)}"
+    share = f"leverage {account['influence']:.2f} of {account['dims']}"
+    if not loss:
+        return f"χ² {account['chi2']:.3g}, {share}, {fall}"
+    counts = f"rᵀΩr {account['chi2']:.3g}, of which {loss} counts {account['rho']:.3g} (weight {account['weight']:.2g})"
+    return f"{counts}, {share}, {fall}"
+
+
+def _told(account: Any) -> str:
+    from factorbus.proto.symbols import format_symbol
+
+    ends = ", ".join(format_symbol(key) for key in account["keys"])
+    return f"{account['factor']} {account['kind']} ({ends})"
+
+
+def _word(plausible: bool) -> str:
+    return "plausible" if plausible else "not plausible"
+
+
+def _read(path: Path) -> Any:
+    with input_file(path):
+        return read_graph(path)
+
+
+def _described(factors: tuple[Any, ...]) -> list[str]:
+    from factorbus.proto.symbols import format_symbol
+
+    return [
+        f"{group.kind} ({', '.join(format_symbol(int(key)) for key in row)})" for group in factors for row in group.keys
+    ]
+
+
+@contextmanager
+def _map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> Iterator[Any]:
+    """The map, joined only if it is there."""
+    from factorbus.cli.process.bus import open_bus
+
+    with (
+        advising(of_what_is_there(name)),
+        open_bus(endpoint, "ask", zenoh, timeout_s) as bus,
+        bus.map(name, mirror=False, create=False) as joined,
+    ):
+        yield joined

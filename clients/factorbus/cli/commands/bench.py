@@ -1,0 +1,101 @@
+"""`factorbus bench`: the measurements of the repository, run from the command line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+
+from factorbus.cli.output.console import document, note
+from factorbus.cli.output.exits import FAILED, OK, Stopped
+from factorbus.cli.process.options import json_option
+
+BENCHES = ("cholesky", "bus", "idp", "ros2", "journal")  # what `all` runs, some minutes
+LONG = ("every-step", "paper", "peers", "fuzz", "soak")  # hours (fuzz, soak: less than one); on request
+ASKED = ("ask", "digest")  # a minute or two; on request
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("name", type=click.Choice([*BENCHES, *ASKED, *LONG, "all"]), default="all")
+@click.argument("options", nargs=-1, type=click.UNPROCESSED)
+@json_option
+def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
+    """Measure NAME, each beside what it is held against; the exit code is 1 when a target is missed.
+
+    \b
+    cholesky   block Cholesky of real systems against CHOLMOD, same matrix and ordering
+    bus        an insert of 10 factors with its delta back against a bare Zenoh echo of equal sizes
+    idp        inverse-depth features: the 2011 paper's tables and figures with our column, seconds, workers;
+               --figures FOLDER, --no-workers
+    ros2       a robot's odometry with its transform back through `factorbus ros2`, against bare Zenoh
+    ask        covariances against GTSAM's and a full batch pass, the last pose and all blocks at every step, gates
+               of 10,000 candidates; --quick
+    every-step the χ² of every published estimate over the batch optimum's from there, beside iSAM2's: simulated
+               drives, data sets, and steps that turn much of a map; an hour; --no-isam2: a quarter of that;
+               --seeds, --seed, --only simulated|data|hard|NAME,...
+    paper      the 2013 paper's evaluation, pose-by-pose replays beside GTSAM's iSAM2 and g2o, with figures; hours,
+               goes on where it was stopped; --quick: two minutes
+    peers      our default mode against iSAM2 on all public data sets, with bars for time, long steps and quality;
+               growth to 100,000 poses, a second core, full passes against CHOLMOD, Python's share; hours;
+               --chi2-every N; --quick: two minutes
+    fuzz       mutated messages against decoders, admission and a live service: 1.4 million, half an hour
+    journal    inserts a second with each durability, in turn, at a window of 32; --folder: on the disk to measure
+    soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
+               --inserts, --minutes
+    digest     the account of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
+    all        cholesky, bus, idp, ros2 and journal
+
+    The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
+    the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.
+
+    \b
+    factorbus bench cholesky
+    factorbus bench paper --quick
+    factorbus bench every-step --only simulated --seeds 3
+    factorbus bench peers --only intel,manhattan3500
+    factorbus bench all --json > bench.json
+    """
+    folder = _folder()
+    names = BENCHES if name == "all" else (name,)
+    codes, results = {}, {}
+    for each in names:
+        note(f"bench {each}")
+        ran = subprocess.run(
+            [sys.executable, str(folder / _file(each)), *(["--json"] if as_json else []), *options],
+            stdout=subprocess.PIPE if as_json else None,
+            text=True,
+            check=False,
+        )
+        codes[each] = ran.returncode
+        if as_json:
+            results[each] = _result(each, ran)
+    if as_json:
+        document(results if name == "all" else results[name])
+    missed = [each for each, code in codes.items() if code]
+    if missed:
+        note(f"bench: {', '.join(missed)} failed or missed a target")
+    return FAILED if missed else OK
+
+
+def _folder() -> Path:
+    """tests/bench of the checkout that this package is installed from.  Raises Stopped."""
+    folder = Path(__file__).resolve().parents[4] / "tests" / "bench"
+    if not all((folder / _file(name)).is_file() for name in (*BENCHES, *ASKED, *LONG)):
+        raise Stopped(
+            "no_repository",
+            "the benchmarks are not part of the installed package: clone the repository and run `make bench` there",
+        )
+    return folder
+
+
+def _file(name: str) -> str:
+    """The file of a benchmark."""
+    return f"{name.replace('-', '_')}.py"
+
+
+def _result(name: str, ran: "subprocess.CompletedProcess[str]") -> object:
+    try:
+        return json.loads(ran.stdout)
+    except json.JSONDecodeError:
+        raise Stopped("bench_failed", f"bench {name} ended with exit code {ran.returncode} and no result") from None

@@ -1,0 +1,98 @@
+"""`factorbus convert`: from one file format to another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from factorbus.cli.process.options import file_argument, json_option
+from factorbus.cli.process.reading import COUNTED, IDS, read_graph, reading_options, robot_option, say
+from factorbus.wording import counted
+
+if TYPE_CHECKING:
+    from factorbus.formats import GraphFile
+
+_WRITES = (".g2o", ".tum", ".kitti")
+
+
+@click.command()
+@file_argument("source")
+@file_argument("target")
+@reading_options
+@robot_option
+@click.option(
+    "--ids",
+    type=click.Choice(IDS),
+    default="auto",
+    show_default=True,
+    help="Of a .g2o: auto, as in SOURCE; ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...",
+)
+@json_option
+def command(
+    source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str, as_json: bool
+) -> None:
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++ or TUM text) and write TARGET (.g2o, .tum or .kitti, by its ending).
+
+    What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
+    letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
+
+    \b
+    factorbus convert w10000.graph w10000.g2o
+    factorbus convert estimate.g2o estimate.tum
+    factorbus convert two-robots.g2o a.tum --robot a
+    factorbus convert edges.txt edges.g2o --dialect slam++
+    """
+    if target.suffix not in _WRITES:
+        raise click.BadParameter(
+            f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
+        )
+    if robot is not None and target.suffix == ".g2o":
+        raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
+    from factorbus.cli.output.console import document, note
+
+    graph = read_graph(source, dialect, strict)
+    _check_any(graph, target)
+    files, notes, counts = _written(graph, target, strict, robot, ids)
+    say(target, notes)
+    if as_json:
+        about = {"source": str(source), "read": graph.account(whole=True), "files": [str(file) for file in files]}
+        document({**about, "notes": list(notes), **counts})
+    told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
+    note(f"{', '.join(map(str, files))}: {told}")
+
+
+def _check_any(graph: "GraphFile", target: Path) -> None:
+    """Raises FormatError where nothing of `graph` would be in `target`."""
+    from factorbus.formats import FormatError
+
+    if target.suffix == ".g2o" and not (graph.batch.variable_count or graph.batch.factor_count):
+        raise FormatError(
+            graph.path, None, "nothing that a .g2o would have", "at least one vertex or edge that is read"
+        )
+    if target.suffix != ".g2o" and not graph.poses:
+        raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
+
+
+def _written(
+    graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
+) -> tuple[list[Path], tuple[str, ...], dict[str, int]]:
+    """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
+    from factorbus.formats import tum_notes, write_g2o, write_kitti, write_tum
+    from factorbus.formats.left_out import LeftOut
+    from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
+
+    counts = {"poses": graph.poses, "landmarks": graph.landmarks, "factors": graph.batch.factor_count}
+    if target.suffix == ".g2o":
+        same = graph.numbering if graph.numbering != "ids" else "auto"
+        return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids), counts
+    form = target.suffix[1:].upper()
+    found = trajectories(graph.batch, form)
+    chosen = [one_trajectory(graph.batch, form, robot)] if robot is not None else list(found.values())
+    left = LeftOut(str(target))
+    for name in ("landmarks", "factors"):
+        left.drop(name, counts[name], "a trajectory has poses alone")
+    left.drop("poses", graph.poses - sum(map(len, chosen)), f"of other robots than {robot!r}")
+    write, notes = (write_tum, tum_notes) if form == "TUM" else (write_kitti, lambda *_: ())
+    untold = sum(len(untimed(rows)) for rows in chosen) if form == "TUM" else 0
+    written = {"poses": sum(map(len, chosen)) - untold, "landmarks": 0, "factors": 0}
+    return write(target, graph.batch, robot), (*left.notes, *notes(graph.batch, robot)), written

@@ -1,0 +1,152 @@
+"""`factorbus journal`: what is on disk of a service's maps, if it is sound, and if it gives the same again."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.output import console as screen
+from factorbus.cli.output.exits import FAILED, OK, require
+from factorbus.cli.process.options import json_option
+from factorbus.wording import counted
+
+_MAP = click.argument("names", nargs=-1, metavar="[MAP ...]")
+_FOLDER = click.option(
+    "--journal",
+    "folder",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="The folder that `factorbus serve` has.",
+)
+
+
+@click.group()
+def command() -> None:
+    """The journals of `factorbus serve --journal DIR`. They are only read, also while a service is at work.
+
+    \b
+    factorbus journal show --journal /var/lib/factorbus
+    factorbus journal check --journal /var/lib/factorbus
+    factorbus journal verify warehouse --journal /var/lib/factorbus
+    """
+
+
+@command.command()
+@_MAP
+@_FOLDER
+@json_option
+def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
+    """What there is of MAP, or of every map."""
+    rows = []
+    for name, store in _stores(folder, names):
+        header, last = store.header(), store.last()
+        counts = store.counts()
+        rows.append(
+            {"map": name, "mode": header.mode, "epoch": header.epoch, "revision": last.revision, **counts}
+            | {"snapshots": [saved.fold for saved in store.snapshots()], "durability": header.durability}
+            | {"epochs": [epoch.because for epoch in header.epochs], "closed_in_order": header.clean}
+        )
+    if as_json:
+        screen.document({"maps": rows})
+    for row in () if as_json else rows:
+        screen.table([(key, str(value)) for key, value in row.items() if key != "map"], title=row["map"])
+
+
+@command.command()
+@_MAP
+@_FOLDER
+def check(names: tuple[str, ...], folder: Path) -> int:
+    """Is it sound: the database, every insert's bytes, every client's numbers, every snapshot? Exit code 1: no."""
+    sound = True
+    for name in _names(folder, names):
+        wrong = list(_wrong_with(folder / name))
+        click.echo(f"{name}: {'sound' if not wrong else 'NOT SOUND'}")
+        for each in wrong:
+            click.echo(f"  {each}")
+        sound = sound and not wrong
+    return OK if sound else FAILED
+
+
+def _wrong_with(folder: Path) -> Iterator[str]:
+    """What is wrong with the journal in `folder`, also where it does not open."""
+    from factorbus.journal.snapshots import file_of, read_snapshot
+    from factorbus.proto.problems import Problem
+
+    try:
+        with _open(folder) as store:
+            yield from store.check()
+            for saved in store.snapshots():
+                try:
+                    read_snapshot(file_of(store.path.parent, saved.fold))
+                except (OSError, ValueError) as error:
+                    yield f"{error}; the map opens without it, and takes longer"
+    except Problem as problem:
+        yield str(problem.detail.get("what") or problem.message)
+
+
+@command.command()
+@_MAP
+@_FOLDER
+def verify(names: tuple[str, ...], folder: Path) -> int:
+    """Fold everything in again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
+
+    Another processor, or another version of factorbus, may well round otherwise: then the first revision is named at
+    which the values differ.
+    """
+    require("service", "factorbus journal verify")
+    from factorbus.service.config import Limits
+    from factorbus.service.journal.library import make_folder
+    from factorbus.service.journal.recovery import verify as run_again
+
+    alike = True
+    for name, store in _stores(folder, names):
+        header, total = store.header(), store.last().fold
+        again = make_folder(header.mode, header.options, header.epoch, Limits())
+        revision, differs = 0, 0
+        with screen.progress(name, total) as show_progress:
+            for fold, same in run_again(store, again):
+                revision = fold.revision
+                differs = differs or (0 if same else revision)
+                show_progress(fold.number, f"revision {revision}")
+        if differs:
+            click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
+        else:
+            click.echo(f"{name}: {counted(total, 'fold')}, {counted(revision, 'revision')}, all the same to the bit")
+        alike = alike and not differs
+    return OK if alike else FAILED
+
+
+def _stores(folder: Path, names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
+    """Each of `names`, or each there is, with its journal open for reading.  Raises Problem."""
+    for name in _names(folder, names):
+        with _open(folder / name) as store:
+            yield name, store
+
+
+def _names(folder: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """`names`, or those of all maps in `folder`.  Raises NoJournal."""
+    from factorbus.journal.folders import maps_in
+    from factorbus.journal.problems import NoJournal
+    from factorbus.journal.store import NAME
+
+    there = tuple(maps_in(folder, NAME)) if folder.is_dir() else ()
+    if not there:
+        raise NoJournal(folder)
+    for name in names:
+        if name not in there:
+            raise NoJournal(folder / name, there)
+    return names or there
+
+
+@contextmanager
+def _open(folder: Path) -> Iterator[Any]:
+    from factorbus.journal.store import open_store
+
+    store = open_store(folder, read_only=True)
+    try:
+        yield store
+    finally:
+        store.close()

@@ -1,0 +1,44 @@
+"""`factorbus maps`: the maps that there are."""
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+from factorbus.cli.process.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.wording import counted
+
+if TYPE_CHECKING:
+    from factorbus.client.map import MapRow
+
+
+@click.command()
+@connect_option
+@zenoh_option
+@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For the answer.")
+@json_option
+def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
+    """List the maps of the service at ENDPOINT; at a router, those of all services.
+
+    The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
+
+    \b
+    factorbus maps
+    factorbus maps --connect tls/solver.local:7447 --zenoh ops.json5 --json
+    """
+    from factorbus.cli.output import console as screen
+    from factorbus.cli.process.bus import open_bus
+
+    with open_bus(endpoint, "maps", zenoh, wait_s) as bus:
+        rows = sorted(bus.maps(), key=lambda row: row.name)
+    if as_json:
+        screen.document({"maps": [asdict(row) for row in rows]})
+    elif rows:
+        screen.table([(row.name, _told(row)) for row in rows])
+    else:
+        screen.note(f"there is no map at {endpoint} yet")
+
+
+def _told(row: "MapRow") -> str:
+    held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
+    return f"{held}, revision {row.revision:,}, mode {row.mode}"

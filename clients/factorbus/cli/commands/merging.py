@@ -1,0 +1,115 @@
+"""`factorbus change merge`: another map into this one."""
+
+from typing import Any
+
+import click
+
+from factorbus.cli.output.advice import MERGING, advising
+from factorbus.cli.output.console import document, table
+from factorbus.cli.output.exits import OK
+
+
+@click.argument("other")
+@click.option("--from", "source", metavar="ENDPOINT", help="The service that has OTHER.  [default: that of --connect]")
+@click.option("--letter", "letters", multiple=True, metavar="OLD=NEW", help="Keys of OTHER get another letter: x=y.")
+@click.option(
+    "--anchor",
+    "anchors",
+    nargs=3,
+    multiple=True,
+    metavar="POSE OTHERS Z",
+    help="Where the other map's pose (its new key) is, seen from one of NAME: x,y,theta or x,y,z,qx,qy,qz,qw.",
+)
+@click.option("--frame", metavar="T", help="Where the origin of OTHER is in NAME, if there is no anchor; as above.")
+@click.option(
+    "--sigmas",
+    metavar="S",
+    help="Standard deviations of anchors or frame: 0.1,0.1,0.05; in space six, metres then radians.",
+)
+@click.option(
+    "--absolute",
+    type=click.Choice(["refuse", "leave-out", "keep"]),
+    default="refuse",
+    show_default=True,
+    help="What OTHER knows of its own frame, beyond where it begins.",
+)
+def merge_command(
+    name: str, other: str, source: str | None, letters: tuple[str, ...], anchors: tuple[tuple[str, str, str], ...],
+    frame: str | None, sigmas: str | None, absolute: str, connect: str, zenoh: str, timeout_s: float, settle: bool,
+    as_json: bool,
+) -> int:  # fmt: skip
+    """Take all of map OTHER into NAME: its keys renamed, in NAME's frame, held by the anchors. OTHER stays as it is.
+
+    All of it happens or none. One fixed pose, or one prior of a pose, is what a map has to begin with, and is left out.
+    More than that (positions, headings, more priors) would be wrong in another frame: it is refused, left out with
+    `--absolute leave-out`, or kept with `--absolute keep` if both maps have one frame.
+
+    \b
+    factorbus change merge hall robot2 --letter x=y --anchor x5 y8 0,2,-1.57 --sigmas 0.1,0.1,0.05 --settle
+    factorbus change merge hall yard --from tcp/10.0.0.7:7447 --letter x=z --frame 12,-3,0.5 --sigmas 1,1,0.1
+    """
+    from factorbus.cli.process.bus import open_bus
+
+    how = {
+        "letters": dict(_pair(each) for each in letters),
+        "anchors": _draft(anchors, sigmas) if anchors else None,
+        "frame": _numbers("--frame", frame) if frame else None,
+        "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
+        "absolute": absolute.replace("-", "_"),
+    }
+    with open_bus(connect, "change", zenoh, timeout_s) as bus:
+        with (
+            open_bus(source or connect, "change", zenoh, timeout_s) as there,
+            there.map(other, mirror=False, create=False) as theirs,
+        ):
+            graph = theirs.graph(timeout_s)
+        with advising(MERGING), bus.map(name, mirror=False, create=False) as joined:
+            merged = joined.merge(graph, settle=settle, **how)
+    _show(merged, as_json)
+    return OK
+
+
+def _show(merged: Any, as_json: bool) -> None:
+    accepted, fitted = merged.accepted, merged.fitted
+    counted = {
+        "variables": fitted.batch.variable_count,
+        "factors": fitted.batch.factor_count,
+        "anchors": fitted.anchors,
+        **{f"left_out_{kind}": count for kind, count in fitted.left_out.items()},
+    }
+    chi2 = accepted.report.get("chi2", float("nan"))
+    if as_json:
+        frame = fitted.frame.tolist()
+        where = {"revision": accepted.revision, "first_factor": accepted.first_factor, "chi2": chi2, "frame": frame}
+        document(where | counted)
+        return
+    rows = [(what.replace("_", " "), str(count)) for what, count in counted.items()]
+    where = " ".join(f"{number:.4g}" for number in fitted.frame)
+    table([*rows, ("its origin", where), ("χ²", f"{chi2:.6g}")], title=f"At revision {accepted.revision}")
+
+
+def _draft(anchors: tuple[tuple[str, str, str], ...], sigmas: str | None) -> Any:
+    from factorbus.client import Draft
+
+    if sigmas is None:
+        raise click.UsageError("--anchor says where, and nothing how certain; give --sigmas")
+    draft = Draft()
+    for here, there, measured in anchors:
+        z = _numbers("--anchor", measured)
+        kind = "between_se2" if len(z) == 3 else "between_se3"
+        draft.factor(kind, (here, there), z, sigmas=_numbers("--sigmas", sigmas))
+    return draft
+
+
+def _numbers(option: str, text: str) -> list[float]:
+    try:
+        return [float(each) for each in text.split(",")]
+    except ValueError:
+        raise click.UsageError(f"{option} is {text!r}; wanted numbers with commas between: 0,2,-1.57") from None
+
+
+def _pair(text: str) -> tuple[str, str]:
+    old, equals, new = text.partition("=")
+    if not equals:
+        raise click.UsageError(f"--letter is {text!r}; wanted OLD=NEW, such as x=y")
+    return old, new

@@ -1,0 +1,178 @@
+"""`factorbus plot`: pictures of maps, drives and systems, from files and from the bus."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from factorbus.cli.output.exits import require
+from factorbus.cli.process.options import ellipses_option, mode_option, out_option, zenoh_option
+from factorbus.cli.process.reading import reading_options
+from factorbus.wording import counted
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_FROM_BUS = "SOURCE is a map of the service at ENDPOINT."
+
+
+@click.group()
+def command() -> None:
+    """Draw into a .png, .svg or .pdf file, in colours that colour-blind readers can tell apart.
+
+    SOURCE is a graph file (g2o, TORO, iSAM, SLAM++), the name of a data set, or with --connect the name of a map on
+    the bus. What of a file is left out is said.
+
+    \b
+    factorbus plot map town.g2o --solve
+    factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --out warehouse.svg
+    factorbus plot drive town.g2o
+    factorbus plot sparsity town.g2o
+    factorbus plot tree town.g2o
+    """
+
+
+def _source(command: F) -> F:
+    return click.argument("source")(
+        click.option("--connect", metavar="ENDPOINT", help=_FROM_BUS)(zenoh_option(reading_options(command)))
+    )
+
+
+def _out(what: str) -> Callable[[F], F]:
+    return out_option("--out", "out", f"The picture.  [default: SOURCE-{what}.png here]", "FILE.png")
+
+
+@command.command("map")
+@_source
+@click.option("--solve", is_flag=True, help="Draw the optimum of the graph, found here, instead of the file's values.")
+@ellipses_option(0)
+@_out("map")
+def map_command(
+    source: str,
+    connect: str | None,
+    zenoh: str,
+    dialect: str | None,
+    strict: bool,
+    solve: bool,
+    ellipses: int,
+    out: Path | None,
+) -> None:
+    """Trajectory, landmarks, loop closures, and where odometry alone would have led.
+
+    \b
+    factorbus plot map intel --solve --out intel.pdf
+    factorbus plot map victoria_park --solve --ellipses 60
+    factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
+    """
+    from factorbus.cli.driving.picture import draw
+    from factorbus.cli.driving.plot_source import graph_of, placed, solved, spread_in
+    from factorbus.viz import Course
+
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    drawn = solved(drawn, on_file=connect is None) if solve else placed(drawn)
+    path = drawn.file("map", out)
+    spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
+    draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)
+    click.echo(path)
+
+
+@command.command("drive")
+@click.argument("source")
+@reading_options
+@mode_option
+@click.option(
+    "--every",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Solve from scratch at every Nth step, to hold χ² against.  [default: ten times]",
+)
+@_out("drive")
+def drive_command(
+    source: str, dialect: str | None, strict: bool, mode: str, every: int | None, out: Path | None
+) -> None:
+    """Drive SOURCE through a map in this process: χ² beside the batch optimum, and the time of each step.
+
+    \b
+    factorbus plot drive intel --mode bayes-tree --out intel-drive.svg
+    """
+    from factorbus.cli.driving.plot_source import file_of
+
+    require("service", "factorbus plot drive")
+    file = _ready(lambda: file_of(source, dialect, strict), out)
+    from factorbus.cli.driving.drive import drive
+    from factorbus.cli.driving.local import LocalMap
+    from factorbus.cli.driving.picture import course_of
+    from factorbus.cli.output.console import progress
+    from factorbus.solver import warm
+    from factorbus.viz import drive_figure, save
+
+    warm()  # so that the first steps do not load kernels
+    target = LocalMap(mode)
+    with progress(Path(file.path).name, file.poses) as show:
+        driven = drive(target, file.steps(), max(file.poses // 10, 1) if every is None else every, show)
+    reports = [step.report for step in driven.steps]
+    name = Path(file.path).stem
+    path = out or Path(f"{name}-drive.png")
+    about = f"{counted(driven.poses, 'pose')}, {counted(driven.factors, 'factor')}, mode {reports[-1]['mode']}"
+    figure = drive_figure(
+        course_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
+    )
+    save(figure, path, name)
+    click.echo(path)
+
+
+@command.command("sparsity")
+@_source
+@_out("sparsity")
+def sparsity_command(
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+) -> None:
+    """Λ in the order of keys, Λ in the order of elimination, and the fill-in of its factor R.
+
+    \b
+    factorbus plot sparsity intel
+    """
+    from factorbus.cli.driving.plot_source import graph_of
+
+    require("service", "factorbus plot sparsity")
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    from factorbus.cli.output.sparsity import pattern_of
+    from factorbus.viz import save, sparsity_figure
+
+    path = drawn.file("sparsity", out)
+    save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
+    click.echo(path)
+
+
+@command.command("tree")
+@_source
+@_out("tree")
+def tree_command(
+    source: str, connect: str | None, zenoh: str, dialect: str | None, strict: bool, out: Path | None
+) -> None:
+    """The elimination tree of Λ, and what of it the last loop closure makes anew.
+
+    \b
+    factorbus plot tree intel
+    """
+    from factorbus.cli.driving.plot_source import graph_of
+
+    require("service", "factorbus plot tree")
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    from factorbus.cli.output.sparsity import last_loop, pattern_of
+    from factorbus.viz import save, tree_figure
+
+    path = drawn.file("tree", out)
+    pattern = pattern_of(drawn.graph)
+    save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
+    click.echo(path)
+
+
+def _ready(load: Callable[[], Any], out: Path | None) -> Any:
+    """What `load` gives, once it is known that a picture can be drawn where it is to go."""
+    require("viz", "factorbus plot")
+    from factorbus.viz import checked_ending
+
+    if out is not None:
+        checked_ending(out)
+    return load()

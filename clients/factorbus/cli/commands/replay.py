@@ -1,0 +1,366 @@
+"""`factorbus replay`: a graph file or a data set through a map, pose by pose, as a robot would have sent it."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.output.exits import REFUSED, Stopped, lacking, require
+from factorbus.cli.output.starts import optimum_from, ratio_to
+from factorbus.cli.process.options import (
+    SECONDS,
+    Number,
+    file_argument,
+    json_option,
+    mode_option,
+    out_option,
+    zenoh_option,
+)
+from factorbus.cli.process.reading import COUNTED, read_graph, reading_options
+from factorbus.wording import counted
+
+_ANSWER_S, _LISTENING_S = 10.0, 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the command line asked for."""
+
+    file: Path
+    in_process: bool
+    connect: str | None
+    wait_s: float | None
+    map_name: str
+    mode: str
+    every: int
+    window: int
+    use_values: bool
+    settle: bool
+    adopt: bool
+    tum: Path | None
+    kitti: Path | None
+    out: Path | None
+    plot: Path | None
+    client: str = "replay"
+    zenoh: str = ""
+    live: bool = False
+    port: int = 8080
+    pace: float | None = None
+    dialect: str | None = None
+    strict: bool = False
+
+    @property
+    def where(self) -> str:
+        """In words."""
+        if self.in_process:
+            return "this process"
+        return f"map {self.map_name} at {self.connect}" if self.connect else "a solver process of its own"
+
+
+@click.command()
+@file_argument("file")
+@click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
+@click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
+@zenoh_option
+@click.option(
+    "--client", default="replay", show_default=True, metavar="NAME", help="Who we are, where access control asks."
+)
+@click.option(
+    "--wait",
+    "wait_s",
+    type=SECONDS,
+    metavar="S",
+    help="Wait so long for a service to be there.  [default: 1 where nobody listens, else 10]",
+)
+@click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
+@mode_option
+@click.option(
+    "--every",
+    type=click.IntRange(0),
+    default=0,
+    metavar="N",
+    help="Hold χ² against the batch optimum at every Nth step; 0: never.",
+)
+@click.option("--window", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Inserts in flight.")
+@click.option("--use-values", is_flag=True, help="Start from the file's vertex values, not from composed odometry.")
+@click.option("--settle/--no-settle", default=True, show_default=True, help="At the end, iterate until converged.")
+@click.option(
+    "--adopt/--no-adopt",
+    default=True,
+    show_default=True,
+    help="With --settle: go to the optimum found from scratch where that is better by more than 1 %.",
+)
+@click.option("--live", is_flag=True, help="Show the map in a browser as it grows; afterwards stay until Ctrl-C.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="Of the page with --live; 0: any."
+)
+@click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
+@out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
+@out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
+@out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
+@out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
+@reading_options
+@json_option
+def command(as_json: bool, **asked: Any) -> None:
+    """Drive FILE (g2o, TORO .graph, iSAM or SLAM++ text, or the name of a data set) through a map, pose by pose.
+
+    Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
+    there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
+
+    \b
+    factorbus replay intel
+    factorbus replay intel.g2o --every 100 --plot intel.png
+    factorbus replay intel.g2o --live --pace 100
+    factorbus replay intel.g2o --connect tcp/127.0.0.1:7447 --map lab --tum lab.tum
+    factorbus replay intel.g2o --in-process --json
+
+    \b
+    In the result, per insert or step:
+      step_ms      the step in the solver
+      bus_ms       from sending the insert to having its answer and its delta here, beyond the solver's own time
+                   (staging and step); with --window above 1, from sending to the answer, queueing included
+      chi2         Σ rᵀ Ω r at the end; chi2_initial: of composed odometry, before any step
+      against_batch  χ² over that of the optimum found from scratch, and what led to it (start): the map's own values
+                   (with --use-values the file's), composed odometry or averaged rotations, whichever ends lowest;
+                   batch_converged false: its search ended before it had converged, the true optimum may be lower
+      adopted      null, or what the map left for a better optimum at the end (better_optimum)
+    """
+    request = Request(**asked)
+    if request.in_process and request.connect:
+        raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
+    if request.in_process and request.live:
+        raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
+    if request.out is not None and request.out.suffix != ".g2o":
+        raise click.BadParameter(f"{request.out} does not end in .g2o", param_hint="--out")
+    from factorbus.cli.output import console as screen
+
+    def told(result: dict[str, Any]) -> None:
+        if as_json:
+            screen.document(result)
+        else:
+            screen.table(_rows(result), title=f"{request.file}, in {request.where}")
+
+    replay(request, told)
+
+
+def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
+    """Do it, with progress on standard error; returns the document, and hands it to `told` while the map is there."""
+    from factorbus.cli.driving.drive import drive
+    from factorbus.cli.driving.replay_source import source_of
+    from factorbus.cli.output import console as screen
+
+    if request.plot:
+        require("viz", "--plot")
+        from factorbus.viz import checked_ending
+
+        checked_ending(request.plot)
+    if request.live:
+        require("gateway", "--live")
+    request = replace(request, file=source_of(request.file))
+    graph = read_graph(request.file, request.dialect, request.strict)
+    steps = graph.steps(use_values=request.use_values)
+    with _target(request) as target:
+        before = target.account()
+        with screen.progress(request.file.name, steps.poses) as show:
+            driven = drive(target, _paced(steps, request.pace), request.every, show)
+        unsettled = target.chi2()
+        last = target.settle() if request.settle else driven.steps[-1]
+        adopted = None
+        if request.settle and request.adopt:
+            last, adopted = _adopt(request, target, last)
+        written = _write(request, target, graph.numbering)
+        if request.plot:
+            _draw(request.plot, request.file.name, driven, target, steps)
+        result = _document(request, driven, target, steps, last, unsettled, before)
+        result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
+        told(result)
+        if request.live:
+            _stay()
+    return result
+
+
+def _adopt(request: Request, target: Any, last: Any) -> tuple[Any, dict[str, Any] | None]:
+    """The optimum found from scratch, if it is better than where the map has settled; says so."""
+    from factorbus.cli.output.console import note
+
+    found = target.optimum()
+    if found.notice is None:
+        return last, None
+    last = target.adopt(found)
+    told = f"better_optimum: χ² {found.chi2:.6g} where the map had settled; it is now at the"
+    there = optimum_from(found.start, request.use_values, found.batch_converged)
+    note(f"{told} {there}; χ² {last.report['chi2']:.6g}")
+    return last, {"code": found.notice.code, **found.as_dict(), "chi2_adopted": last.report["chi2"]}
+
+
+def _document(
+    request: Request, driven: Any, target: Any, steps: Any, last: Any, unsettled: float, before: Any
+) -> dict[str, Any]:
+    """What was measured."""
+    measured, after = driven.measures(), target.account()
+    return {
+        "file": str(request.file),
+        "where": request.where,
+        **measured,
+        "revision": last.revision,
+        "chi2": last.report["chi2"] if request.settle else unsettled,
+        "chi2_unsettled": unsettled,
+        "chi2_initial": _chi2_initial(steps),
+        "settled": bool(request.settle and last.report["converged"]),
+        "settle_iterations": last.report["iterations"] if request.settle else 0,
+        "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
+        "kernels_compiled_s": after["kernels_compiled_s"],
+        "deltas": after["deltas"],
+        "use_values": request.use_values,
+        "against_batch": [each.as_dict() for each in target.compared()],
+    }
+
+
+@contextmanager
+def _target(request: Request) -> Iterator[Any]:
+    """The map to drive into: here, in a service of our own, or in one that runs."""
+    if request.in_process:
+        require("service", "factorbus replay --in-process")
+        from factorbus.cli.driving.local import LocalMap
+
+        yield LocalMap(request.mode)
+        return
+    from factorbus.cli.driving.remote import RemoteMap
+    from factorbus.cli.output.console import note
+    from factorbus.cli.process.children import gateway, service, worker
+    from factorbus.cli.process.stopping import interrupt_on_sigterm
+    from factorbus.client import connect
+
+    with ExitStack() as stack:
+        stack.enter_context(interrupt_on_sigterm())
+        endpoint, solver = request.connect, None
+        if endpoint is None:
+            require("service", "factorbus replay without --connect")
+            solver, endpoint = stack.enter_context(service(say=note))
+            note(f"solver process {solver.pid} on {endpoint}")
+            if request.every:
+                stack.enter_context(worker(endpoint, "worker1"))
+        bus = stack.enter_context(
+            connect(
+                endpoint,
+                client=request.client,
+                zenoh=request.zenoh,
+                timeout_s=_ANSWER_S if request.wait_s is None else request.wait_s,
+                listening_s=_LISTENING_S if request.wait_s is None else None,
+            )
+        )
+        if solver is not None:
+            solver.when_ended(bus.close)
+        joined = stack.enter_context(bus.map(request.map_name, mode=request.mode, window=request.window))
+        if joined.estimate.revision > 0:
+            raise Stopped(
+                "map_not_empty",
+                f"map {request.map_name!r} is at revision {joined.estimate.revision} already; "
+                "a replay needs an empty one: give another --map",
+                REFUSED,
+                map=request.map_name,
+            )
+        if request.live:
+            page = stack.enter_context(gateway(endpoint, request.port, request.zenoh))
+            note(f"the map, live: {page}/#{request.map_name}")
+        target = RemoteMap(joined, request.window)
+        stack.callback(target.close)
+        yield target
+
+
+def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
+    """The same steps, at most so many a second."""
+    begun = time.monotonic()
+    for number, step in enumerate(steps):
+        if pace_hz is not None:
+            time.sleep(max(0.0, begun + number / pace_hz - time.monotonic()))  # the pace that was asked for
+        yield step
+
+
+def _stay() -> None:
+    """Until Ctrl-C or SIGTERM."""
+    from factorbus.cli.output.console import note
+    from factorbus.cli.process.stopping import stop_on_signals, wait_until
+
+    with stop_on_signals(until_eof=False) as stop:
+        note("the page stays until Ctrl-C")
+        wait_until(stop)
+
+
+def _write(request: Request, target: Any, numbering: str) -> list[Path]:
+    """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
+    from factorbus.cli.output.console import note
+    from factorbus.cli.process.reading import say
+    from factorbus.formats import write_g2o, write_kitti, write_tum
+    from factorbus.proto.messages import Batch
+
+    files: list[Path] = []
+    if request.out:
+        ids = numbering if numbering != "ids" else "auto"
+        say(request.out, write_g2o(request.out, target.graph(), request.strict, ids))
+        files.append(request.out)
+    for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
+        if path:
+            robots = write(path, Batch(target.estimate()))
+            if robots != [path]:
+                note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
+            files += robots
+    return files
+
+
+def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
+    from factorbus.cli.driving.picture import course_of, draw
+
+    reports = [step.report for step in driven.steps]
+    draw(path, steps, target.estimate(), course_of(reports, target.compared()), title)
+
+
+def _chi2_initial(steps: Any) -> float | None:
+    """χ² before any step, by the solver; None in a light client, which has none."""
+    if lacking("service"):
+        return None
+    from factorbus.cli.driving.local import chi2_unsolved
+
+    return chi2_unsolved(steps)
+
+
+def _size(result: dict[str, Any]) -> str:
+    return ", ".join(counted(result[many], one) for many, one in COUNTED)
+
+
+def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
+    step, bus = result["step_ms"], result["bus_ms"]
+    rows = [
+        ("graph", _size(result)),
+        ("time", f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s"),
+        ("solver CPU", f"{result['solver_cpu_s']:.2f} s"),
+        ("step", _times(step)),
+    ]
+    if bus:
+        rows.append(("bus", _times(bus)))
+        rows.append(("estimates received", f"{result['deltas']}, at revision {result['revision']}"))
+    initial = "" if result["chi2_initial"] is None else f", {result['chi2_initial']:.6g} by odometry"
+    rows.append(("χ²", f"{result['chi2']:.8g}, {result['chi2_unsettled']:.8g} after the last step{initial}"))
+    for each in result["against_batch"]:
+        by = f"{_optimum(each, result)}; {each['worker']}, {each['seconds']:.2f} s"
+        worse = "  better_optimum" if each["better_optimum"] else ""
+        rows.append((f"χ² / batch at {each['revision']}", f"{ratio_to(each['chi2'], each['batch'])}  ({by}){worse}"))
+    if result["adopted"]:
+        was = f"{result['adopted']['chi2']:.8g}, {_optimum(result['adopted'], result)}"
+        rows.append(("better_optimum", f"adopted: χ² was {was}"))
+    rows.append(("strategies", ", ".join(f"{name} {count}" for name, count in result["strategies"].items())))
+    if result["kernels_compiled_s"] > 0.1:
+        rows.append(("compiling", f"{result['kernels_compiled_s']:.1f} s, once on this machine"))
+    return rows
+
+
+def _optimum(compared: dict[str, Any], result: dict[str, Any]) -> str:
+    return optimum_from(compared["start"], result["use_values"], compared["batch_converged"])
+
+
+def _times(times: dict[str, float]) -> str:
+    return f"p50 {times['p50']:.2f}   p95 {times['p95']:.2f}   p99 {times['p99']:.2f}   max {times['max']:.2f} ms"

@@ -1,0 +1,132 @@
+"""`factorbus ros2`: a robot that speaks ROS 2 over Zenoh, on a map."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+from factorbus.cli.output.exits import require
+from factorbus.cli.output.logs import begin, log_option
+from factorbus.cli.process.children import READY
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, zenoh_option
+
+DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical")
+# The interpreter's default, 5 ms, is what a transform would wait for while a path is being drawn.
+_SWITCH_S = 0.0005
+
+
+@click.command()
+@click.argument("map_name", metavar="MAP")
+@click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="Ours.")
+@click.option("--ros", metavar="ENDPOINT", help="The robot's Zenoh router (rmw_zenohd).  [default: as --connect]")
+@click.option(
+    "--domain", type=click.IntRange(0, 232), default=0, show_default=True, envvar="ROS_DOMAIN_ID", show_envvar=True
+)
+@click.option("--distro", type=click.Choice(DISTRIBUTIONS), default="jazzy", show_default=True, help="Of the robot.")
+@click.option("--namespace", default="/", show_default=True, metavar="NAME", help="Of our node; topics are as given.")
+@click.option("--node", "node_name", default="factorbus", show_default=True, metavar="NAME", help="Of our node.")
+@click.option("--odom", default="/odom", show_default=True, metavar="TOPIC", help="nav_msgs/Odometry, to read.")
+@click.option(
+    "--pose", "poses", multiple=True, metavar="TOPIC",
+    help="geometry_msgs/PoseWithCovarianceStamped, to read.  [default: /initialpose]",
+)  # fmt: skip
+@click.option(
+    "--landmarks", multiple=True, metavar="TOPIC",
+    help="vision_msgs/Detection3DArray, to read.  [default: /detections]",
+)  # fmt: skip
+@click.option("--tf", default="/tf", show_default=True, metavar="TOPIC", help="Where map to odometry goes.")
+@click.option("--path", default="/factorbus/path", show_default=True, metavar="TOPIC", help="Where nav_msgs/Path goes.")
+@click.option(
+    "--markers", default="/factorbus/markers", show_default=True, metavar="TOPIC",
+    help="Where visualization_msgs/MarkerArray goes.",
+)  # fmt: skip
+@click.option("--map-frame", default="map", show_default=True, metavar="FRAME")
+@click.option("--space", is_flag=True, help="Poses in space (se3, point3), not in the plane (se2, point2).")
+@click.option("--letter", default="x", show_default=True, metavar="LETTER", help="Of this robot's keys: one for each.")
+@click.option(
+    "--start", type=click.Choice(("odometry", "pose")), default="odometry", show_default=True,
+    help="Where the map begins: where odometry does, or with the first pose that is told.",
+)  # fmt: skip
+@click.option(
+    "--keyframe", nargs=2, type=Number(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
+    metavar="METRES RADIANS", help="A pose of the map for so much way or turn.",
+)  # fmt: skip
+@click.option(
+    "--mount",
+    "mounts",
+    multiple=True,
+    metavar="FRAME=x,y,z,qx,qy,qz,qw",
+    help="Where a sensor's frame is on the robot.",
+)
+@click.option(
+    "--drift", nargs=2, type=Number(min=0, min_open=True), default=(0.02, 0.02), show_default=True,
+    metavar="PER_METRE PER_RADIAN", help="Odometry is not believed to be better than this.",
+)  # fmt: skip
+@click.option("--tolerance", default=0.1, show_default=True, metavar="SECONDS", help="Transforms are stamped ahead.")
+@click.option("--display", default=1.0, show_default=True, metavar="SECONDS", help="Least time between paths.")
+@zenoh_option
+@log_option
+@click.option("--quiet", is_flag=True, help="Log warnings only.")
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+def command(
+    map_name: str,
+    endpoint: str,
+    ros: str | None,
+    domain: int,
+    distro: str,
+    namespace: str,
+    node_name: str,
+    log_form: str,
+    quiet: bool,
+    until_eof: bool,
+    zenoh: str,
+    **given: Any,
+) -> None:
+    """Join a robot that speaks ROS 2 over Zenoh (rmw_zenoh) to MAP. No ROS is needed on this side.
+
+    Reads odometry, poses with covariance and landmark detections; publishes the transform from map to odometry after
+    every step, a path and markers. Prints `ready` when the robot can begin. Until Ctrl-C.
+
+    \b
+    factorbus ros2 warehouse
+    factorbus ros2 warehouse --ros tcp/robot1.local:7447 --domain 7 --odom /robot1/odom --letter a
+    factorbus ros2 yard --space --landmarks /tags --mount camera=0.2,0,0.3,-0.5,0.5,-0.5,0.5
+
+    What is done with covariances, and more: deploy/ros2/README.md.
+    """
+    require("ros2", "factorbus ros2")
+    from factorbus.cli.process.bus import open_bus
+    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.ros2.bridge import Bridge
+    from factorbus.ros2.messages import Messages
+    from factorbus.ros2.node import open_node
+    from factorbus.ros2.settings import from_options
+
+    begin(log_form, quiet)
+    settings = from_options(**given)
+    with (
+        _switching_often(),
+        stop_on_signals(until_eof) as stop,
+        open_bus(endpoint, "ros2", zenoh) as bus,
+        bus.map(map_name) as joined,
+        open_node(
+            ros or endpoint, domain, namespace, node_name, bus.timeout_s, {}, zenoh if ros is None else ""
+        ) as node,
+    ):
+        bridge = Bridge(joined, node, Messages(distro), settings)
+        click.echo(f"{READY}{ros or endpoint}")
+        bridge.run(stop)
+        click.echo(" ".join(f"{name}={count}" for name, count in sorted(bridge.counts.items())), err=True)
+
+
+@contextmanager
+def _switching_often() -> Iterator[None]:
+    """Threads take turns after _SWITCH_S."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)

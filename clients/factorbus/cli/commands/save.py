@@ -1,0 +1,89 @@
+"""`factorbus save`: a map of a service as a file."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from factorbus.cli.output.exits import REFUSED, Stopped
+from factorbus.cli.process.options import SECONDS, checked_output, connect_option, zenoh_option
+from factorbus.cli.process.reading import IDS
+
+if TYPE_CHECKING:
+    from factorbus.client import Map
+
+_WRITES = (".g2o", ".tum", ".kitti")
+
+
+@click.command()
+@click.argument("name", metavar="MAP")
+@click.argument("target", type=click.Path(path_type=Path), callback=checked_output, metavar="FILE")
+@click.option("--robot", metavar="LETTER", help="The trajectory of this robot alone: the letter of its poses' keys.")
+@click.option(
+    "--ids",
+    type=click.Choice(IDS),
+    help="Of a .g2o: ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...  "
+    "[default: ids where x and l are all the letters, else keys]",
+)
+@connect_option
+@zenoh_option
+@click.option("--wait", "wait_s", type=SECONDS, default=60, show_default=True, metavar="S", help="For the answer.")
+def command(
+    name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, wait_s: float
+) -> None:
+    """Write MAP as it is now into FILE: the whole graph as .g2o, or trajectories as .tum or .kitti, by its ending.
+
+    A trajectory is of one robot, the letter of its poses' keys. Of several each gets a file of its own: out.tum becomes
+    out-a.tum and out-b.tum. Its times are the poses' time stamps, and where no pose has one the numbers of their keys;
+    a pose without one among others that have one is left out, and that is said.
+
+    \b
+    factorbus save warehouse warehouse.g2o
+    factorbus save warehouse counted.g2o --ids counted
+    factorbus save warehouse way.tum --robot a
+    """
+    if target.suffix not in _WRITES:
+        raise click.BadParameter(f"{target} does not end in {', '.join(_WRITES)}", param_hint="FILE")
+    if robot is not None and target.suffix == ".g2o":
+        raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
+    if ids is not None and target.suffix != ".g2o":
+        raise click.UsageError("--ids is of a .g2o: a trajectory has times instead")
+    from factorbus.cli.process.bus import open_bus
+
+    form = target.suffix.removeprefix(".")
+    with open_bus(endpoint, "save", zenoh, wait_s) as bus, bus.map(name, mirror=False, create=False) as joined:
+        robots = [] if form == "g2o" else _robots(joined, robot)
+        texts = (
+            {letter: joined.export(form, robot=letter) for letter in robots}
+            if robots
+            else {"": joined.export(form, ids=ids or "auto")}
+        )
+    for letter, text in texts.items():
+        path = target if len(texts) == 1 else target.with_name(f"{target.stem}-{letter or 'none'}{target.suffix}")
+        _write(path, text)
+        click.echo(path)
+
+
+def _robots(joined: "Map", robot: str | None) -> list[str]:
+    """The letters of the robots to write; "" for keys without one.  Raises Stopped."""
+    from factorbus.proto.symbols import symbol_parts
+
+    poses = [group.keys for group in joined.ask_estimate().variables if group.kind in ("se2", "se3")]
+    there = sorted({symbol_parts(key)[0] for keys in poses for key in keys.tolist()})
+    if robot is None:
+        return there
+    if robot not in there:
+        told = ", ".join(letter or "keys without a letter" for letter in there) or "no pose"
+        raise Stopped("several_robots", f"map {joined.name!r} has no robot {robot!r}; there is {told}", REFUSED)
+    return [robot]
+
+
+def _write(path: Path, text: str) -> None:
+    """Whole or not at all.  Raises Stopped."""
+    beside = path.with_name(f".{path.name}.part")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        beside.replace(path)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise Stopped("cannot_write", f"{path} cannot be written: {error.strerror}", path=str(path)) from error

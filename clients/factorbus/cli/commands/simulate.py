@@ -1,0 +1,61 @@
+"""`factorbus simulate`: a world with a robot in it, as a file."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.process.options import WORLDS, out_option
+from factorbus.wording import counted
+
+
+@click.command()
+@click.argument("world", type=click.Choice(WORLDS))
+@click.option("--poses", type=click.IntRange(2, 1_000_000), default=3500, show_default=True, metavar="N")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="The same seed, the same world.")
+@out_option("--out", "out", "What the robot measured, as g2o.", "FILE.g2o")
+@out_option("--truth", "truth", "Where it really was, in TUM form.", "FILE.tum")
+def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | None) -> None:
+    """Drive a robot through WORLD and write what it measured.
+
+    \b
+    manhattan    a drive on a street grid, with loop closures (SE2)
+    city-trees   the same streets, with trees seen as landmarks (SE2 and points)
+    sphere       round and round a sphere (SE3)
+
+    The file has no initial estimate but that of the first pose, which is fixed: the reader composes the others from
+    the measurements, as `factorbus replay` does.
+
+    \b
+    factorbus simulate manhattan --poses 10000 --out m10k.g2o --truth m10k.tum
+    factorbus replay m10k.g2o
+    """
+    if out is None and truth is None:
+        raise click.UsageError("there is nothing to write: give --out FILE.g2o, --truth FILE.tum or both")
+    from factorbus.cli.driving.columns import merged
+    from factorbus.cli.output import console as screen
+    from factorbus.cli.process.reading import say
+    from factorbus.formats import write_g2o, write_tum
+    from factorbus.proto.messages import Batch
+
+    batches, truths = [], []
+    with screen.progress(world, poses) as show:
+        for number, step in enumerate(_steps(world, poses, seed), 1):
+            batches.append(step.batch)
+            truths.append(Batch(step.truth))
+            if number % 1000 == 0 or number == poses:
+                show(number, "")
+    if out:
+        graph = merged(batches)
+        say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
+        screen.note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
+    if truth:
+        write_tum(truth, merged(truths))
+        screen.note(f"{truth}: {counted(poses, 'pose')}, as they are")
+
+
+def _steps(world: str, poses: int, seed: int) -> Iterator[Any]:
+    from factorbus.simulate import WORLDS as DRIVES
+
+    return DRIVES[world.replace("-", "_")](poses=poses, seed=seed)

@@ -1,0 +1,144 @@
+"""`factorbus stats`: what services count and time, asked over the bus."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import click
+
+from factorbus.cli.output.exits import FAILED, OK
+from factorbus.cli.process.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.proto.problems import UnknownMap
+from factorbus.wording import counted
+
+
+@click.command()
+@click.argument("name", metavar="[MAP]", required=False)
+@connect_option
+@zenoh_option
+@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For answers.")
+@json_option
+def command(name: str | None, endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
+    """Show how services are, what their maps hold, and how long steps and inserts take; with MAP, of that map alone.
+
+    The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
+    At a router every service answers. Where access control is on, ask as an operator. The exit code is 1 when a
+    service says that it is not alive: one of its threads is stuck.
+
+    \b
+    factorbus stats
+    factorbus stats warehouse
+    factorbus stats --connect tls/solver.local:7447 --zenoh ops.json5 --json
+    """
+    from factorbus.cli.output import console as screen
+    from factorbus.cli.process.bus import open_bus
+
+    with open_bus(endpoint, "stats", zenoh, wait_s) as bus:
+        services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
+    if name is not None:
+        services = _of_map(services, name)
+    if as_json:
+        screen.document({"services": services})
+    else:
+        for each in services:
+            screen.table(_rows(each), title=f"service {each['service']}")
+    return OK if all(each["alive"] for each in services) else FAILED
+
+
+def _of_map(services: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """The services that have map `name`, with its row alone.  Raises UnknownMap."""
+    found = []
+    for each in services:
+        own = {rows: [row for row in each.get(rows, ()) if row["name"] == name] for rows in ("maps", "unopened")}
+        if any(own.values()):
+            found.append(each | own)
+    if not found:
+        rows = [row for each in services for row in (*each["maps"], *each.get("unopened", ()))]
+        raise UnknownMap(name, sorted(row["name"] for row in rows))
+    return found
+
+
+def _rows(account: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    state = "ready" if account["ready"] else "alive, not ready" if account["alive"] else "stuck"
+    stuck = f": {', '.join(account['stuck'])}" if account["stuck"] else ""
+    yield "state", f"{state}{stuck}, for {_span(account['uptime_s'])}, version {account['version']}"
+    memory = account["memory"]
+    yield "memory", f"{memory['resident_bytes'] >> 20} MiB of {memory['limit_bytes'] >> 20} MiB"
+    workers = account.get("workers", ())
+    told = ", ".join(f"{each['name']} ({each['in_flight']} of {each['slots']})" for each in workers)
+    yield "workers", told or "none: jobs are done in place"
+    for row in account["maps"]:
+        yield f"map {row['name']}", _map(row)
+    for row in account.get("unopened", ()):
+        yield f"map {row['name']}", f"does not open ({row['state']}): {row['problem']}"
+    for name, value in _told(account.get("journal", {})):
+        yield f"journal {name}", value
+
+
+def _map(row: Mapping[str, Any]) -> str:
+    inserts = row["inserts"]
+    lines = [
+        f"{counted(row['variables'], 'variable')}, {counted(row['factors'], 'factor')}, revision {row['revision']:,}, "
+        f"mode {row['mode']}",
+        f"χ² {row['chi2']:.6g}, {_convergence(row)}; {_steps(row['strategies'])}",
+        f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
+        f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
+        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
+        f"{counted(row['clients'], 'client')}",
+        *(f"journal {name}: {value}" for name, value in _told(row.get("journal", {}))),
+    ]
+    return "\n".join(lines)
+
+
+def _told(fields: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Fields that have something to say: names in words, times to three digits."""
+    for name, value in fields.items():
+        if value not in ("", None):
+            is_long = isinstance(value, float) and abs(value) < 1000
+            shown = f"{value:.3g}" if is_long else f"{value:,.0f}" if isinstance(value, float) else str(value)
+            yield name.replace("_", " "), shown
+
+
+def _convergence(row: Mapping[str, Any]) -> str:
+    state = "converged" if row["converged"] else "not converged"
+    so_far = f" after {counted(row['further_steps'], 'further step')}"
+    if row["converging"]:
+        return f"{state}, converging,{so_far}"
+    if not row["gave_up"]:
+        return state
+    if row["converged"]:
+        return f"converged to a thousandth of χ²; gave up coming nearer{so_far}, as {row['gave_up']}"
+    return f"{state}{so_far}: gave up, as {row['gave_up']}"
+
+
+def _steps(strategies: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {strategy}" for strategy, count in strategies.items()) or "no step yet"
+
+
+def _codes(refusals: Mapping[str, int]) -> str:
+    told = ", ".join(f"{count} {code}" for code, count in refusals.items() if code != "busy")
+    return f" ({told})" if told else ""
+
+
+def _times(histogram: Mapping[str, Any]) -> str:
+    """Half and 99 of 100 of them, by the bounds between which they were counted."""
+    if not sum(histogram["counts"]):
+        return "no time yet"
+    return " and ".join(
+        f"{_below(histogram, share)} ({name})" for name, share in (("half of them", 0.5), ("99 of 100", 0.99))
+    )
+
+
+def _below(histogram: Mapping[str, Any], share: float) -> str:
+    reached, wanted = 0, share * sum(histogram["counts"])
+    for bound, count in zip(histogram["bounds_s"], histogram["counts"], strict=False):
+        reached += count
+        if reached >= wanted:
+            return f"at most {1e3 * bound:g} ms"
+    return f"more than {histogram['bounds_s'][-1]:g} s"
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,105 @@
+"""`factorbus watch`: the live view."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.output.exits import require
+from factorbus.cli.process.options import Number, connect_option, ellipses_option, out_option, zenoh_option
+
+
+@click.command()
+@click.argument("map_name", metavar="MAP")
+@connect_option
+@zenoh_option
+@out_option("--save", "save", "Write a Rerun recording instead of opening a viewer.", "FILE.rrd")
+@click.option("--serve", "serving", is_flag=True, help="Serve the viewer to browsers: for machines without a display.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, help="Address to serve it at, as browsers reach it; 0.0.0.0: all."
+)
+@click.option("--web-port", type=click.IntRange(1, 65535), default=9090, show_default=True, metavar="PORT")
+@click.option("--data-port", type=click.IntRange(1, 65535), default=9876, show_default=True, metavar="PORT")
+@click.option("--rate", type=Number(0.1, 60), default=5.0, show_default=True, metavar="HZ", help="Looks a second.")
+@ellipses_option(30)
+@click.option("--until", type=click.IntRange(1), metavar="REVISION", help="Stop when the map has got there.")
+@click.option("--until-eof", is_flag=True, help="Stop, too, when standard input closes: for a parent process.")
+def command(
+    map_name: str,
+    endpoint: str,
+    zenoh: str,
+    save: Path | None,
+    serving: bool,
+    host: str,
+    web_port: int,
+    data_port: int,
+    rate: float,
+    ellipses: int,
+    until: int | None,
+    until_eof: bool,
+) -> None:
+    """Watch MAP live in Rerun: trajectory, landmarks, loop closures by how badly they fit, and plots of every step.
+
+    Opens the Rerun viewer; where there is no display, serves it to browsers of this machine, or with --host to all who
+    can reach that address. A map that is not there yet is waited for. Until Ctrl-C.
+
+    \b
+    factorbus watch warehouse
+    factorbus watch warehouse --serve --web-port 9090
+    factorbus watch warehouse --serve --host 192.168.1.20
+    factorbus watch warehouse --save monday.rrd; rerun monday.rrd
+    """
+    if save and serving:
+        raise click.UsageError("--save and --serve exclude each other")
+    require("watch", "factorbus watch")
+    from factorbus.cli.output.console import note
+    from factorbus.cli.process.bus import joined_when_there, open_bus
+    from factorbus.cli.process.stopping import stop_on_signals
+    from factorbus.viz.live import LiveView
+    from factorbus.viz.lookout import Lookout
+
+    with (
+        stop_on_signals(until_eof) as stop,
+        open_bus(endpoint, "watcher", zenoh) as bus,
+        joined_when_there(bus, map_name, stop.wait) as joined,
+    ):
+        if joined is None:
+            note(f"stopped before there was a map {map_name}")
+            return
+        view = LiveView(map_name)
+        try:
+            where = _open(view, save, host if serving or not _has_display() else None, web_port, data_port)
+            with Lookout(joined, ellipses=ellipses) as lookout:
+                view.show(lookout.last_look(joined.timeout_s))
+                click.echo(f"ready {where}")
+                while not stop.wait(1 / rate) and (until is None or joined.estimate.revision < until):
+                    if lookout.wait(0):
+                        view.show(lookout.look())
+                view.show(lookout.last_look(joined.timeout_s))
+        finally:
+            view.close()
+    unconverged = ", which had not converged" if joined.estimate.converged is False else ""
+    converging = unconverged or (", which was converging" if joined.estimate.converging else "")
+    note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
+
+
+def _open(view: Any, save: Path | None, host: str | None, web_port: int, data_port: int) -> str:
+    """Where it is to be seen.  Raises Stopped."""
+    from factorbus.cli.output.exits import Stopped
+
+    try:
+        if save:
+            view.save(save)
+            return str(save)
+        if host is not None:
+            return view.serve(host, web_port, data_port)
+        view.spawn(data_port)
+    except RuntimeError as error:
+        raise Stopped("no_viewer", f"the viewer does not start: {error}") from error
+    return "on this display"
+
+
+def _has_display() -> bool:
+    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

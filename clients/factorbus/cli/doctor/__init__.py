@@ -1,0 +1,1 @@
+"""What `factorbus doctor` looks at."""

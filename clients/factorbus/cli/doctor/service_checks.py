@@ -1,0 +1,59 @@
+"""What the doctor looks at in services on the bus: one finding for each of them."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from factorbus.cli.doctor.checks import Finding
+from factorbus.proto.problems import Problem
+from factorbus.proto.version import __version__
+from factorbus.wording import counted
+
+_WAIT_S = 5.0
+
+
+def services(endpoint: str, zenoh: str) -> list[Finding]:
+    """How the services at `endpoint` are; a failure where none answers."""
+    from factorbus.cli.process.bus import open_bus
+
+    try:
+        with open_bus(endpoint, "doctor", zenoh, _WAIT_S) as bus:
+            return [finding(account) for account in bus.stats()]
+    except Problem as problem:
+        mend = "is it running (systemctl status factorbus)? with access control, only an operator may ask: give --zenoh"
+        return [Finding("services", "fail", problem.message, mend)]
+
+
+def finding(account: Mapping[str, Any]) -> Finding:
+    """The worst that `account` tells of its service."""
+    name, maps = f"service {account['service']}", account["maps"]
+    told = ", ".join(f"{row['name']} ({counted(row['variables'], 'variable')})" for row in maps) or "no maps"
+    for state, seen, mend in _troubles(account):
+        return Finding(name, state, f"{seen}; {told}", mend)
+    return Finding(name, "ok", f"alive, {told}, {counted(len(account.get('workers', ())), 'worker')}")
+
+
+def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """(state, seen, mend), the worst first."""
+    if account["stuck"]:
+        seen = f"stuck: {', '.join(account['stuck'])}"
+        yield "fail", seen, "look into its log and restart it; WatchdogSec= in its systemd unit does so by itself"
+    for row in account.get("unopened", ()):
+        mend = f"restore its folder from a copy and restart, or `factorbus drop {row['name']} --damaged` gives it up"
+        yield "fail", f"map {row['name']} does not open ({row['state']}): {row['problem']}", mend
+    resident, limit = (account["memory"][name] for name in ("resident_bytes", "limit_bytes"))
+    if resident > 0.9 * limit:
+        state = "fail" if resident > limit else "warn"
+        mend = "drop or move a map, or give it more (limits.memory_bytes): beyond the limit inserts are refused"
+        yield state, f"{resident >> 20} MiB of memory, {limit >> 20} MiB allowed", mend
+    for row in account["maps"]:
+        if why := row.get("journal", {}).get("problem"):
+            yield "fail", why, "make room or make it writable: the map goes on by itself"
+    if not account["ready"]:
+        yield "warn", "alive, but not ready", "it is starting or stopping: look again"
+    if (version := account["version"]) != __version__:
+        yield "warn", f"version {version}, here it is {__version__}", "the same wire; update when it suits"
+    for row in account["maps"]:
+        inserts = row["inserts"]
+        if inserts["busy"] > 0.1 * max(inserts["accepted"], 10):
+            mend = "clients send faster than it solves: insert less often, or spread maps over more services"
+            yield "warn", f"map {row['name']} told {inserts['busy']} of its inserts to wait", mend

@@ -1,0 +1,1 @@
+"""A stream of inserts into a map, on the bus or in this process, and where it comes from."""

@@ -1,0 +1,116 @@
+"""A map in this process, without a bus: the same solver, for `replay --in-process`."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from factorbus.cli.driving.drive import Compared, Stepped
+from factorbus.proto.arrays import F64, I64
+from factorbus.proto.messages import Batch, Change, Factors, Variables
+from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
+from factorbus.solver.covariance.blocks import Blocks
+
+
+class LocalMap:
+    """A solver of our own."""
+
+    def __init__(self, mode: str = "auto") -> None:
+        self._solver = Solver(Options(mode=mode, clock=time.perf_counter))
+        self._revision = 0
+        self._cpu_s = 0.0
+        self._compared: list[Compared] = []
+
+    def send(self, batch: Batch) -> list[Stepped]:
+        """Stage and step.  Raises SolverError."""
+        start = time.thread_time()
+        self._solver.stage(batch)
+        return [self._step(start, settle=False)]
+
+    def flush(self) -> list[Stepped]:
+        """Nothing is ever out."""
+        return []
+
+    def settle(self) -> Stepped:
+        """Iterate until converged."""
+        return self._step(time.thread_time(), settle=True)
+
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate."""
+        return self._solver.chi2()
+
+    def compare(self) -> None:
+        """Solve the same graph from scratch, here and now: the drive waits."""
+        self._compared.append(replace(self.optimum(), variables=()))
+
+    def optimum(self) -> Compared:
+        """The same, and the optimum itself."""
+        start = time.perf_counter()
+        batch = solve_batch(*self._solver.graph())
+        seconds, chi2 = time.perf_counter() - start, self._solver.chi2()
+        values = _variables(batch.values)
+        return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values, batch.converged)
+
+    def adopt(self, found: Compared) -> Stepped:
+        """Go to an optimum, and settle there."""
+        start = time.thread_time()
+        changes = [Change("place", keys=g.keys, kind=g.kind, values=g.values, carry=True) for g in found.variables]
+        self._solver, _, report, counted = self._solver.with_changes(changes, settle=True)
+        self._cpu_s += time.thread_time() - start
+        self._revision += 1
+        return Stepped(self._revision, report.as_dict() | counted, None)
+
+    def compared(self) -> list[Compared]:
+        """All comparisons."""
+        return self._compared
+
+    def estimate(self) -> tuple[Variables, ...]:
+        """A copy of all variables."""
+        return _variables(self._solver.estimate())
+
+    def graph(self) -> Batch:
+        """A copy of all variables and factors."""
+        variables, factors = self._solver.graph()
+        return Batch(
+            _variables(variables),
+            tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale) for g in factors),
+        )
+
+    def account(self) -> dict[str, Any]:
+        """CPU seconds of this thread in the solver, seconds of compiling."""
+        return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compiled_seconds(), "deltas": None}
+
+    def _step(self, start: float, settle: bool) -> Stepped:
+        report = self._solver.step(settle=settle).as_dict()
+        self._cpu_s += time.thread_time() - start
+        self._revision += 1
+        return Stepped(self._revision, report, None)
+
+
+def chi2_unsolved(batches: Iterable[Batch]) -> float:
+    """χ² of the whole graph with every variable as composed from the first factor that reaches it."""
+    solver = Solver(Options(mode="inc-l", max_iterations=0))
+    for batch in batches:
+        solver.stage(batch)
+    return solver.step().chi2
+
+
+def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
+    """Key → covariance of its tangent, of some variables of a graph, linearised at the values that it has.
+
+    Raises SolverError.
+    """
+    solver = Solver(Options(mode="inc-l", max_iterations=0))
+    solver.stage(graph)
+    solver.step()
+    blocks = Blocks(solver.factored())
+    place = {key: at for at, key in enumerate(blocks.factored.graph.keys[: blocks.factored.count].tolist())}
+    found = blocks.of(np.array([place[key] for key in keys.tolist()], np.int64))
+    dims = blocks.factored.dims
+    return {key: block[: dims[place[key]], : dims[place[key]]] for key, block in zip(keys.tolist(), found, strict=True)}
+
+
+def _variables(groups: Iterable[Any]) -> tuple[Variables, ...]:
+    return tuple(Variables(group.kind, group.keys, group.values, group.fixed, group.stamps) for group in groups)

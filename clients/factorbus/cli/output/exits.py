@@ -1,0 +1,108 @@
+"""How a command ends: the exit codes, the errors of the command line itself, and which error leads to which code."""
+
+import json
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import click
+
+from factorbus.cli.output.installing import install_command
+
+OK, FAILED, USAGE, BAD_FILE, UNAVAILABLE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
+
+EXIT_CODES = {
+    OK: "done",
+    FAILED: "failed: the message says at what",
+    USAGE: "wrong use: an option, a name or an endpoint that cannot be",
+    BAD_FILE: "an input file that cannot be read, or is not what it should be",
+    UNAVAILABLE: "nobody answered: on the bus, or where a data set is fetched from",
+    REFUSED: "the service or the solver refused the input",
+    INTERRUPTED: "interrupted",
+}
+
+# What the extras of pyproject.toml bring, by import name.
+EXTRAS = {
+    "service": ("numba", "scipy", "sksparse", "prometheus_client"),
+    "viz": ("matplotlib",),
+    "watch": ("rerun",),
+    "record": ("foxglove",),
+    "gateway": ("starlette", "uvicorn", "websockets"),
+    "ros2": ("rosbags", "xxhash"),
+}
+
+_USAGE_CODES = (
+    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting",
+    "cannot_listen", "exposed", "port_taken",
+)  # fmt: skip
+_UNAVAILABLE_CODES = ("unavailable", "shutting_down", "other_protocol")
+
+
+class Stopped(Exception):
+    """A command cannot go on.  `code` is for programs, the message says what to do next."""
+
+    def __init__(self, code: str, message: str, exit_code: int = FAILED, **detail: Any) -> None:
+        self.code, self.message, self.exit_code, self.detail = code, message, exit_code, detail
+        super().__init__(message)
+
+
+def report(error: Exception, as_json: bool, debug: bool) -> int:
+    """Show `error` as one line on standard error (with `as_json`, also as the one document); returns the exit code."""
+    code = str(getattr(error, "code", "failed"))
+    message = str(getattr(error, "message", "") or error or type(error).__name__)
+    if not hasattr(error, "code"):
+        message = f"{type(error).__name__}: {message}" + ("" if debug else " (more with --debug)")
+    if debug:
+        click.echo("".join(traceback.format_exception(error)), err=True, nl=False)
+    click.echo(f"factorbus: {message} [{code}]", err=True)
+    if as_json:
+        detail = getattr(error, "detail", {})
+        click.echo(json.dumps({"problem": {"code": code, "message": message, "detail": detail}}, default=str))
+    return _exit_code(error, code)
+
+
+@contextmanager
+def input_file(path: Path) -> Iterator[None]:
+    """Turns what goes wrong in reading `path` into the exit code for a bad file.  Raises Stopped."""
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        raise Stopped("bad_file", f"{path} is not text: {error.reason}", BAD_FILE, path=str(path)) from error
+    except OSError as error:
+        raise Stopped("bad_file", f"{path} cannot be read: {error.strerror}", BAD_FILE, path=str(path)) from error
+
+
+def require(extra: str, what: str) -> None:
+    """`what` needs the libraries of `extra`; said before the work begins, and with the command that installs them.
+
+    Looks without importing.  Raises Stopped.
+    """
+    if missing := lacking(extra):
+        hint = " (compiles against SuiteSparse: apt-get install libsuitesparse-dev first)" if extra == "service" else ""
+        raise Stopped(
+            "missing_extra",
+            f"{what} needs {', '.join(missing)}, not installed here: {install_command(extra)}{hint}",
+            extra=extra,
+        )
+
+
+def lacking(extra: str) -> list[str]:
+    """The libraries of `extra` that are not installed, by import name."""
+    return [name for name in EXTRAS[extra] if find_spec(name) is None]
+
+
+def _exit_code(error: Exception, code: str) -> int:
+    if isinstance(error, Stopped):
+        return error.exit_code
+    if not hasattr(error, "code"):
+        return FAILED
+    if code == "bad_file":
+        return BAD_FILE
+    if code in _USAGE_CODES:
+        return USAGE
+    if code in _UNAVAILABLE_CODES:
+        return UNAVAILABLE
+    return REFUSED

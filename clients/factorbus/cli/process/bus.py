@@ -1,0 +1,42 @@
+"""How commands come to the bus: an address where nobody listens is said within about a second."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from factorbus.client import Bus, Map
+
+_LISTENING_S = 1.0
+
+
+def open_bus(endpoint: str, client: str, zenoh: str = "", timeout_s: float = 10.0) -> "Bus":
+    """A connection to what is at `endpoint`; `timeout_s` is for its answers.  Raises as `factorbus.client.connect`."""
+    from factorbus.client import connect
+
+    return connect(endpoint, client=client, zenoh=zenoh, timeout_s=timeout_s, listening_s=_LISTENING_S)
+
+
+@contextmanager
+def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -> Iterator["Map | None"]:
+    """Map `name`, once there is one; None if it was stopped before.  stopped: waits for so many seconds, at most.
+
+    Raises Refused, Unavailable.
+    """
+    from factorbus.cli.output.console import note
+    from factorbus.proto.problems import UnknownMap
+
+    said = False
+    while True:
+        try:
+            joined = bus.map(name, create=False)
+            break
+        except UnknownMap as unknown:
+            if not said:
+                note(f"{unknown.message}; waiting until there is one")
+            said = True
+        if stopped(_LISTENING_S):
+            yield None
+            return
+    with joined:
+        yield joined

@@ -1,0 +1,57 @@
+"""Graph files as commands read them: the options, and one place where what was left out is said."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from factorbus.formats import GraphFile
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# The graph formats that are read; `tests/clients/test_cli_files.py` holds them to the reader's own list.
+DIALECTS = ("g2o", "toro", "isam", "slam++", "tum")
+COUNTED = (("poses", "pose"), ("landmarks", "landmark"), ("factors", "factor"))  # of a graph, and of one of them
+IDS = ("auto", "ids", "keys", "counted")
+
+
+def reading_options(command: F) -> F:
+    """--dialect and --strict."""
+    for option in (
+        click.option("--strict", is_flag=True, help="Refuse what would otherwise be left out and said."),
+        click.option(
+            "--dialect",
+            type=click.Choice(DIALECTS),
+            help="What the file is written in.  [default: as its records say; a guess is said]",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def robot_option(command: F) -> F:
+    """--robot."""
+    return click.option(
+        "--robot",
+        metavar="LETTER",
+        help='Write the trajectory of this robot alone ("" for keys without a letter).  [default: a file for each]',
+    )(command)
+
+
+def read_graph(path: Path, dialect: str | None = None, strict: bool = False) -> "GraphFile":
+    """The graph in `path`; what was left out, assumed or changed is said on standard error.  Raises FormatError."""
+    from factorbus.formats import read
+
+    graph = read(path, dialect, strict)
+    say(path, graph.notes)
+    return graph
+
+
+def say(path: Path, notes: tuple[str, ...]) -> None:
+    """Notes on a file, to standard error."""
+    from factorbus.cli.output.console import note
+
+    for text in notes:
+        note(f"{path}: {text}")

@@ -1,0 +1,105 @@
+"""When a long-running command stops: a signal, or the end of standard input."""
+
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from factorbus.cli.output.exits import INTERRUPTED
+
+_LOOK_S = 0.5
+_OURS = (signal.SIGTERM, signal.SIGINT)
+_ENDED = b"\x1b[?25h\ninterrupted\n"  # the cursor was hidden, if a bar was shown
+
+
+@contextmanager
+def stop_on_signals(until_eof: bool, on_stop: Callable[[], None] = lambda: None) -> Iterator[threading.Event]:
+    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set.  The second signal is final.
+
+    on_stop: called at the first signal.
+    """
+    stop = threading.Event()
+
+    def on_signal(number: int, _frame: object) -> None:
+        if stop.is_set():
+            os._exit(INTERRUPTED)
+        stop.set()
+        on_stop()
+
+    before = {number: signal.signal(number, on_signal) for number in _OURS}
+    if until_eof:
+        threading.Thread(target=_wait_for_eof, args=(stop,), daemon=True).start()
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def wait_until(stop: threading.Event) -> None:
+    """Until it is set.  No wait in it is long: Python sees a signal that comes right before one only when it ends."""
+    while not stop.wait(_LOOK_S):
+        pass
+
+
+@contextmanager
+def interrupt_on_sigterm(grace_s: float = 10.0) -> Iterator[None]:
+    """While inside, SIGTERM ends the command as Ctrl-C does: through every `finally`.  The second signal is final.
+
+    Both raise KeyboardInterrupt wherever the main thread happens to be, where it may do harm or be lost: in
+    a callback from a library that is not Python's, in the midst of taking a lock.  So a command that has not ended
+    within `grace_s` after the signal is ended.
+    """
+
+    def on_signal(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, on_signal) for number in _OURS}
+    told, tell = socket.socketpair()
+    tell.setblocking(False)
+    told_before = signal.set_wakeup_fd(tell.fileno())  # told of by the C part of Python, whatever the main thread does
+    threading.Thread(target=_see_to_the_end, args=(told, grace_s), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(told_before)
+        tell.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _see_to_the_end(told: socket.socket, grace_s: float) -> None:
+    """After one signal there are so many seconds to end by itself, after another there is none."""
+    with told:
+        if not signalled(told):
+            return
+        told.settimeout(grace_s)
+        with suppress(TimeoutError):
+            if not signalled(told):
+                return
+        os.write(sys.stderr.fileno(), _ENDED)
+        os._exit(INTERRUPTED)
+
+
+def signalled(told: socket.socket) -> bool:
+    """Wait for the next of our signals; False when there is nothing left to end.  Raises TimeoutError."""
+    while number := told.recv(1):
+        if number[0] in _OURS:
+            return True
+    return False
+
+
+def leave_on_eof() -> None:
+    """Wait for the end of standard input, then end this process at once: whoever started it has gone."""
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os._exit(INTERRUPTED)
+
+
+def _wait_for_eof(stop: threading.Event) -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    stop.set()

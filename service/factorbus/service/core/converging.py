@@ -1,0 +1,109 @@
+"""When a map to which nothing comes takes further steps, without an insert.  Pure: the core asks.
+
+    converged ──a step that could not finish──▶ waits ──no insert for a moment──▶ goes on ──▶ converged
+        │                                                                                        │
+        └──no insert for longer──▶ goes on ──▶ finished: a step would not lower what χ² shows ◀───┘
+
+An insert comes first at any time, and ends the waiting.  Where further steps are of no use, or were too many, the map
+gives up until something else changes it.
+Reasons and figures: docs/decisions/further-steps.md.
+"""
+
+import math
+
+from factorbus.service.core.events import Stepped
+from factorbus.wording import counted
+
+# Idle is a map whose last step of another sort ended so long ago: one that has not converged goes on, and one that has
+# is polished, that is, goes on to its optimum.
+CONVERGE_IDLE_S, POLISH_IDLE_S = 0.1, 1.0
+FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
+MOST, MOST_S = 10_000, 300.0  # so many in a row, and so much of a core for them
+# Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
+_SHARE, _NOTHING = 1e-7, 1e-12
+_USELESS, _STILL = 20, 3  # so many in a row
+
+
+class Converging:
+    """How near a map is to its optimum at the revision that is told, and what is done about it."""
+
+    def __init__(self) -> None:
+        self.converged = True
+        self.gave_up = ""  # why no further step is made, though one is wanted
+        self.steps = 0  # further ones since the last of another sort
+        self._unfinished = False  # a step would still bring it nearer to its optimum, though it may have converged
+        self._untold = False  # a further step is under way, or not told yet
+        self._goes_on = False
+        self._under_way = ""  # "further", "inserts", or neither
+        self._busy_at = self._rests_until = -math.inf
+        self._spent_s = 0.0
+        self._least, self._useless, self._still = math.inf, 0, 0
+
+    @property
+    def converging(self) -> bool:
+        """Will have further steps by itself, unless an insert comes first."""
+        return self._unfinished and not self.gave_up
+
+    def is_due(self, now: float) -> bool:
+        """Whether the solver, which is free, is to take a further step now."""
+        return self.converging and self._goes_on and not self._untold and now >= self._rests_until
+
+    def look(self, now: float) -> None:
+        """Time went by: has the map been idle for long enough?"""
+        idle_s = POLISH_IDLE_S if self.converged else CONVERGE_IDLE_S
+        self._goes_on = self._goes_on or now - self._busy_at >= idle_s
+
+    def began(self, further: bool) -> None:
+        """The solver was given a further step, or inserts."""
+        self._untold = self._untold or further
+        self._goes_on = further
+        self._under_way = "further" if further else "inserts"
+
+    def ended(self, worked_s: float, now: float) -> None:
+        """The solver is free again.  worked_s: what it used of a core."""
+        if self._under_way == "further":
+            self._spent_s += worked_s
+            self._rests_until = now + worked_s if self._spent_s > FULL_SPEED_S else now
+        elif self._under_way:
+            self._busy_at = now
+        self._under_way = ""
+
+    def refused(self) -> None:
+        """The further step was refused: the map is where it was, so the next one would be, too."""
+        self._untold, self.gave_up = False, "the solver refused it, see the service's log"
+
+    def undone(self) -> None:
+        """What was not told did not happen."""
+        self._untold = False
+
+    def moved_on(self, converged: bool, unfinished: bool, chi2: float) -> None:
+        """A step of another sort is told."""
+        self.converged, self._unfinished, self.gave_up = converged, unfinished or not converged, ""
+        self.steps, self._spent_s = 0, 0.0
+        self._least, self._useless, self._still = chi2, 0, 0
+
+    def went_on(self, stepped: Stepped) -> None:
+        """A further step is told: was it of use?"""
+        self._untold, self.converged = False, stepped.converged
+        self._unfinished = stepped.unfinished or not stepped.converged
+        self.steps += 1
+        useful = stepped.chi2 < (1.0 - _SHARE) * self._least - _NOTHING
+        if useful:
+            self._least = stepped.chi2
+        self._useless = 0 if useful else self._useless + 1
+        self._still = self._still + 1 if not stepped.changed else 0
+        if self._unfinished and not self.gave_up:
+            self.gave_up = self._why_give_up(stepped)
+
+    def _why_give_up(self, stepped: Stepped) -> str:
+        if stepped.rebuilt:
+            return "the solver failed in a further step and was replaced, see the service's log"
+        # With damping left the next step tries another way, of which there are no more than _USELESS.
+        if self._still >= _STILL and not stepped.damping:
+            return f"{counted(self._still, 'further step')} in a row changed nothing"
+        if self._useless >= _USELESS:
+            return f"{counted(self._useless, 'further step')} in a row did not lower χ²"
+        if self.steps >= MOST or self._spent_s >= MOST_S:
+            steps = counted(self.steps, "further step")
+            return f"it was not at its optimum after {steps} in a row, which took {self._spent_s:.0f} s of a core"
+        return ""

@@ -1,0 +1,210 @@
+"""What goes into the core and what comes out of it, as values.
+
+An `Asker` is whoever waits for an answer: the shell's query, which the core carries about and never looks into.
+Time is in seconds of any clock that does not go back; it arrives with the events.
+
+Those on the path of every insert are named tuples: a frozen dataclass takes three times as long to make.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+from factorbus.proto.arrays import I64
+from factorbus.proto.messages import Insert
+from factorbus.proto.problems import Problem
+from factorbus.service.questions.answers import Question
+
+Asker: TypeAlias = Any
+
+
+# ---- events -----------------------------------------------------------------------------------------------------
+
+
+class Located(NamedTuple):
+    """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
+
+    message: bytes
+    groups: I64
+    settle: bool
+
+
+class Arrived(NamedTuple):
+    """An insert came in, and waits for its answer.
+
+    askers: everybody who waits with it (a client may ask again).  content: the message, or the problem with it when
+    only its sequence number could be read; such an insert takes its place in the sequence and is refused there.
+    digest tells a repetition from another message of that number.  message: the bytes as they came, for the journal.
+    """
+
+    askers: list[Asker]
+    client: str
+    sequence: int
+    epoch: int
+    size: int
+    digest: int
+    content: Insert | Located | Problem
+    now: float
+    message: bytes = b""
+
+    @property
+    def is_change(self) -> bool:
+        """Whether it changes what the map has, which is a step of its own."""
+        return isinstance(self.content, Insert) and bool(self.content.changes)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question came in, with its bytes."""
+
+    asker: Asker
+    question: str
+    payload: bytes
+
+
+class Outcome(NamedTuple):
+    """What became of one insert: the bytes of its Accepted, or why it was refused.
+
+    first_factor: the id of its first factor; −1 where it was refused.
+    """
+
+    insert: Arrived
+    answer: bytes | Any
+    first_factor: int = -1
+
+
+class Judged(NamedTuple):
+    """The solver accepted or refused these inserts.
+
+    revision, together: of the step that took in those that were accepted, and how many they were.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    revision: int = 0
+    together: int = 0
+
+
+class Stepped(NamedTuple):
+    """The solver made a step; the delta tells of it.
+
+    converged, unfinished: if not, or if so, further steps are to follow when no insert does.  changed: how many
+    variables; damping: what the next step would begin with.  further: without an insert, because the map was not at its
+    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  reordered: another
+    solver took its place, which was made of what there was after this fold, in a fresh order, and has been given all
+    since.
+    """
+
+    revision: int
+    delta: bytes
+    strategy: str
+    chi2: float
+    solver_ms: float
+    rebuilt: bool = False
+    reordered: int | None = None
+    converged: bool = True
+    changed: int = 0
+    damping: float = 0.0
+    further: bool = False
+    unfinished: bool = False
+
+
+class Folded(NamedTuple):
+    """The solver is done with a Run; how large the map is now, and what its thread has used.
+
+    refused: a further step was, and the map is where it was.
+    """
+
+    variables: int
+    factors: int
+    solver_cpu_s: float
+    now: float
+    refused: bool = False
+
+
+class Alone(NamedTuple):
+    """One insert was taken in by a step of its own: what Judged, Stepped and Folded say of it, in one."""
+
+    insert: Arrived
+    answer: bytes
+    delta: bytes
+    first_factor: int
+    revision: int
+    strategy: str
+    chi2: float
+    solver_ms: float
+    variables: int
+    factors: int
+    solver_cpu_s: float
+    now: float
+    converged: bool = True
+    unfinished: bool = False
+
+
+# ---- what waits -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """A question that needs the solver's state.  asker is None for a keyframe: its answer is published."""
+
+    question: Question
+    asker: Asker = None
+
+
+# ---- effects ----------------------------------------------------------------------------------------------------
+
+
+class Answer(NamedTuple):
+    """Answer `asker` with these bytes."""
+
+    asker: Asker
+    message: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """Answer `asker` with a plain map, which the shell may add its own numbers to."""
+
+    asker: Asker
+    content: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Refuse:
+    """Answer `asker` with a problem: anything with code, message and detail.
+
+    following: of an insert, `detail.next`: above its number where that is used up; else what is wanted next.
+    """
+
+    asker: Asker
+    problem: Any
+    following: int | None = None
+
+
+class Publish(NamedTuple):
+    """Publish to everybody: channel is delta or event."""
+
+    channel: str
+    message: bytes
+
+
+class Run(NamedTuple):
+    """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
+
+    short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
+    the journal has.  further: there are no inserts, and one step is to go on from the last one.
+    """
+
+    reads: tuple[Read, ...]
+    inserts: tuple[Arrived, ...]
+    short: bool = False
+    reload: bool = False
+    further: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Drained:
+    """Nothing is waiting any more and nothing will be taken: the map can be closed."""
+
+
+Effect: TypeAlias = Answer | Tell | Refuse | Publish | Run | Drained

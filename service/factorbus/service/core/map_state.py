@@ -1,0 +1,383 @@
+"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
+
+    Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
+    Asked ───▶ reads ──────────────┴▶ Run ─▶ Folded ────┼─▶ Publish           delta of every step
+                                    (solver thread)     └─▶ Run               what came in meanwhile; nothing did, and
+                                                                              it is not at its optimum: a further step
+
+At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Insert
+from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
+from factorbus.service.config import Limits
+from factorbus.service.core.account import Account, Done
+from factorbus.service.core.admission import Admission
+from factorbus.service.core.converging import Converging
+from factorbus.service.core.events import (
+    Alone,
+    Arrived,
+    Asked,
+    Asker,
+    Drained,
+    Effect,
+    Folded,
+    Judged,
+    Located,
+    Publish,
+    Read,
+    Refuse,
+    Run,
+    Stepped,
+    Tell,
+)
+from factorbus.service.core.pending_questions import Reads
+from factorbus.service.questions.admin import MovedOn
+from factorbus.service.questions.answers import Question, parse
+
+_KEYFRAME = Read(Question("keyframe"))
+# A Run is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
+# insert was already on its way when the last Run ended: then there are likely more behind it, to be folded together.
+_SHORT_BYTES = 16 << 10
+_SHORT_S = 0.002
+_ROUND_TRIP_S = 0.0002
+
+
+class Restored(NamedTuple):
+    """How a map is that was here before."""
+
+    revision: int
+    variables: int
+    factors: int
+    chi2: float
+    converged: bool = True
+    unfinished: bool = False
+
+
+class MapCore:
+    """The state of one map, short of its estimate.  Every method takes an event and returns effects, in order."""
+
+    def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float) -> None:
+        self.name, self.mode, self.epoch = name, mode, epoch
+        self.revision = self.variables = self.factors = 0
+        self._limits, self._created = limits, now
+        self._admission = Admission(epoch, limits)
+        self._reads = Reads()
+        self._running: Run | None = None
+        self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
+        self._must_reload = self._must_tidy = False
+        self._started = self._ended = 0.0
+        self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
+        self._closing: Problem | None = None
+        self._drained = False
+        self._since_keyframe = [0, 0]  # steps, bytes of deltas
+        self._solver_cpu_s = 0.0
+        self._account = Account()
+        self._converging = Converging()
+        self._moved_at = 0  # the revision of the last step that was not a further one
+
+    def row(self) -> dict[str, Any]:
+        """What admin/maps says of this map."""
+        return {
+            "name": self.name,
+            "mode": self.mode,
+            "epoch": self.epoch,
+            "revision": self.revision,
+            "variables": self.variables,
+            "factors": self.factors,
+            "state": "blocked" if self._admission.blocked else "open",
+            "converged": self._converging.converged,
+            "converging": self._converging.converging,
+        }
+
+    def created(self) -> list[Effect]:
+        """The map is on the bus: new, or as it was before."""
+        happened: list[Effect] = [self._event("opened" if self.revision else "created")]
+        return [*happened, self._event("blocked")] if self._admission.blocked else happened
+
+    def insert(self, arrived: Arrived) -> list[Effect]:
+        """An insert came in."""
+        if isinstance(arrived.content, Located) and (run := self._try_alone(arrived, arrived.content.settle)):
+            self._account.received(arrived.size)
+            return [run]
+        effects = self._admission.expire(arrived.now)
+        judged = self._admission.admit(arrived)
+        self._account.received(arrived.size)
+        for effect in judged:
+            if isinstance(effect, Refuse):
+                self._account.refused(effect.problem)
+        return self._go_on(effects + judged, arrived.now)
+
+    def unread(self, client: str, refuse: Refuse) -> list[Effect]:
+        """An insert of `client` came in of which not even the number can be read."""
+        self._account.refused(refuse.problem)
+        return [replace(refuse, following=self._admission.wanted(client))]
+
+    def ask(self, asked: Asked, now: float) -> list[Effect]:
+        """A question came in."""
+        try:
+            if self._closing is not None:
+                raise self._closing
+            question = parse(asked.question, asked.payload)
+        except Problem as problem:
+            return [Refuse(asked.asker, problem)]
+        if question.name == "stats":
+            return [Tell(asked.asker, self.stats(now))]
+        return self.read(Read(question, asked.asker), now)
+
+    def read(self, read: Read, now: float) -> list[Effect]:
+        """A question that needs the solver's state."""
+        if self._closing is not None:
+            return [Refuse(read.asker, self._closing)]
+        if len(self._reads) >= self._limits.questions:
+            return [Refuse(read.asker, Busy(len(self._reads), 0.1))]
+        self._reads.append(read)
+        return self._go_on([], now)
+
+    def judged(self, judged: Judged) -> list[Effect]:
+        """The solver's word on some of what it has."""
+        effects: list[Effect] = []
+        self._unjudged -= len(judged.outcomes)
+        for outcome in judged.outcomes:
+            self._unjudged_bytes -= outcome.insert.size
+            effects += self._admission.answer(outcome.insert, outcome.answer)
+            if isinstance(outcome.answer, bytes):
+                self._account.accepted(len(outcome.answer))
+            else:
+                self._account.refused(outcome.answer)
+        return effects
+
+    def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
+        """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
+        insert, size = alone.insert, len(alone.delta)
+        others = self._admission.answer(insert, alone.answer, answered)
+        self._unjudged -= 1
+        self._unjudged_bytes -= insert.size
+        seconds = alone.now - insert.now
+        self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
+        self._moved_on(alone.revision, size)
+        self._converging.moved_on(alone.converged, alone.unfinished, alone.chi2)
+        self._moved_at = alone.revision
+        self._free(alone, 1)
+        return self._go_on(others, alone.now)
+
+    def kept(self, events: Sequence[Judged | Stepped], now: float) -> list[Effect]:
+        """What came of a Run is written down."""
+        effects: list[Effect] = []
+        for event in events:
+            effects += self.judged(event) if isinstance(event, Judged) else self.stepped(event)
+        return self._go_on(effects, now)
+
+    def block(self, problem: Problem, now: float) -> list[Effect]:
+        """The journal cannot be written: nothing new is taken in, and what has not gone to the solver is refused."""
+        self._admission.block(problem)
+        effects = self._count_refused(self._admission.take_back(problem, given=False))
+        return self._go_on([*effects, self._event("blocked")], now)
+
+    def unkept(self, problem: Problem, now: float) -> list[Effect]:
+        """The same, and what came of Runs since the last `kept` did not happen: the solver is to go back."""
+        self._admission.block(problem)
+        effects = self._count_refused(self._admission.take_back(problem, given=True))
+        self._unjudged = self._unjudged_bytes = 0
+        self._converging.undone()
+        self._must_reload = True
+        return self._go_on([*effects, self._event("blocked")], now)
+
+    def unblock(self) -> list[Effect]:
+        """The journal can be written again."""
+        self._admission.block(None)
+        return [self._event("unblocked")]
+
+    def restore(
+        self, senders: Iterable[tuple[str, int, Iterable[tuple[int, int, object]]]], restored: Restored
+    ) -> None:
+        """The map was here before: what its clients have sent, and how it is."""
+        for name, following, answered in senders:
+            self._admission.restore(name, following, answered, self._created)
+        self.revision, self.variables, self.factors, self._account.chi2 = restored[:4]
+        self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
+        self._moved_at = restored.revision
+
+    def stepped(self, stepped: Stepped) -> list[Effect]:
+        """The solver made a step."""
+        size = len(stepped.delta)
+        self._account.stepped(stepped.strategy, stepped.chi2, stepped.solver_ms, size)
+        self._moved_on(stepped.revision, size)
+        if stepped.further:
+            self._converging.went_on(stepped)
+        else:
+            self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
+            self._moved_at = stepped.revision
+        return [Publish("delta", stepped.delta)]
+
+    def _moved_on(self, revision: int, delta_bytes: int) -> None:
+        self.revision = revision
+        self._since_keyframe[0] += 1
+        self._since_keyframe[1] += delta_bytes
+        steps, size = self._since_keyframe
+        if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
+            self._since_keyframe = [0, 0]
+            self._reads.append(_KEYFRAME)
+
+    def folded(self, folded: Folded) -> list[Effect]:
+        """The solver is free again."""
+        taken = self._running.inserts if self._running else ()
+        for insert in taken:
+            self._account.took(folded.now - insert.now)
+        if folded.refused:
+            self._converging.refused()
+        self._free(folded, len(taken))
+        return self._go_on([], folded.now)
+
+    def _free(self, folded: Folded | Alone, taken: int) -> None:
+        self._running = None
+        self._ended = folded.now
+        self._converging.ended(folded.solver_cpu_s - self._solver_cpu_s, folded.now)
+        seconds = self._ended - self._started
+        self._admission.took(taken, seconds)
+        self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
+        self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
+
+    def failed(self, problem: Problem, now: float) -> list[Effect]:
+        """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
+        effects = self.drop(now, problem)
+        for insert in self._running.inserts if self._running else ():
+            if self._admission.is_open(insert):
+                effects += self._admission.answer(insert, problem)
+                self._unjudged -= 1
+                self._unjudged_bytes -= insert.size
+        self._running = None
+        return self._go_on(effects, now)
+
+    def tick(self, now: float) -> list[Effect]:
+        """Time went by."""
+        self._account.count()
+        self._converging.look(now)
+        return self._go_on(self._admission.expire(now), now)
+
+    def tidy(self, now: float) -> list[Effect]:
+        """Something waits for the end of a Run: where there is none, one with nothing in it, if it can be kept."""
+        self._must_tidy = self._running is None and self._closing is None and not self._admission.blocked
+        return self._go_on([], now)
+
+    def stop(self, now: float) -> list[Effect]:
+        """Take nothing new; Drained comes when everything accepted is answered."""
+        self._closing = ShuttingDown()
+        return self._go_on([*self._admission.close(), self._event("stopping")], now)
+
+    def check_at(self, revision: int) -> None:
+        """Is the map at `revision`, but for further steps, and with nothing under way that would change what it has?
+
+        Raises MovedOn.
+        """
+        waiting = self._unjudged + self._admission.ready + self._admission.parked
+        if not self._moved_at <= revision <= self.revision or waiting:
+            raise MovedOn(self.name, self.revision, revision, waiting)
+
+    def drop(self, now: float, why: Problem | None = None) -> list[Effect]:
+        """The map is to go: what waits is refused, what the solver has is still answered."""
+        self._closing = why or UnknownMap(self.name)
+        effects: list[Effect] = [Refuse(read.asker, self._closing) for read in self._reads if read.asker is not None]
+        self._reads.clear()
+        return self._go_on([*effects, *self._admission.close(self._closing), self._event("dropped")], now)
+
+    def stats(self, now: float) -> dict[str, Any]:
+        """What ask/stats says of this map."""
+        return self.row() | {
+            "uptime_s": now - self._created,
+            "waiting": self._admission.ready,
+            "parked": self._admission.parked,
+            "unwritten": self._unjudged - (len(self._running.inserts) if self._running else 0),
+            "in_solver": len(self._running.inserts) if self._running else 0,
+            "clients": self._admission.next_sequences,
+            "steps": self.revision,
+            "further_steps": self._converging.steps,
+            "gave_up": self._converging.gave_up,
+            "solver_cpu_s": self._solver_cpu_s,
+            **self._account.stats(),
+        }
+
+    def account(self, now: float) -> dict[str, Any]:
+        """What admin/stats says of this map: `stats`, with what only an operator asks for."""
+        return self.stats(now) | {
+            "clients": len(self._admission.next_sequences),
+            **self._account.for_operators(),
+        }
+
+    def running_s(self, now: float) -> float:
+        """For how long the solver has been at what it has; 0 when it is free."""
+        return now - self._started if self._running is not None else 0.0
+
+    def _go_on(self, effects: list[Effect], now: float) -> list[Effect]:
+        """Give the solver what waits, if it is free."""
+        if self._running is not None:
+            return effects
+        limits = self._limits
+        room = self._has_room()
+        further = self._may_go_on(now)
+        if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room) or further:
+            reads, inserts = self._reads.take(), self._admission.take(limits.fold) if room else ()
+            short = self._is_short(reads, inserts, now)
+            self._running = Run(reads, inserts, short, self._must_reload, further)
+            if inserts or further:
+                self._converging.began(further)
+            self._must_reload = self._must_tidy = False
+            self._unjudged += len(inserts)
+            self._unjudged_bytes += sum([insert.size for insert in inserts])
+            self._started = now
+            effects.append(self._running)
+        elif self._closing is not None and not self._drained and not self._unjudged:
+            self._drained = True
+            effects.append(Drained())
+        return effects
+
+    def _may_go_on(self, now: float) -> bool:
+        """May the solver take a further step?  Inserts come first, and nothing is left to be told or written."""
+        waits = self._admission.ready or self._unjudged or self._must_reload
+        stopped = self._admission.blocked or self._closing is not None
+        return not waits and not stopped and self._converging.is_due(now)
+
+    def _has_room(self) -> bool:
+        """May the solver have more, or has the journal to write first?"""
+        return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
+
+    def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
+        """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
+        if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
+            return None
+        if self._must_reload or not self._has_room():
+            return None
+        if not self._admission.take_alone(arrived):
+            return None
+        self._started = arrived.now
+        self._converging.began(False)
+        self._unjudged += 1
+        self._unjudged_bytes += arrived.size
+        self._running = run = Run((), (arrived,), True)
+        return run
+
+    def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Arrived, ...], now: float) -> bool:
+        if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
+            return False
+        content = inserts[0].content
+        if inserts[0].is_change or (isinstance(content, Insert) and content.points_below):
+            return False
+        return isinstance(content, Problem) or not content.settle
+
+    def _is_quick(self, size: int, now: float) -> bool:
+        return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S
+
+    def _count_refused(self, effects: list[Effect]) -> list[Effect]:
+        for effect in effects:
+            if isinstance(effect, Refuse):
+                self._account.refused(effect.problem)
+        return effects
+
+    def _event(self, what: str) -> Publish:
+        return Publish("event", codec.encode_map({"event": what, "epoch": self.epoch, "revision": self.revision}))

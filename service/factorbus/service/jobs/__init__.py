@@ -1,0 +1,1 @@
+"""Jobs for workers: dispatched, checked, done in place where there is no worker."""

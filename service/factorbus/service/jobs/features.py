@@ -1,0 +1,178 @@
+"""New features for filters: a question is cut into shards, workers do them, the answer has them in order.
+
+threads   Zenoh's      a question comes in: handed over
+          features     reads it, decides, does small ones itself, puts answers together
+          desk         gives shards to workers and takes what comes of them
+"""
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from factorbus.proto.features import Ask, Shard, answer_size
+from factorbus.proto.features_codec import decode_ask, encode_answer, encode_shard
+from factorbus.proto.limits import Limits
+from factorbus.proto.messages import Job, JobDone
+from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
+from factorbus.service.core.events import Asker
+from factorbus.service.jobs.dispatch import IN_PLACE, Ended
+from factorbus.service.jobs.rates import measured
+from factorbus.service.jobs.running import Jobs, do_here
+from factorbus.service.jobs.sharding import Rates, Work, cuts, seconds, shards_for, work_of
+from factorbus.service.jobs.worker_latency import Trips
+from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.questions.question_memory import COPIES, Room
+
+log = logging.getLogger(__name__)
+
+# A worker has so much longer than the shard should take, and this much besides: for one that is merely busy.
+_PATIENCE, _BESIDES_S = 20.0, 1.0
+# Nobody waits longer than this for features; every shard is done long before, in place if need be.
+_GIVE_UP_S = 600.0
+_UNBOUNDED = Room()
+
+
+@dataclass(slots=True)
+class _Question:
+    """A question whose shards are being done; `parts` has what came, by shard."""
+
+    asker: Asker
+    parts: list[tuple[bytes, str, float] | None]
+    clean: bool = True
+    over: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Cutting:
+    """A question that goes to workers, in at most so many shards."""
+
+    payload: bytes
+    ask: Ask
+    most: int
+    work: Work
+    rates: Rates
+
+
+class Features:
+    """The questions for features of one service.  Thread-safe: what is called from outside only hands over."""
+
+    def __init__(
+        self,
+        desk: Lane,
+        jobs: Jobs,
+        trips: Trips,
+        reply: Callable[[Asker, bytes], None],
+        refuse: Callable[[Asker, Any], None],
+        limits: Limits,
+        most: int,
+        deadline_s: float,
+        room: Room = _UNBOUNDED,
+    ) -> None:
+        self._desk, self._jobs, self._trips = desk, jobs, trips
+        self._reply, self._refuse = reply, refuse
+        self._limits, self._most, self._deadline_s, self._room = limits, most, deadline_s, room
+        self._rates: Rates | None = None
+        self._open = 0  # on the desk
+        self._stopping = False
+        self._lane = Lane("features")
+
+    def measure(self) -> Rates:
+        """Find out what computing takes here, before anybody asks."""
+        self._rates = measured()
+        return self._rates
+
+    def ask(self, asker: Asker, payload: bytes) -> None:
+        """A question came in."""
+        if (waiting := self._lane.waiting) >= self._most:
+            self._refuse(asker, Busy(waiting, 0.05))
+        else:
+            self._lane.hand(self._take, asker, payload)
+
+    def stop(self) -> None:
+        """Refuse from now on; returns when all that was asked before is answered or handed to the desk."""
+        self._stopping = True
+        reached = threading.Event()
+        self._lane.hand(reached.set)
+        reached.wait()
+
+    def close(self) -> None:
+        """Return when the answers that are ready are sent; after `stop`, and after the desk is closed."""
+        self._lane.close()
+
+    # ---- on the features lane ---------------------------------------------------------------------------------------
+
+    def _take(self, asker: Asker, payload: bytes) -> None:
+        try:
+            if self._stopping:
+                raise ShuttingDown
+            ask = decode_ask(payload, self._limits)
+            self._check(ask)
+            work, rates = work_of(ask), self._rates or self.measure()
+            count = shards_for(work, rates, self._trips.known, self._jobs.slots("idp"))
+            if count == 0:
+                self._here(asker, payload, ask.sighting.count)
+                return
+        except Problem as problem:
+            self._refuse(asker, problem)
+        except Exception:
+            reference = secrets.token_hex(4)
+            log.exception("fault %s: features", reference)
+            self._refuse(asker, Internal(reference))
+        else:
+            self._desk.hand(self._submit, asker, _Cutting(payload, ask, count, work, rates))
+
+    def _check(self, ask: Ask) -> None:
+        """Is there room for the answer?  Raises TooLarge, OutOfMemory."""
+        size = answer_size(ask)
+        self._room.fits("the answer", size)
+        self._room.check(COPIES * size)
+
+    def _here(self, asker: Asker, payload: bytes, count: int) -> None:
+        done = do_here(Job("in-place", "idp", encode_shard(Shard(payload, 0, count))))
+        if isinstance(done, JobDone):
+            self._reply(asker, encode_answer([(done.payload, IN_PLACE, done.seconds)], clean=True))
+        else:
+            self._refuse(asker, done)
+
+    def _answer(self, question: _Question) -> None:
+        self._reply(question.asker, encode_answer([part for part in question.parts if part], question.clean))
+
+    # ---- on the desk ------------------------------------------------------------------------------------------------
+
+    def _submit(self, asker: Asker, cutting: _Cutting) -> None:
+        if self._open >= self._most:
+            self._refuse(asker, Busy(self._open, 0.05))
+            return
+        self._open += 1
+        # Into no more shards than are begun at once: a shard that waits only repeats what every shard does.
+        count = min(cutting.most, max(1, self._jobs.free("idp")))
+        deadline_s = min(self._deadline_s, _BESIDES_S + _PATIENCE * seconds(cutting.work, cutting.rates, count))
+        shards = [Shard(cutting.payload, first, last) for first, last in cuts(cutting.ask, count)]
+        question = _Question(asker, [None] * len(shards))
+        for place, shard in enumerate(shards):
+            self._jobs.submit(
+                "idp",
+                encode_shard(shard),
+                lambda job, place=place: self._came(question, place, job),
+                deadline_s,
+                _GIVE_UP_S,
+                ahead=1,
+            )
+
+    def _came(self, question: _Question, place: int, job: Ended) -> None:
+        question.clean &= job.tries == 1
+        if question.over:
+            return
+        result = job.result
+        if isinstance(result, JobDone):
+            question.parts[place] = (result.payload, job.worker, result.seconds)
+            if None in question.parts:
+                return
+            self._lane.hand(self._answer, question)
+        else:
+            self._refuse(question.asker, result)
+        question.over = True
+        self._open -= 1

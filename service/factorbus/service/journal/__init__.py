@@ -1,0 +1,1 @@
+"""The journal of a map: written beside the steps, and recovered from."""

@@ -1,0 +1,402 @@
+"""A map's journal at work: a thread that writes down what was folded, and says when it is safe.
+
+    commit   what came of a Run is told when the disk has it: answers, deltas and estimates alike, so nobody ever sees
+             what a crash could take back.  While the disk is busy the next inserts are folded; all that waits then goes
+             into one transaction (group commit)
+    group    told at once, written and safe no later than `group_s` afterwards
+    none     told at once, written now and then, safe when the operating system pleases
+
+When the disk takes nothing: with commit, what was not written did not happen; it is refused, the solver goes back to
+what the journal has, and questions are answered from there.  Else it has been told, so it is kept here and tried again.
+In any case nothing new is taken in until the disk takes something.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeAlias
+
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
+from factorbus.journal.records import Fold
+from factorbus.journal.snapshots import file_of, write_snapshot
+from factorbus.journal.store import Last, Saved, Store, open_store
+from factorbus.service.core.events import Arrived, Judged, Stepped
+from factorbus.service.journal.writing import written
+from factorbus.service.solving.apply import Folder
+
+log = logging.getLogger(__name__)
+
+_NONE_S = 1.0  # durability none: how often what there is gets written
+_PAUSES_S = (0.2, 5.0)  # between tries to write again
+_KEPT_SNAPSHOTS = 2
+_SHARE = 0.05  # of the time that steps take, for copies of the solver's state
+
+Events: TypeAlias = Sequence[Judged | Stepped]
+
+
+class Listener(Protocol):
+    """Who is told what becomes of the writing; called on the journal's thread."""
+
+    def kept(self, events: Events) -> None:
+        """What came of a Run is safe."""
+        ...
+
+    def unkept(self, problem: JournalFailed) -> None:
+        """What `kept` has not been called for did not happen; the solver goes back, and `reloaded` is to be called."""
+        ...
+
+    def blocked(self, problem: JournalFailed) -> None:
+        """The disk takes nothing at the moment."""
+        ...
+
+    def unblocked(self) -> None:
+        """It takes something again."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Folded:
+    number: int
+    inserts: Sequence[Arrived]
+    events: Events
+    further: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _After:
+    call: Callable[[], None]
+    dropped: Callable[[JournalFailed], None]
+
+
+@dataclass(frozen=True, slots=True)
+class _Noted:
+    saved: Saved
+    life: int
+
+
+class _Reloaded:
+    """The solver is where the journal is."""
+
+
+class _Snapshot:
+    """When the solver's state is to be written next, and the thread that does."""
+
+    def __init__(self, every_s: float) -> None:
+        self.every_s = every_s
+        self.steps_s = self.copying_s = 0.0
+        self.thread: threading.Thread | None = None
+        self.fold = 0
+
+    def due(self) -> bool:
+        """Steps have taken long enough, copying takes a small share of it, and none is being written."""
+        waits = max(self.every_s, self.copying_s / _SHARE)
+        return self.steps_s >= waits and (self.thread is None or not self.thread.is_alive())
+
+
+class Keeping(Protocol):
+    """What a host needs to have a journal."""
+
+    def keeper(self, listener: Listener) -> "Keeper":
+        """The keeper, not started yet."""
+        ...
+
+    def reload(self, folder: Folder) -> Last:
+        """Bring `folder` back to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
+        ...
+
+
+class Keeper:
+    """One map's journal.  `hand` to `snapshot`: on the solver's thread only."""
+
+    def __init__(
+        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot_s: float,
+        fingerprint: str, begin: Callable[[Store], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self._store, self._listener = store, listener
+        self._folder, self._durability = store.path.parent, durability
+        self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
+        self._fingerprint, self._begin, self._begun = fingerprint, begin, False
+        self._last, self._number = last, last.fold
+        self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._ending = threading.Event()
+        self._problem: JournalFailed | None = None
+        self._snapshot = _Snapshot(snapshot_s)
+        self._life = 0  # counts how often the solver went back to where the journal ends
+        self._commits, self._commit_s, self._longest_s, self._inserts = 0, 0.0, 0.0, 0
+        self._thread = threading.Thread(target=self._run, name=f"journal {self._folder.name}", daemon=True)
+
+    @property
+    def waits(self) -> bool:
+        """Whether what is folded is told only when `Listener.kept` is called."""
+        return self._durability == "commit"
+
+    def start(self) -> JournalFailed | None:
+        """Begin writing, with what `begin` writes; gives why that cannot be done: then `unblocked` tells when it is."""
+        if (problem := self._try_to_begin()) is not None:
+            log.error("%s", problem)
+        self._problem = problem
+        self._thread.start()
+        return problem
+
+    def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False) -> None:
+        """Write down that `inserts` were folded, and what came of it; of none, a `further` step, which may have been
+        refused, or another solver."""
+        if inserts or events or further:
+            self._number += 1
+            self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
+            self._items.put(_Folded(self._number, inserts, events, further))
+
+    def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
+        """Do `call` when all that was handed in so far is told; `dropped` if it never will be."""
+        if self.waits:
+            self._items.put(_After(call, dropped))
+        else:
+            call()
+
+    def when_written(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
+        """Do `call` when all that was handed in so far is in the journal; `dropped` if it never will be."""
+        self._items.put(_After(call, dropped))
+
+    @property
+    def folds(self) -> int:
+        """How many were handed in, with those that the journal began with."""
+        return self._number
+
+    def reloaded(self, last: Last) -> None:
+        """The solver is where the journal ends."""
+        self._number = last.fold
+        self._life += 1
+        self._items.put(_Reloaded())
+
+    def wants_snapshot(self) -> bool:
+        """Whether a copy of the solver's state is to be handed in now."""
+        return self._snapshot.due() and self._problem is None
+
+    def snapshot(self, state: dict[str, Any], copying_s: float) -> None:
+        """Write `state`, which is that after all that was handed in so far; on a thread of its own."""
+        plan, fold = self._snapshot, self._number
+        plan.steps_s, plan.copying_s = 0.0, copying_s
+        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, fold, self._life), name="snapshot")
+        plan.thread.daemon = True
+        plan.thread.start()
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be written at the moment; empty: it can."""
+        return str(problem.detail["reason"]) if (problem := self._problem) is not None else ""
+
+    def stats(self) -> dict[str, Any]:
+        """What ask/stats says of the journal."""
+        return {
+            "durability": self._durability,
+            "folds": self._last.fold,
+            "revision": self._last.revision,
+            "commits": self._commits,
+            "inserts": self._inserts,
+            "commit_ms": 1e3 * self._commit_s,
+            "longest_commit_ms": 1e3 * self._longest_s,
+            "snapshot_fold": self._snapshot.fold,
+            "blocked": int(self._problem is not None),
+            "problem": self._problem.message if self._problem else "",
+        }
+
+    def close(self, dump: Callable[[], dict[str, Any]] | None) -> None:
+        """Write what is left, and the state that `dump` gives if a restart would take long without; then close."""
+        self._ending.set()
+        self._items.put(None)
+        self._thread.join()
+        if self._snapshot.thread is not None:
+            self._snapshot.thread.join()
+        if self._problem is None and self._store.writable:
+            try:
+                if dump is not None and self._snapshot.steps_s > 0.1 * self._snapshot.every_s:
+                    self._write_snapshot(dump(), self._number, self._life)
+                self._note_snapshots()
+                self._store.end()
+            except JournalFailed as problem:
+                log.error("%s", problem)
+        self._store.close()
+
+    # ---- on the journal's thread ------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        if self._problem is not None:
+            self._wait_until_writable()
+        while (batch := self._next_batch()) is not None:
+            if (problem := self._write(batch)) is None:
+                continue
+            if self.waits:
+                self._listener.unkept(problem)
+                self._drop_until_reloaded(batch, problem)
+                self._wait_until_writable()
+            else:
+                self._listener.blocked(problem)
+                if not self._try_again(batch):
+                    return
+
+    def _next_batch(self) -> list[Any] | None:
+        """All that waits; None: there is nothing, and nothing will come."""
+        first = self._items.get()
+        if first is None:
+            return None
+        if self._pause_s:
+            self._ending.wait(self._pause_s)
+        batch = [first]
+        while True:
+            try:
+                item = self._items.get_nowait()
+            except queue.Empty:
+                return batch
+            if item is None:
+                self._items.put(None)
+                return batch
+            batch.append(item)
+
+    def _write(self, batch: list[Any]) -> JournalFailed | None:
+        """Write `batch` in one transaction and tell; with a problem nothing of it is written or told."""
+        folds, last = [], self._last
+        for item in batch:
+            if isinstance(item, _Folded):
+                fold = written(item.number, item.inserts, item.events, last, item.further)
+                folds.append(fold)
+                last = Last(fold.number, fold.revision, fold.chain)
+        try:
+            if folds:
+                self._append(folds)
+        except JournalFailed as problem:
+            self._problem = problem
+            log.error("%s", problem)
+            return problem
+        self._last = last
+        for item in batch:
+            if isinstance(item, _After):
+                item.call()
+            elif isinstance(item, _Folded) and self.waits:
+                self._listener.kept(item.events)
+            elif isinstance(item, _Noted):
+                self._note(item)
+        return None
+
+    def _append(self, folds: list[Fold]) -> None:
+        started = time.perf_counter()
+        self._store.append(folds)
+        took = time.perf_counter() - started
+        self._commits += 1
+        self._commit_s += took
+        self._longest_s = max(self._longest_s, took)
+        self._inserts += sum(len(fold.entries) for fold in folds)
+
+    def _drop_until_reloaded(self, batch: list[Any], problem: JournalFailed) -> None:
+        """Nothing of what comes before the solver is back where the journal is counts any more."""
+        for item in batch:
+            if isinstance(item, _After):
+                item.dropped(problem)
+        while not isinstance(item := self._items.get(), _Reloaded):
+            if item is None:
+                self._items.put(None)
+                return
+            if isinstance(item, _After):
+                item.dropped(problem)
+
+    def _wait_until_writable(self) -> None:
+        """Try again and again, and let questions through meanwhile."""
+        pause_s, longest_s = _PAUSES_S
+        while True:
+            try:
+                item = self._items.get(timeout=pause_s)
+            except queue.Empty:
+                if self._is_writable():
+                    break
+                pause_s = min(2 * pause_s, longest_s)
+                continue
+            if item is None:
+                self._items.put(None)
+                return
+            if isinstance(item, _After):
+                item.call()
+        self._recovered()
+
+    def _try_again(self, batch: list[Any]) -> bool:
+        """What has been told has to be written, if there is any way; False: there is none, nor for what comes after."""
+        pause_s, longest_s = _PAUSES_S
+        while self._write(batch) is not None:
+            if self._ending.wait(pause_s):
+                lost = sum(len(item.inserts) for item in batch if isinstance(item, _Folded))
+                log.error("%s: %d inserts and more that were answered are not written", self._store.path, lost)
+                return False
+            pause_s = min(2 * pause_s, longest_s)
+        self._recovered()
+        return True
+
+    def _recovered(self) -> None:
+        self._problem = None
+        log.info("%s can be written again", self._store.path)
+        self._listener.unblocked()
+
+    def _is_writable(self) -> bool:
+        try:
+            if not self._begun:
+                self._reopen()
+            self._store.probe()
+        except (JournalFailed, JournalDamaged, JournalUnreadable, JournalVersion, NoJournal) as problem:
+            log.debug("still not: %s", problem)
+            return False
+        return self._try_to_begin() is None
+
+    def _try_to_begin(self) -> JournalFailed | None:
+        """Write what has to be there before anything else, unless it is; gives why that cannot be done."""
+        if not self._store.writable:
+            return JournalFailed(self._store.path, "it is read-only")
+        if not self._begun:
+            try:
+                self._begin(self._store)
+            except JournalFailed as problem:
+                return problem
+            self._begun = True
+        return None
+
+    def _reopen(self) -> None:
+        # The old one is closed first: in one process, what is open for reading keeps all others from writing.
+        self._store.close()
+        self._store = open_store(self._folder, self._durability)
+        if not self._store.writable:
+            raise JournalFailed(self._store.path, "it is read-only")
+
+    # ---- snapshots --------------------------------------------------------------------------------------------------
+
+    def _write_snapshot(self, state: dict[str, Any], fold: int, life: int) -> None:
+        """On a thread of its own; the journal's thread notes it behind the fold that it was made after."""
+        started = time.perf_counter()
+        path = file_of(self._folder, fold)
+        try:
+            size = write_snapshot(path, state)
+        except OSError as error:
+            log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
+            return
+        log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
+        self._items.put(_Noted(Saved(fold, self._fingerprint, size), life))
+
+    def _note(self, noted: _Noted) -> None:
+        """A snapshot counts once it is noted; one of folds that did not happen must not."""
+        saved = noted.saved
+        if noted.life != self._life:
+            file_of(self._folder, saved.fold).unlink(missing_ok=True)
+            return
+        try:
+            old = self._store.add_snapshot(saved, _KEPT_SNAPSHOTS)
+        except JournalFailed as problem:
+            log.warning("snapshot %d is not noted: %s", saved.fold, problem)
+            file_of(self._folder, saved.fold).unlink(missing_ok=True)
+            return
+        self._snapshot.fold = saved.fold
+        for fold in old:
+            file_of(self._folder, fold).unlink(missing_ok=True)
+
+    def _note_snapshots(self) -> None:
+        """Those that were written while the journal's thread ended."""
+        while not self._items.empty():
+            if isinstance(item := self._items.get(), _Noted):
+                self._note(item)

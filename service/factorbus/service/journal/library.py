@@ -1,0 +1,228 @@
+"""The folder of a service's journals: which maps are there, made, opened, and brought to where they were."""
+
+import logging
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
+from factorbus.journal.forking import fork_journal
+from factorbus.journal.lock import Owned, own
+from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
+from factorbus.journal.records import Epoch, Header
+from factorbus.journal.snapshots import remove_strangers
+from factorbus.journal.store import NAME, Last, Store, create, open_store
+from factorbus.proto.nearest import nearest
+from factorbus.proto.problems import Problem
+from factorbus.service.config import Config, Limits
+from factorbus.service.core.map_state import MapCore, Restored
+from factorbus.service.journal.keeping import Keeper, Listener
+from factorbus.service.journal.recovery import Recovered, answers, recover
+from factorbus.service.solving.apply import Folder
+
+log = logging.getLogger(__name__)
+
+
+def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> Folder:
+    """A new folder with a solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
+    from factorbus.solver import Options, Solver
+    from factorbus.solver.errors import BadOption
+
+    known = tuple(field.name for field in fields(Options) if field.name != "clock")
+    for name in options:
+        if name not in known:
+            raise JournalOption(name, "there is no such option here" + nearest(name, known))
+    try:
+        settings = Options(**{**options, "mode": mode, "clock": time.perf_counter})
+    except BadOption as bad:
+        raise JournalOption(str(bad.detail["name"]), bad.message) from None
+    return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
+
+
+def restored(folder: Folder) -> Restored:
+    """How the map in `folder` is."""
+    chi2 = folder.chi2() if folder.revision else 0.0
+    return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished)
+
+
+def log_owner(owner: str) -> None:
+    """Say who is waited for."""
+    log.info("standing by: the journal belongs to %s", owner or "a service that has not said who it is")
+
+
+class Library:
+    """A folder of journals that this process owns."""
+
+    def __init__(self, owned: Owned, config: Config) -> None:
+        self._owned, self._config = owned, config
+        for path in left_behind(owned.folder):
+            shutil.rmtree(path, ignore_errors=True)
+
+    def names(self) -> list[str]:
+        """The maps that there are."""
+        return maps_in(self._owned.folder, NAME)
+
+    def has(self, name: str) -> bool:
+        """Whether there is a map of this name."""
+        return is_map(self._owned.folder / name, NAME)
+
+    def is_taken(self, name: str) -> bool:
+        """Whether a new map cannot have this name: there is one, or a folder that is something else."""
+        return (self._owned.folder / name).exists()
+
+    def mode(self, name: str) -> str:
+        """The mode that map `name` was made in.  Raises JournalDamaged, JournalVersion."""
+        store = open_store(self._owned.folder / name, read_only=True)
+        try:
+            return store.header().mode
+        finally:
+            store.close()
+
+    def make(self, name: str, mode: str, limits: Limits) -> "Kept":
+        """A new map, and its journal.  Raises JournalFailed."""
+        where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
+        folder = make_folder(mode, {}, epoch, limits)
+        store = create(where, name, mode, folder.options(), epoch, self._config.durability)
+        return Kept(store, store.header(), folder, Recovered(store.last(), True, 0, 0), self._config)
+
+    def open(self, name: str, limits: Limits) -> "Kept":
+        """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
+        path = self._owned.folder / name
+        try:
+            store = open_store(path, self._config.durability)
+        except NoJournal:
+            raise JournalDamaged(path, f"{NAME} is missing beside what was written with it") from None
+        try:
+            return _reopened(store, limits, self._config)
+        except Problem:
+            store.close()
+            raise
+        except Exception as fault:  # one map that nobody thought of keeps no other from coming back
+            store.close()
+            log.exception("%s: a fault while it was opened", path)
+            raise JournalDamaged(path, f"opening it ends in {type(fault).__name__} ({fault})") from fault
+
+    def fork(self, source: str, target: str, fold: int, state: Mapping[str, Any], limits: Limits) -> "Kept":
+        """A new map `target` with a journal, which is in `state` as `source` was after `fold`.  Raises Problem."""
+        from factorbus.solver import fingerprint
+
+        where, config, because = self._owned.folder, self._config, f"forked from {source} after fold {fold}"
+        epoch = Epoch(secrets.randbits(62) | 1, fold + 1, because)
+        fork_journal(where / source, where / target, fold, epoch, state, fingerprint())
+        store = open_store(where / target, config.durability)
+        try:
+            header = store.header()
+            folder = make_folder(header.mode, header.options, header.epoch, limits)
+            folder.load(state)
+            return Kept(store, header, folder, Recovered(store.last(), True, fold, 0), config)
+        except BaseException:
+            store.close()
+            self.remove(target)
+            raise
+
+    def remove(self, name: str) -> None:
+        """Forget map `name`, which is closed: first its name, in one go, then its files.  Raises JournalFailed."""
+        path = self._owned.folder / name
+        gone = self._owned.folder / f"{GONE}{name}-{secrets.token_hex(4)}"
+        try:
+            path.rename(gone)
+            sync_folder(self._owned.folder)
+            shutil.rmtree(gone)
+        except OSError as error:
+            raise JournalFailed(path, str(error)) from None
+
+    def say(self, text: str) -> None:
+        """Tell whoever else wants the folder who has it."""
+        self._owned.say(text)
+
+    def close(self) -> None:
+        """Let others own the folder."""
+        self._owned.release()
+
+
+class Kept:
+    """A map with its journal, open: what a host and its core are to begin with."""
+
+    def __init__(
+        self, store: Store, header: Header, folder: Folder, recovered: Recovered, config: Config,
+        epoch: Epoch | None = None,
+    ) -> None:  # fmt: skip
+        """epoch: a new one, which is not in the journal yet."""
+        self.store, self.folder, self.recovered = store, folder, recovered
+        self.header = replace(header, epochs=(*header.epochs, epoch)) if epoch else header
+        self._config, self._epoch = config, epoch
+        folder.enter(self.header.epoch)
+
+    def restore(self, core: MapCore) -> None:
+        """Tell `core` how the map is."""
+        limits, epoch = self._config.limits, self.header.epochs[-1]
+        senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
+        core.restore(
+            [(sender.client, sender.next, answers(sender)) for sender in senders],
+            restored(self.folder),
+        )
+
+    def keeper(self, listener: Listener) -> Keeper:
+        """As `keeping.Keeping`."""
+        from factorbus.solver import fingerprint
+
+        config = self._config
+        return Keeper(
+            self.store, self.recovered.last, listener, config.durability, config.group_s, config.snapshot_s,
+            fingerprint(), lambda store: store.begin(config.durability, self._epoch),
+        )  # fmt: skip
+
+    def reload(self, folder: Folder) -> Last:
+        """As `keeping.Keeping`."""
+        from factorbus.solver import fingerprint
+
+        store = open_store(self.store.path.parent, read_only=True)
+        try:
+            return recover(store, folder, fingerprint()).last
+        finally:
+            store.close()
+
+
+def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> Library | None:
+    """The library that `config` names, owned by this process; None if `stop` was set while standing by.
+
+    Raises JournalInUse, UnsafeJournal, JournalFailed.
+    """
+    folder = Path(config.journal)
+    try:
+        owned = own(folder, stop if config.standby else None, waiting)
+    except OSError as error:
+        raise JournalFailed(folder, str(error)) from None
+    return Library(owned, config) if owned is not None else None
+
+
+def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
+    from factorbus.solver import fingerprint
+
+    started = time.perf_counter()
+    store.check_form()
+    header = store.header()
+    folder = make_folder(header.mode, header.options, header.epoch, limits)
+    recovered = recover(store, folder, fingerprint())
+    if store.writable:
+        remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
+    epoch = None
+    if because := _reason_for_an_epoch(header, recovered):
+        epoch = Epoch(secrets.randbits(62) | 1, recovered.last.fold + 1, because)
+        log.warning("%s: a new epoch, because %s", store.path, because)
+    log.info(
+        "map %s is back at revision %d in %.2f s: snapshot %d and %d folds after it", header.map,
+        recovered.last.revision, time.perf_counter() - started, recovered.from_fold, recovered.folds,
+    )  # fmt: skip
+    return Kept(store, header, folder, recovered, config, epoch)
+
+
+def _reason_for_an_epoch(header: Header, recovered: Recovered) -> str:
+    """Clients must not go on from what is not there any more."""
+    if header.durability != "commit" and not header.clean:
+        return f"it was not closed in order, and durability {header.durability} does not keep what was answered last"
+    return "" if recovered.same else "values have other bits than they had: another version or machine made them"

@@ -1,0 +1,37 @@
+"""What is written down of a Run: its inserts in their order, what became of each, and a digest of what changed."""
+
+from collections.abc import Sequence
+
+from factorbus.journal import chain
+from factorbus.journal.digest import sealed
+from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
+from factorbus.journal.store import Last
+from factorbus.proto import codec
+from factorbus.service.core.events import Arrived, Judged, Outcome, Stepped
+from factorbus.solver.errors import SolverError
+
+
+def written(
+    number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last, further: bool = False
+) -> Fold:
+    """What is written down of a Run.  further: it was for a further step, which may have been refused."""
+    present, revision, rebuilt, reordered = last.chain, last.revision, False, None
+    outcomes: dict[int, tuple[Outcome, Judged]] = {}
+    for event in events:
+        if isinstance(event, Judged):
+            outcomes |= {id(outcome.insert): (outcome, event) for outcome in event.outcomes}
+            revision = max(revision, event.revision)
+        else:
+            present, revision = chain.follow(present, event.delta), event.revision
+            rebuilt, reordered = rebuilt or event.rebuilt, event.reordered
+    entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
+    return Fold(number, revision, rebuilt, present, entries, reordered, further and not rebuilt)
+
+
+def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:
+    if isinstance(outcome.answer, bytes):
+        answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, outcome.answer
+    else:
+        tried = REFUSED if isinstance(outcome.answer, SolverError) else UNTRIED
+        answer = tried, judged.revision, -1, 0, codec.encode_problem(outcome.answer)
+    return sealed(Entry(insert.client, insert.sequence, 0, *answer, insert.message))

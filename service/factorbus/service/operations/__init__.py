@@ -1,0 +1,1 @@
+"""What an operator meets: the start, the health report, the metrics."""

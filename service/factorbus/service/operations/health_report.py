@@ -1,0 +1,62 @@
+"""What the service knows of itself: is it alive, is there memory, and the account that an operator reads."""
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from factorbus.proto.version import __version__
+from factorbus.service.config import Config
+from factorbus.service.maps.host import Host
+from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.process.health import Health, Pulse, Signs
+from factorbus.service.process.memory import Memory
+
+# What others have to say in the account, by name: a function for each, called on any thread.
+Chapters = dict[str, Callable[[], Any]]
+
+
+class Vitals:
+    """Of one service.  `look` is for the thread that ticks; the rest may be called from any."""
+
+    def __init__(
+        self, config: Config, service: str, lanes: Mapping[str, Lane], hosts: Callable[[], Mapping[str, Host]]
+    ) -> None:
+        """hosts: the maps there are at the moment."""
+        self.health = Health(config.stuck_s)
+        self.memory = Memory(config.limits.memory_bytes)
+        self.chapters: Chapters = {}
+        self._service, self._started = service, time.monotonic()
+        self._pulses = {name: Pulse(lane.hand) for name, lane in lanes.items()}
+        self._hosts = hosts
+
+    def look(self) -> set[str]:
+        """Measure memory, feel every pulse; returns the maps whose solver is stuck."""
+        hosts = self._hosts()
+        self.memory.look()
+        now = time.monotonic()
+        lanes = {name: pulse.silent_s(now) for name, pulse in self._pulses.items()}
+        solvers = {name: host.silent_s() for name, host in hosts.items()}
+        closed = {name: why for name, host in hosts.items() if (why := host.unwritable)}
+        self.health.seen(Signs(now, lanes | {f"solver {name}": seconds for name, seconds in solvers.items()}, closed))
+        return {name for name, seconds in solvers.items() if seconds > self.health.stuck_s}
+
+    def account(self) -> dict[str, Any]:
+        """What admin/stats says, and what the metrics are made of."""
+        from factorbus.service.operations.warm import compiled_seconds
+
+        return {
+            "service": self._service,
+            "version": __version__,
+            "pid": os.getpid(),
+            "uptime_s": time.monotonic() - self._started,
+            "alive": self.health.alive(),
+            "ready": self.health.ready(),
+            "stuck": self.health.stuck(),
+            "lacking": self.health.lacking(),
+            "silent_s": self.health.silent_s(),
+            "memory": {"resident_bytes": self.memory.resident, "limit_bytes": self.memory.limit},
+            "kernels_compiled_s": compiled_seconds(),
+            "maps": [host.account() for host in self._hosts().values()],
+            **{name: read() for name, read in self.chapters.items()},
+        }

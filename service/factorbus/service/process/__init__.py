@@ -1,0 +1,1 @@
+"""The process: its memory, its threads, whether it is alive."""

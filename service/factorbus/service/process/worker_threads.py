@@ -1,0 +1,62 @@
+"""Threads that lend their cores to the eliminations of all maps, which are long in large ones.  MATH §9.5."""
+
+import os
+import threading
+from typing import Any
+
+from factorbus.service.process.control_groups import limit_files
+from factorbus.solver.sparse.lending import Lender, can_lend, count_free
+
+
+def core_count() -> int:
+    """Cores that this process may run on, and has the time of: of its control groups, or of the machine."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    shares = [float(there)]
+    for path in limit_files("cpu", "cpu.cfs_quota_us", "cpu.max"):
+        try:
+            text = path.read_text()
+            if path.name != "cpu.max":  # version 1 has the period in a file of its own
+                text += path.with_name("cpu.cfs_period_us").read_text()
+            quota, period = map(int, text.split())
+        except (OSError, ValueError):  # not there, or "max"
+            continue
+        if quota > 0:
+            shares.append(quota / period)
+    return max(int(min(shares)), 1)
+
+
+class LentCores:
+    """Until it is closed, an elimination may be at work on `cores` of those that there are at once.
+
+    From when the kernel that eliminates is at hand: threads that asked for it before would compile it, for nobody yet,
+    and whoever closes this would have to wait for them.
+    """
+
+    def __init__(self, cores: int) -> None:
+        self._more = min(cores, core_count()) - 1
+        self._lenders: list[Lender] = []
+        self._threads: list[threading.Thread] = []
+        self.tick()
+
+    def tick(self) -> None:
+        """Time went by: somebody may have compiled or loaded the kernel."""
+        if self._threads or not can_lend():
+            return
+        self._lenders = [Lender() for _ in range(min(self._more, count_free()))]
+        self._threads = [
+            threading.Thread(target=lender.lend, name=f"core {n}", daemon=True)
+            for n, lender in enumerate(self._lenders, 1)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def account(self) -> dict[str, Any]:
+        """How many that is, with the one that a map's own thread has; pieces of eliminations that the others made."""
+        return {"used": 1 + len(self._threads), "pieces": sum(lender.made for lender in self._lenders)}
+
+    def close(self) -> None:
+        """Eliminations go on alone; returns when the threads have ended."""
+        for lender in self._lenders:
+            lender.leave()
+        for thread in self._threads:
+            thread.join()

@@ -1,0 +1,1 @@
+"""The solver of a map: inserts are parsed, applied in one step, and judged."""

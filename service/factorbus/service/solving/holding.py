@@ -1,0 +1,262 @@
+"""The solver of one map, and what it is known to hold: questions to it, copies, and another one in its place.
+
+A fault of the solver itself (anything but SolverError) leaves it in a state nobody can vouch for.  It is replaced by
+a new one with the content that had been accepted, which comes first and is counted here, and the whole estimate is
+published again.
+"""
+
+import logging
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+
+from factorbus.proto import codec
+from factorbus.proto.messages import Delta
+from factorbus.proto.problems import Problem
+from factorbus.service.config import Limits
+from factorbus.service.core.events import Stepped
+from factorbus.service.questions.answers import Copied, Question, Snapshot, snapshot
+from factorbus.service.questions.question_memory import Room
+from factorbus.service.questions.uncertainty import Uncertain
+from factorbus.solver.divergence import check_step, is_usual, undone
+
+# Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
+# each up to twice what the solver has in use, as arrays double when they grow (measured: 1.7 times for 10,000 poses).
+_COPIES = 6
+
+log = logging.getLogger(__name__)
+
+
+class Broken(Problem):
+    """The solver failed and its content could not be brought back: the map answers nothing more."""
+
+    code = "internal"
+
+    def __init__(self, reference: str) -> None:
+        super().__init__(
+            f"the map is broken since fault {reference} (see the service's log); drop it and insert again",
+            reference=reference,
+        )
+
+
+class Holding:
+    """A solver with its revision and what had been accepted.  For one thread at a time."""
+
+    def __init__(
+        self, make_solver: Callable[[], Any], epoch: int, limits: Limits, options: Mapping[str, Any] | None = None
+    ) -> None:
+        self._options = dict(options or {})
+        self._make, self._epoch, self._limits = make_solver, epoch, limits
+        self._solver: Any = make_solver()
+        self._revision = 0
+        self._account: dict[str, Any] = {}  # of the last step
+        self._uncertain: Uncertain | None = None  # R at this revision, if somebody asked
+        self._held = (0, 0)  # variables and factors that were accepted
+        self._converged, self._unfinished = True, False
+        self._broken = ""
+        self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
+        self._room = Room()
+
+    def bound(self, room: Room) -> None:
+        """Questions may take no more than this."""
+        self._room = room
+
+    def snapshot(self, questions: Sequence[Question]) -> Snapshot:
+        """Copies of what `questions` need, at the present revision.  Raises Broken."""
+        if self._broken:
+            raise Broken(self._broken)
+        taken = snapshot(
+            self._solver, self._epoch, self._revision, questions, self._account, self._uncertain, self._room
+        )
+        self._uncertain = taken.uncertain
+        rooms = [question.ask.room for question in questions if question.name == "copy"]
+        return replace(taken, copied=self._copied(min(rooms))) if rooms else taken
+
+    def options(self) -> dict[str, Any]:
+        """The settings of its solver."""
+        return self._options
+
+    @property
+    def revision(self) -> int:
+        """Steps that were made."""
+        return self._revision
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Variables and factors."""
+        return self._solver.variable_count, self._solver.factor_count
+
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate."""
+        return float(self._solver.chi2())
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step had; of an empty map, it has."""
+        return self._converged
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether a further step would bring the estimate nearer to its optimum."""
+        return self._unfinished
+
+    def enter(self, epoch: int) -> None:
+        """From now on answers and deltas name this epoch."""
+        self._epoch = epoch
+
+    def dump(self) -> dict[str, Any]:
+        """All that later folds depend on, a copy.  Raises Broken."""
+        if self._broken:
+            raise Broken(self._broken)
+        state = {"revision": self._revision, "held": list(self._held), "converged": self._converged}
+        return {"solver": self._solver.dump()} | state
+
+    def _copied(self, room: int) -> Copied:
+        """All of it, if another folder and what lies between them fit into so many bytes."""
+        size = _COPIES * self.memory_bytes()
+        return Copied(self.dump() if size <= room else None, size)
+
+    def load(self, state: Mapping[str, Any] | None) -> None:
+        """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
+        self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
+        self._held, self._converged, self._unfinished = (0, 0), True, False
+        if state is not None:
+            self._solver.load(state["solver"])
+            self._wary = not is_usual(self._solver)
+            self._revision = int(state["revision"])
+            self._held = tuple(state["held"])
+            self._converged = bool(state["converged"])
+            self._unfinished = bool(self._solver.unfinished)
+
+    def content(self) -> dict[str, Any]:
+        """What another one `beside` this one begins with, a copy.  Raises Broken."""
+        if self._broken:
+            raise Broken(self._broken)
+        return {"graph": self._solver.to_order_anew(), "revision": self._revision, "held": list(self._held)}
+
+    def beside(self, content: Mapping[str, Any]) -> Self:
+        """Another one of the same map, where all of `content` is ordered anew; it is to be given what came since.
+
+        Takes as long as all of the map takes to eliminate, on any thread.  Raises SolverError.
+        """
+        made = type(self)(self._make, self._epoch, self._limits, self._options)
+        report = made._solver.order_anew(content["graph"])
+        check_step(made._solver, report)
+        made._account = report.as_dict()
+        made._converged = _has_converged(made._account)
+        made._revision, made._held = int(content["revision"]), tuple(content["held"])
+        return made
+
+    def take_place(self, other: Self, after: int, because: str) -> Stepped:
+        """Go on with the solver of `other`, which has all that this one has: a step, whose delta has everything.
+
+        after: the fold after which `other` began.
+        """
+        started = time.perf_counter()
+        self._solver = other._solver
+        account = other._account | {
+            "strategy": "full", "because": because, "chi2": self.chi2(), "new_variables": 0, "new_factors": 0,
+            "changed": self._solver.variable_count,
+        }  # fmt: skip
+        everything = tuple(self._solver.estimate())
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(account)
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
+        told = account["strategy"], account["chi2"], account["solver_ms"]
+        left = {"converged": self._converged, "unfinished": self._unfinished}
+        return Stepped(self._revision, delta, *told, reordered=after, **left)
+
+    @property
+    def nonzeros(self) -> int:
+        """Of R, as of the last step; 0: not known, or R is not kept from step to step."""
+        known = self._account.get("mode") == "bayes-tree" and not self._broken
+        return int(self._account.get("nnz_r", 0)) if known else 0
+
+    @property
+    def solver(self) -> Any:
+        """To see whether it was replaced."""
+        return self._solver
+
+    def memory_bytes(self) -> int:
+        """What its solver has in use."""
+        return int(self._solver.memory_bytes())
+
+    def _told(self, account: dict[str, Any], previous: int | None = None) -> Stepped:
+        """The solver's last step, with its delta; what it takes to find out what changed is the solver's time, too."""
+        previous = self._revision - 1 if previous is None else previous
+        started = time.perf_counter()
+        changed = self._solver.changed()
+        account["solver_ms"] += (time.perf_counter() - started) * 1e3
+        delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
+        told = account["strategy"], account["chi2"], account["solver_ms"]
+        return Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
+
+    def _next(self, account: dict[str, Any]) -> None:
+        """The solver has made a step: its `account` says, too, whether more are to follow."""
+        self._revision += 1
+        self._account, self._uncertain = account, None
+        self._converged, self._unfinished = _has_converged(account), bool(self._solver.unfinished)
+        account["converging"] = self._unfinished or not self._converged
+
+    def _fault(self) -> str:
+        """Log what is being handled; the reference under which it is found."""
+        reference = secrets.token_hex(4)
+        log.exception("fault %s: the solver failed; starting a new one with what had been accepted", reference)
+        return reference
+
+    def _replace_solver(self, reference: str) -> Iterator[Stepped]:
+        """A new solver with what had been accepted, and the step that brought it there."""
+        try:
+            account = self._rebuild()
+            if account is not None:
+                self._next(account)
+                yield self._told(account)._replace(rebuilt=True)
+        except Exception:
+            self._broken = reference
+            log.exception("fault %s: what had been accepted could not be brought back; the map is broken", reference)
+
+    def _go_back(self, report: Any) -> Iterator[Stepped]:
+        """The last step, which gave `report`, does not count: what was there before it, in a new solver.
+
+        That is a step of its own, whose delta has everything; the revision of the one that does not count was not used.
+        """
+        started = time.perf_counter()
+        try:
+            solver, own = undone(self._solver, report, *self._held)
+        except Exception:
+            self._broken = secrets.token_hex(4)
+            log.exception("fault %s: a step could not be undone; the map is broken", self._broken)
+            return
+        self._solver = solver
+        if not any(self._held):
+            return
+        account = own.as_dict() | {
+            "strategy": "full", "because": "a step that diverged was undone", "new_variables": 0, "new_factors": 0,
+            "solver_ms": (time.perf_counter() - started) * 1e3,
+        }  # fmt: skip
+        self._next(account)
+        yield self._told(account)
+
+    def _rebuild(self) -> dict[str, Any] | None:
+        """What had been accepted are the first variables and factors: whatever a failed insert left is behind them."""
+        variables, _ = self._solver.graph(*self._held)
+        for group in variables:
+            if not np.isfinite(group.values).all():
+                raise ValueError(f"the failed solver's values of {group.kind} are not finite")
+        fresh, started = self._make(), time.perf_counter()
+        report = fresh.renew(self._solver, *self._held)
+        found = fresh.variable_count, fresh.factor_count
+        if found != self._held:
+            raise ValueError(f"the failed solver holds {found} variables and factors; accepted were {self._held}")
+        self._solver = fresh
+        if not any(self._held):
+            return None
+        return report.as_dict() | {"solver_ms": (time.perf_counter() - started) * 1e3}
+
+
+def _has_converged(account: Mapping[str, Any]) -> bool:
+    return bool(account.get("converged", True))

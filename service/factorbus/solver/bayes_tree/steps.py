@@ -1,0 +1,277 @@
+"""Steps in the mode "bayes-tree": the tree of cliques does the work, and Levenberg-Marquardt on all of Λ is behind it.
+
+A step solves a linear problem, measures χ² at the estimate that it comes to, and relinearizes what is too far from its
+linear model (MATH §9.6).  One that raises χ² is replaced by Levenberg-Marquardt from where the estimate stood.
+"""
+
+import copy
+import math
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.inc_l.incremental import Incremental
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.step import FINISHED, LEAST_CHI2
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.chi2 import sum_chi2
+from factorbus.solver.kernels.model.retract import differing
+from factorbus.solver.optimize.gauss_newton import Course, minimise
+from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
+from factorbus.solver.optimize.system import System
+from factorbus.solver.options import Options
+from factorbus.solver.report import Shares, StepReport, Stopwatch
+from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.elimination import Elimination
+from factorbus.wording import counted
+
+_START: Mark = (0,) * at.COUNTS
+_ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
+_COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
+_NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
+# What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
+# hundred times what it comes to.
+_FINISHED_LEFT = 1e-7
+# By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
+_AT_END = 1e-6
+# Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
+_STILL = 0.1
+_WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
+_ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
+_GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
+_new = tuple.__new__
+
+
+class TreeSteps:
+    """Solves for what is new in a graph, step by step."""
+
+    NOT_KEPT = ("_graph", "_options", "before_batch")
+
+    def __init__(self, graph: Graph, options: Options) -> None:
+        self._graph, self._options = graph, options
+        self._tree = Tree(graph, options)
+        self._mark = graph.mark()
+        self._first_new, self._batched, self._held = 0, False, False
+        self._bounded = True  # whether the last step ended within its bound
+        self._moved: I64 = np.empty(0, np.int64)  # by a batch
+        self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
+
+    @property
+    def tree(self) -> Tree:
+        """For tests."""
+        return self._tree
+
+    @property
+    def mark(self) -> Mark:
+        """How much of the graph there was after the last step."""
+        return self._mark
+
+    def step(self, settle: bool) -> StepReport:
+        """As `Solver.step`."""
+        clock = self._options.clock
+        started = clock() if clock else 0.0
+        tree, because = self._tree, ""
+        try:
+            status = tree.step()
+            if status == tl.UNSURE:
+                because = self._check_held()
+                status = tree.step(sure=True)
+            if status == tl.FAILED:
+                raise self._system(self._apart()).underconstrained(tree.failed)
+            if status == tl.INFINITE:
+                raise errors.NotFinite("χ² of the new factors")
+        except BaseException:
+            self._graph.forget(self._mark)
+            raise
+        compiled = clock() if clock else 0.0
+        self._held = False
+        if not settle and not tree.state.item(tl.S_AFTER):
+            return self._account(started, compiled, None, because)
+        course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
+        return self._account(started, compiled, course, because)
+
+    def rebase(self, fewer: int) -> None:
+        """So many of the factors that were there after the last step are gone."""
+        mark = list(self._mark)
+        mark[at.FACTORS] -= fewer
+        self._mark = tuple(mark)
+
+    def forget(self) -> None:
+        """What came since the last step was never there."""
+        self._graph.forget(self._mark)
+
+    def start_over(self) -> None:
+        """A new tree for the graph as it is, which leaves the estimate where it is."""
+        self._begin_anew(self._graph.values)
+
+    def changed(self) -> I64:
+        """The variables whose values have other bits than before the last step, new ones included."""
+        if self._batched:
+            return self._moved
+        return self._tree.list_moved(self._first_new)
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether a step with nothing new may bring the estimate nearer to the optimum by what χ² shows, (9.27)."""
+        _, chi2, _, error, _, _, _, left, *_ = self._tree.account.tolist()
+        share = max(chi2, 0.0) + LEAST_CHI2
+        scalars = int(self._graph.counts[at.SCALARS])
+        if self._held or self._tree.raised:
+            return not self._is_within(_AT_END, chi2)
+        return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
+
+    def _is_within(self, share: float, chi2: float) -> bool:
+        """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
+        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._tree.account.item(tl.A_LEAST) + LEAST_CHI2)
+
+    def chi2(self) -> float:
+        """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
+        return max(self._sum_chi2(self._mark[at.FACTORS]), 0.0)  # pieces of a form sum to zero but for rounding
+
+    def _check_held(self) -> str:
+        """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
+        suspects = find_unheld(self._graph, self._mark)
+        if not suspects.size:
+            return ""
+        free = find_unanchored(self._graph, self._mark)
+        system = self._system(self._apart())
+        if free >= 0:
+            raise system.underconstrained(
+                free,
+                "nothing joins it to a fixed variable or a prior; fix a variable, or add a prior or a factor to the "
+                "rest of the map",
+            )
+        system.begin(suspects, Stopwatch(None))
+        system.factorize(0.0)
+        return f"only several factors together hold {counted(suspects.size, 'new variable')}"
+
+    def _complete(self, settle: bool, because: str) -> tuple[Course | None, str]:
+        """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
+        tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
+        chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
+        course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
+        continues = self._graph.mark() == self._mark
+        goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
+        if settle or worse or rises or goes_on:
+            tree.exchange()
+            before = self._graph.values.copy()
+            if not worse:
+                tree.exchange()
+            course = self._batch(before, settle, continues)
+            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON
+            # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
+            if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
+                course.converged = True
+            if course and course.converged:
+                tree.account[tl.A_LEAST] = tree.account[tl.A_CHI2]
+            # The tree's own step followed, and what it was before is that of the step.
+            tree.account[tl.A_BEFORE] = chi2_before
+        if not math.isfinite(tree.account[tl.A_CHI2]):
+            self._begin_anew(before)
+            raise errors.NotFinite("χ² of the estimate after the step")
+        return course, because
+
+    def _begin_anew(self, before: F64) -> None:
+        """The graph as it was before the step, at the values `before`, and a tree made for it that leaves it there."""
+        self._graph.values = before
+        self._graph.forget(self._mark)
+        self._tree.clear()
+        if self._graph.counts[at.VARIABLES]:
+            self._tree.step(sure=True)
+            self._tree.hold()
+            self._held = True
+
+    def _apart(self) -> Graph:
+        """The graph with rows of its own, for equations that leave it as it is."""
+        graph = copy.copy(self._graph)
+        graph.var, graph.fac = graph.var.copy(), graph.fac.copy()
+        return graph
+
+    def _system(self, graph: Graph) -> System:
+        """All normal equations at the estimate, apart from the tree."""
+        options = self._options
+        system = System(graph, Incremental(Elimination(options), options))
+        system.blocks.extend(graph, _START)
+        system.factor.moved()
+        return system
+
+    def _batch(self, before: F64, settle: bool, continues: bool) -> Course:
+        """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows, and stays where they
+        end if its own step from there would raise χ².
+
+        before: the values as they were before the step.  continues: with nothing new
+        """
+        options, self.before_batch = self._options, before
+        system = self._system(self._graph)
+        system.begin(np.empty(0, np.int64), Stopwatch(None))
+        chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
+        rule = (further_rule if continues else ordinary_rule)(options, options.tolerance)
+        if settle:
+            rule = settling_rule(options)
+        course = minimise(system, chi2, 0.0, rule)
+        if course.iterations or not settle:
+            self._tree.move_all()
+            self._tree.step()
+            self._held = not self._tree.account[tl.A_CHI2] <= course.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
+            if self._held:
+                self._tree.hold()
+        count = int(self._graph.counts[at.VARIABLES])
+        found = np.empty(count, np.int64)
+        bits = before.view(np.int64), self._graph.values.view(np.int64)
+        self._moved = found[: differing(self._mark[at.VARIABLES], count, self._graph.var, *bits, found)]
+        return course
+
+    def _sum_chi2(self, factors: int) -> float:
+        graph = self._graph
+        return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
+
+    def _account(self, started: float, compiled: float, course: Course | None, because: str) -> StepReport:
+        before, self._mark = self._mark, self._graph.mark()
+        now, clock = self._mark, self._options.clock
+        self._first_new, self._batched = before[at.VARIABLES], course is not None
+        told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
+        nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
+        compiled_ms = 1e3 * (compiled - started)
+        _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
+        chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
+        share = self._options.converged_share
+        converged = course.converged if course else error <= allowed
+        if not course and self._tree.raised:
+            converged &= self._is_within(share, chi2)
+        bounded = converged
+        if not course and not self._bounded:  # in a long valley a step gains hardly less than the one before
+            converged &= chi2_before - chi2 <= _STILL * share * (chi2 + LEAST_CHI2)
+        self._bounded = bounded
+        # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
+        # the rest.
+        return _new(StepReport, (
+            "bayes-tree",
+            "batch" if course else ("tree" if moved or relinearised else "extend"),
+            because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
+            course.iterations if course else rounds,
+            chi2,
+            max(chi2_before, 0.0),
+            now[at.VARIABLES] - before[at.VARIABLES],
+            now[at.FACTORS] - before[at.FACTORS],
+            self._moved.size if course else changed,
+            relinearised,
+            eliminated,
+            asleep,
+            nonzeros,
+            float(flops),
+            0.0,  # damping
+            converged,
+            Shares(tl.PHASES, told[_COUNTS:], compiled_ms),
+            1e3 * (clock() - started) if clock else 0.0,
+            compiled_ms,
+        ))  # fmt: skip
+
+
+def _relinearized(count: int, rounds: int) -> str:
+    """Why a step did more than solve.  In several rounds one variable counts as often as it was relinearized."""
+    if rounds > 1:
+        return f"{counted(count, 'relinearization')} in {rounds} rounds"
+    return f"{counted(count, 'variable')} relinearized"

@@ -1,0 +1,195 @@
+"""The tree of cliques: per-step work in proportion to what a step changes.  MATH §9.
+
+This is the memory of `kernels/bayes_tree/step.py`, which does the work in one call; here is what grows.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from factorbus.solver.graph import pages
+from factorbus.solver.graph.arenas import Arenas, lines
+from factorbus.solver.graph.factor_graph import Graph, grown, roomy
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
+from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_moved
+from factorbus.solver.kernels.bayes_tree.reset_estimate import hold_at_linearization
+from factorbus.solver.kernels.bayes_tree.step import tree_step
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.task_queue import NOBODY
+from factorbus.solver.options import Options
+from factorbus.solver.sparse.lending import BOARD
+
+_FEW = 8  # new variables for which good first values are looked for
+
+
+class Tree(Arenas):
+    """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
+
+    ARENAS = tl.ARENAS
+    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
+
+    def __init__(self, graph: Graph, options: Options) -> None:
+        self._graph, self._rest = graph, options.rest
+        self.settings: F64 = np.empty(tl.P_SIZE)
+        self.settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
+        self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
+        self.settings[[tl.P_CONVERGED, tl.P_RECENT]] = options.converged_share, options.recent_steps
+        self.settings[[tl.P_SOON, tl.P_PATIENCE, tl.P_MOST]] = (
+            options.bent_soon,
+            options.patience,
+            options.bent_most,
+        )
+        self.settings[tl.P_MANY] = options.many
+        self.settings[[tl.P_REST, tl.P_RELUCTANCE, tl.P_DEAR]] = options.rest, options.reluctance, options.dear
+        self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
+        self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_AROUND]] = options.heavy, options.near, options.around
+        self.settings[[tl.P_WORTH, tl.P_RINGS, tl.P_DETOUR]] = options.worth, options.rings, options.detour
+        self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
+        self.clear()
+
+    @contextmanager
+    def placing_none(self) -> Iterator[None]:
+        """While inside, variables that are new to the tree stay at the values that they have."""
+        place, self.settings[tl.P_PLACE] = self.settings[tl.P_PLACE], -1
+        try:
+            yield
+        finally:
+            self.settings[tl.P_PLACE] = place
+
+    def clear(self) -> None:
+        """Let go of everything: the next step takes in the whole graph."""
+        self.node: I64 = lines((256, tl.N_WIDTH), np.int64)
+        self.link: I64 = lines((512, tl.L_WIDTH), np.int64)
+        self.clique: I64 = lines((256, tl.C_WIDTH), np.int64)
+        self.motions: F64 = lines(256 * tl.M_WIDTH, np.float64)
+        self.lists: I64 = np.empty(4096, np.int64)
+        self.numbers: F64 = pages.zeros(16384)
+        self.hessian: F64 = pages.zeros(16384)
+        self.lin: F64 = np.empty((3, 1024))
+        self.scalars: F64 = np.zeros((3, 1024))
+        self.stiff: F64 = lines((512, tl.B_WIDTH), np.float64)
+        self.turns: F64 = lines((256, tl.U_WIDTH), np.float64)
+        self.pending: I64 = np.empty(256, np.int64)
+        self.changed: I64 = np.empty(256, np.int64)
+        self.moved: I64 = np.empty(256, np.int64)
+        self.marked: I64 = np.empty(256, np.int64)
+        self.saved: F64 = np.empty((16, 8))
+        self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
+        self.account: F64 = np.zeros(tl.A_SIZE)
+        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARISED_AT] = -1, -self._rest
+        self.state[tl.S_NUMBERS] = fr.SCRATCH
+
+    def step(self, sure: bool = False) -> int:
+        """Take in what is new in the graph and solve; gives a status: DONE, UNSURE, FAILED, INFINITE.
+
+        UNSURE: only the numbers can tell whether everything new is held; the next call is to be with `sure`.  FAILED:
+        the pivot of variable `failed` was not positive.  INFINITE: the χ² of a new factor is beyond numbers.  After
+        these nothing has changed, and the graph has to forget what is new where it is to be refused.
+        """
+        if sure:
+            self.state[tl.S_CHECKED] = 1
+        while (status := tree_step(self._graph.places, self.places, BOARD, NOBODY)) == tl.NO_ROOM:
+            self._make_room()
+        return status
+
+    @property
+    def rises(self) -> bool:
+        """Whether the last round of the step raised χ², so that it went no further."""
+        return bool(self.state[tl.S_RISES])
+
+    @property
+    def raised(self) -> bool:
+        """Whether pivots were raised, so that R alone does not lead to the optimum."""
+        return bool(self.state[tl.S_RAISED])
+
+    @property
+    def failed(self) -> int:
+        """The variable whose pivot made the last step fail."""
+        return int(self.state[tl.S_FAILED])
+
+    def move_all(self) -> None:
+        """The next step moves the linearisation points of all variables to the estimate."""
+        var = self._graph.var[: self.state[tl.S_VARIABLES]]
+        free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
+        self.node[free, tl.N_FLAGS] = 1
+        self.pending[: free.size] = free
+        self.state[tl.S_PENDING] = free.size
+        self.state[[tl.S_DUE, tl.S_ONCE]] = 1
+        self.state[tl.S_RAISED] = 0
+
+    def hold(self) -> None:
+        """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""
+        hold_at_linearization(self._graph.places, self.places)
+
+    def list_moved(self, first_new: int) -> I64:
+        """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
+        graph = self._graph
+        found = np.empty(self.state.item(tl.S_CHANGED) + graph.counts.item(at.VARIABLES) - first_new, np.int64)
+        return found[: list_moved(first_new, graph.places, self.places, found)]
+
+    def exchange(self) -> None:
+        """Exchange the estimate and the one from before the last step, of the variables that it changed."""
+        changed = self.changed[: self.state[tl.S_CHANGED]]
+        exchange(changed, self._graph.var, self.lin, self._graph.values)
+
+    def memory_bytes(self) -> int:
+        """Bytes in use of all arenas."""
+        variables, factors, cliques, lists, numbers, hessian = (
+            int(self.state[entry])
+            for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
+        )
+        counts = self._graph.counts
+        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.B_WIDTH)
+        rows += cliques * (tl.C_WIDTH + tl.M_WIDTH)
+        columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
+        return 8 * (rows + columns + lists + numbers + hessian)
+
+    def in_use(self) -> dict[str, int]:
+        """Of the arenas that are by far the largest, how many entries a copy needs."""
+        return {"numbers": int(self.state[tl.S_NUMBERS]), "hessian": int(self.state[tl.S_HESSIAN])}
+
+    def _make_room(self) -> None:
+        self._make_room_for_graph()
+        state = self.state
+        if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
+            self.clique = grown(self.clique, need)
+            self.motions = grown(self.motions, len(self.clique) * tl.M_WIDTH)
+        if len(self.clique) > self.marked.size:
+            self.marked = np.empty(len(self.clique), np.int64)
+        if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
+            self.lists = grown(self.lists, need)
+        if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
+            state[tl.S_FRESH] = min(int(state[tl.S_FRESH]), self.numbers.size)  # of a copy it may be more
+            pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
+        state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
+
+    def _make_room_for_graph(self) -> None:
+        """Of the arenas by variable and by factor, as `kernels/bayes_tree/begin_step.py` looks for it."""
+        counts = self._graph.mark()
+        variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
+        if variables > len(self.node):
+            self.node, self.turns, self.pending, self.changed, self.moved = (
+                grown(array, variables) for array in (self.node, self.turns, self.pending, self.changed, self.moved)
+            )
+        if factors > len(self.link):
+            self.link, self.stiff = grown(self.link, factors), grown(self.stiff, factors)
+        if counts[at.VALUES] > self.lin.shape[1]:
+            self.lin = _widened(self.lin, counts[at.VALUES])
+        if counts[at.SCALARS] > self.scalars.shape[1]:
+            self.scalars = _widened(self.scalars, counts[at.SCALARS])
+        new = factors - int(self.state[tl.S_FACTORS])
+        if (need := int(self.state[tl.S_HESSIAN]) + new * HESSIAN) > self.hessian.size:
+            pages.enlarge(self, "hessian", roomy(need, self.hessian.size))
+        if 2 * new > len(self.saved):
+            self.saved = np.empty((4 * new, 8))
+
+
+def _widened(array: F64, need: int) -> F64:
+    """A copy with columns for at least `need`, and more for the next ones."""
+    wider = np.zeros((len(array), roomy(need, array.shape[1])))
+    wider[:, : array.shape[1]] = array
+    return wider

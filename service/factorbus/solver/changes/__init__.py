@@ -1,0 +1,1 @@
+"""Changes of a graph that are no additions: removing, weighing, marginalizing, repairing."""

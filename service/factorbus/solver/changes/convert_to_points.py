@@ -1,0 +1,111 @@
+"""Features of inverse depth become points.  MATH §3.3.
+
+A point has half the numbers of a feature, and its sights half the work; it is as good a Gaussian once its depth is
+known.  What changes is the form, not the estimate: the point is where the feature stood for, and the same pixels are
+measured of it.  What goes is the tie to the anchor and the first guess of the depth, which has done its work by then.
+"""
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import Graph, table_size
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.graph.admit import enter_keys
+from factorbus.solver.kernels.graph.linearity_index import linearity
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.lenses.layout import LENS_SIZE
+
+# Of a first sight's payload: where the lens is, and the pixel's block in the upper triangle of a 6 × 6 matrix.
+_LENS = np.arange(3, 4 + LENS_SIZE)
+_PIXEL_BLOCK = np.array([15, 16, 18])
+# Where the information of its guess of ρ is, and how much surer than the guess (σ) one has to be to do without.
+_GUESS, _SURER = 14 + 20, 10.0
+
+
+def find_ripe(graph: Graph, below: float) -> I64:
+    """The variables, ascending, that are features whose linearity index (3.19) is below this.
+
+    One whose first guess of the depth still says something is left: as a point it would lose that, and a map its scale.
+    """
+    count = int(graph.counts[at.VARIABLES])
+    found = np.empty(count)
+    linearity(count, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload, found)
+    firsts = graph.fac[: graph.counts[at.FACTORS]]
+    firsts = firsts[firsts[:, at.F_KIND] == at.IDP_FIRST]
+    features = firsts[:, at.F_J]
+    guessed = 1.0 / np.sqrt(graph.payload[firsts[:, at.F_AT] + _GUESS])
+    known = found[features] * np.abs(graph.values[graph.var[features, at.V_AT] + 5]) / 4.0
+    found[features[guessed < _SURER * known]] = np.inf
+    found[is_held(graph)] = np.inf
+    return np.flatnonzero(found < below)
+
+
+def is_held(graph: Graph) -> np.ndarray:
+    """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
+    fac, held = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
+    held[fac[fac[:, at.F_KIND] >= at.LINEAR_SE2, at.F_I : at.F_J + 1]] = True
+    return held[:-1]
+
+
+def with_points(graph: Graph, features: I64) -> Graph:
+    """A graph in which these features are points, under their keys; all else is the same, factor ids included."""
+    made = Graph()
+    variables, factors = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
+    var, fac = graph.var[:variables].copy(), graph.fac[:factors].copy()
+    turned = np.zeros(variables, bool)
+    turned[features] = True
+    values = _values(graph, var, turned)
+    payload = _payload(graph, fac, turned)
+    free = var[:, at.V_COLUMN] >= 0
+    var[turned, at.V_KIND] = at.POINT3
+    dims = np.array([VARIABLE_KIND_OF_CODE[code].dim for code in var[:, at.V_KIND].tolist()], np.int64)
+    var[free, at.V_SCALAR] = np.cumsum(dims[free]) - dims[free]
+    var[:, at.V_DIAGONAL] = -1
+    fac[:, [at.F_II, at.F_JJ, at.F_IJ]] = -1
+    made.keys, made.var, made.values, made.fac, made.payload = graph.keys[:variables].copy(), var, values, fac, payload
+    made.dims = np.zeros(variables, np.int64)
+    made.dims[: np.count_nonzero(free)] = dims[free]
+    made.table = np.zeros(max(table_size(variables), 64), np.int64)
+    enter_keys(variables, made.table, made.keys)
+    made.counts[[at.VARIABLES, at.FACTORS, at.VALUES]] = variables, factors, values.size
+    made.counts[[at.PAYLOAD, at.COLUMNS, at.SCALARS]] = payload.size, np.count_nonzero(free), dims[free].sum()
+    made.stamps, made.counts[at.STAMPED] = graph.stamps[:variables].copy(), graph.counts[at.STAMPED]
+    made.ids, made.id_shift = graph.ids, graph.id_shift
+    return made
+
+
+def _values(graph: Graph, var: I64, turned: I64) -> F64:
+    """The values, packed anew; V_AT of `var` follows."""
+    pieces, at_new = [], 0
+    for row, is_turned in zip(var, turned, strict=True):
+        size = VARIABLE_KIND_OF_CODE[int(row[at.V_KIND])].size
+        value = graph.values[row[at.V_AT] : row[at.V_AT] + size]
+        pieces.append(_point(value) if is_turned else value)
+        row[at.V_AT] = at_new
+        at_new += pieces[-1].size
+    return np.concatenate([*pieces, np.empty(0)])
+
+
+def _point(y: F64) -> F64:
+    """(x, y, z) + m/ρ."""
+    m = np.array([np.cos(y[4]) * np.sin(y[3]), -np.sin(y[4]), np.cos(y[4]) * np.cos(y[3])])
+    return y[:3] + m / y[5]
+
+
+def _payload(graph: Graph, fac: I64, turned: I64) -> F64:
+    """The payloads, packed anew; F_KIND and F_AT of `fac` follow."""
+    pieces, at_new = [], 0
+    for row in fac:
+        kind, p = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])], int(row[at.F_AT])
+        has_loss = row[at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
+        numbers = graph.payload[p : p + kind.size + kind.triangle + has_loss]
+        if row[at.F_J] >= 0 and turned[row[at.F_J]]:
+            if kind.code == at.IDP_FIRST:
+                scale = numbers[kind.size + kind.triangle :]
+                numbers = np.concatenate([numbers[:2], numbers[_LENS], numbers[kind.size + _PIXEL_BLOCK], scale])
+            row[at.F_KIND] = at.POINT_SEEN
+        pieces.append(numbers)
+        row[at.F_AT] = at_new
+        at_new += numbers.size
+    return np.concatenate([*pieces, np.empty(0)])

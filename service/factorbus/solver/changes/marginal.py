@@ -1,0 +1,140 @@
+"""Variables taken out of a graph for good: what their factors say of the others is kept as linear factors.  MATH §11.3.
+
+Variables that hang together go together.  Those that they share a factor with are their border, and what they say of
+it is a linear factor there, linearised at the estimate: of one variable or two, or a prior of one point that it
+determines.  Of more variables it is one in pieces (`joints`).  Refused is a border of more than MOST variables.
+"""
+
+import numpy as np
+
+from factorbus.pieces import MOST, as_pieces, cut
+from factorbus.solver import errors
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.groups import FactorGroup
+from factorbus.solver.graph.joints import find_joints
+from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+
+# Below this share of the largest eigenvalue a direction of the border is not known at all.
+_NOTHING = 1e-13
+
+
+def marginals(graph: Graph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGroup], list[int]]:
+    """(the linear factors that take the place of those on the variables `gone`, the rows of all that these replace).
+
+    kept (m,): the factors that are there.  Raises TooConnected, Underconstrained.
+    """
+    made: list[FactorGroup] = []
+    used: list[int] = []
+    for part, rows in _pieces(graph, gone, kept):
+        used += rows
+        _check_border(graph, part or gone[:1].tolist(), rows, gone)
+        whole = quadratic(graph, rows, part)
+        border = whole.variables[len(part) :]
+        if border:
+            made += _as_factors(graph, border, *_reduced(graph, whole, len(part)))
+    return made, used
+
+
+def _pieces(graph: Graph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], list[int]]]:
+    """(free variables, factors) of each piece of `gone` that hangs together; what is fixed joins nothing.
+
+    What is known of many variables together goes whole where one of them goes.
+    """
+    going = set(gone.tolist())
+    free = {v for v in going if graph.var[v, at.V_COLUMN] >= 0}
+    above = {v: v for v in free}
+
+    def root(v: int) -> int:
+        while above[v] != v:
+            above[v] = above[above[v]]
+            v = above[v]
+        return v
+
+    ends = graph.fac[: kept.size, at.F_I : at.F_J + 1]
+    groups = [
+        (joint.variables, joint.rows) for joint in find_joints(graph, kept) if not going.isdisjoint(joint.variables)
+    ]
+    joined = {f for _, rows in groups for f in rows}
+    on = np.flatnonzero(kept & np.isin(ends, gone).any(axis=1)).tolist()
+    groups += [([v for v in ends[f].tolist() if v >= 0], [f]) for f in on if f not in joined]
+    for of, _ in groups:
+        inside = [v for v in of if v in free]
+        for v in inside[1:]:
+            above[root(v)] = root(inside[0])
+    variables: dict[int, list[int]] = {}
+    factors: dict[int, list[int]] = {}
+    for v in sorted(free):
+        variables.setdefault(root(v), []).append(v)
+    for of, rows in groups:
+        inside = [v for v in of if v in free]
+        head = root(inside[0]) if inside else max(set(of) - going, default=-1)
+        factors.setdefault(head, []).extend(rows)
+    heads = sorted({*variables, *factors})
+    return [(variables.get(head, []), sorted(factors.get(head, []))) for head in heads]
+
+
+def _check_border(graph: Graph, part: list[int], rows: list[int], gone: I64) -> None:
+    """Before anything is computed of it.  Raises TooConnected."""
+    ends = np.unique(graph.fac[rows, at.F_I : at.F_J + 1])
+    ends = np.setdiff1d(ends[ends >= 0], gone)
+    border = ends[graph.var[ends, at.V_COLUMN] >= 0]
+    if border.size > MOST:
+        raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[border].tolist(), MOST)
+
+
+def _reduced(graph: Graph, whole: Quadratic, count: int) -> tuple[F64, F64]:
+    """Λ and η of the border once the first `count` variables have taken theirs.  (11.4)"""
+    if not count:
+        return whole.information, whole.eta
+    cut = whole.starts[whole.variables[count]]
+    inner, cross = whole.information[:cut, :cut], whole.information[:cut, cut:]
+    try:
+        L = np.linalg.cholesky(inner)
+    except np.linalg.LinAlgError:
+        key, factors = int(graph.keys[whole.variables[0]]), graph.factors_of(whole.variables[0])
+        raise errors.Underconstrained(
+            key, factors, "its own factors leave it free; it cannot be marginalised"
+        ) from None
+    across, along = np.linalg.solve(L, cross), np.linalg.solve(L, whole.eta[:cut])
+    return whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along
+
+
+def _as_factors(graph: Graph, border: list[int], information: F64, eta: F64) -> list[FactorGroup]:
+    """Linear factors on the border with these Λ and η."""
+    kinds, keys, y = [kind_of(graph, v).name for v in border], graph.keys[border], [_value(graph, v) for v in border]
+    if len(border) > 2:
+        pieces = cut(kinds, keys, y, information, eta)
+    elif len(border) == 1 and kinds[0] in ("point2", "point3") and _is_determined(information):
+        return [_prior(kinds[0], keys, y[0], information, eta)]
+    else:
+        R, d = _root(information, eta)
+        pieces = as_pieces(kinds, keys, y, R, -d)
+    return [FactorGroup(*piece) for piece in pieces]
+
+
+def _is_determined(information: F64) -> bool:
+    return bool(np.linalg.eigvalsh(information)[0] > _NOTHING * np.abs(information).max())
+
+
+def _prior(kind: str, keys: I64, y: F64, information: F64, eta: F64) -> FactorGroup:
+    """Of a point that is determined a linear factor is a prior."""
+    z = y + np.linalg.solve(information, eta)
+    upper = 0.5 * (information + information.T)[np.triu_indices(z.size)]
+    return FactorGroup(f"prior_{kind}", keys[:, None], z[None], upper[None])
+
+
+def _root(information: F64, eta: F64) -> tuple[F64, F64]:
+    """Upper triangular R and d with RᵀR = Λ and Rᵀd = η; rows of nothing where Λ has no information."""
+    values, V = np.linalg.eigh(information)
+    known = values > _NOTHING * max(values[-1], 0.0)
+    root = np.where(known, np.sqrt(np.maximum(values, 0.0)), 0.0)
+    along = np.where(known, (V.T @ eta) / np.where(known, root, 1.0), 0.0)
+    Q, R = np.linalg.qr(root[:, None] * V.T)
+    return np.triu(R), Q.T @ along
+
+
+def _value(graph: Graph, v: int) -> F64:
+    start = int(graph.var[v, at.V_AT])
+    return graph.values[start : start + kind_of(graph, v).size].copy()

@@ -1,0 +1,266 @@
+"""The graph as columns: variables and factors in arenas that grow by doubling.  The arenas are laid out in
+`kernels/model/layout.py`.
+
+A `Mark` is how much of everything was in use at some moment; `forget` goes back to it.  Nothing that was there then
+has been moved, so going back is setting counts and clearing the keys that came after.
+
+A factor's id is the number of factors that the map took in before it, and stays with it when others are removed: the
+ids of the first rows are listed, those of the rows behind them follow each other without gaps.
+"""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from factorbus.solver.errors import printed
+from factorbus.solver.graph.arenas import Arenas, lines
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
+from factorbus.solver.graph.groups import FactorGroup, Group
+from factorbus.solver.graph.rows import Rows, Span
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.graph.admit import enter_keys, find_variable, remove_keys
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.retract import gather, label_of
+
+Mark: TypeAlias = tuple[int, ...]
+
+_MUCH = 4096  # rows
+_NO_KEYS: I64 = np.empty(0, np.int64)
+
+
+class Graph(Arenas):
+    """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
+
+    ARENAS = at.ARENAS
+    NOT_KEPT = ("_rows", "places")  # of a solver's state: they follow from the rest
+
+    def __init__(self) -> None:
+        # Room for the first few hundred factors: the step that finds none takes several times as long.
+        self.keys: I64 = np.empty(256, np.int64)
+        self.var: I64 = lines((256, at.V_WIDTH), np.int64)
+        self.dims: I64 = np.empty(256, np.int64)
+        self.stamps: I64 = np.empty(256, np.int64)
+        self.values: F64 = np.zeros(1024)
+        self.fac: I64 = lines((512, at.F_WIDTH), np.int64)
+        self.payload: F64 = np.empty(8192)
+        self.counts: I64 = np.zeros(at.COUNTS, np.int64)
+        self.table: I64 = np.zeros(1024, np.int64)
+        # No keys yet: it loads the kernel, which the step that needs a larger table would have to wait for.
+        enter_keys(0, self.table, self.keys)
+        self.ids: I64 = np.empty(0, np.int64)  # of the first rows of `fac`, ascending
+        self.id_shift = 0  # of a later row: its id less its number
+        self.holes = 0  # numbers of the payload that no factor has any more
+        self._rows = Rows()
+
+    @property
+    def sights(self) -> bool:
+        """Whether any camera has seen anything."""
+        kinds = self.fac[: self.counts[at.FACTORS], at.F_KIND]
+        return bool(((kinds >= at.IDP_FIRST) & (kinds < at.POSITION_SE2)).any())
+
+    def mark(self) -> Mark:
+        """How much is in use now."""
+        return tuple(self.counts.tolist())
+
+    def forget(self, mark: Mark) -> None:
+        """Go back to `mark`."""
+        remove_keys(mark[at.VARIABLES], int(self.counts[at.VARIABLES]), self.table, self.keys)
+        self.counts[:] = mark
+        if self._rows.forget(mark[at.VARIABLES]):
+            # Somebody may have an estimate of what is gone, its keys and stamps.
+            self.keys, self.stamps = self.keys.copy(), self.stamps.copy()
+
+    def copied(self) -> "Graph":
+        """The same graph with arrays of its own, as large as what is in use."""
+        variables, factors, values, payload, columns, *_ = self.counts.tolist()
+        other = Graph()
+        other.keys, other.var = self.keys[:variables].copy(), self.var[:variables].copy()
+        other.stamps = self.stamps[:variables].copy()
+        other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
+        other.values, other.payload = self.values[:values].copy(), self.payload[:payload].copy()
+        other.fac = self.fac[:factors].copy()
+        other.ids, other.id_shift, other.holes = self.ids.copy(), self.id_shift, self.holes
+        return other
+
+    def make_room(self, groups: I64) -> None:
+        """For groups of variables and factors as `kernels/model/layout.py` has them."""
+        groups = groups[: int(np.argmax(groups[:, at.G_KIND] == at.END))]
+        of_factors, rows = groups[:, at.G_FACTORS] != 0, groups[:, at.G_COUNT]
+        numbers = rows * (groups[:, at.G_SIZE] + groups[:, at.G_TRIANGLE])
+        self.reserve_variables(int(rows[~of_factors].sum()), int(numbers[~of_factors].sum()))
+        self.reserve_factors(int(rows[of_factors].sum()), int(numbers[of_factors].sum()))
+
+    def reserve_variables(self, more: int, numbers: int) -> None:
+        """Make room for `more` variables, whose values have so many numbers together."""
+        counts = self.counts.tolist()
+        if (need := counts[at.VARIABLES] + more) > self.keys.size:
+            together = self.keys, self.var, self.dims, self.stamps
+            self.keys, self.var, self.dims, self.stamps = (grown(array, need) for array in together)
+        if (need := counts[at.VALUES] + numbers) > self.values.size:
+            self.values = grown(self.values, need)
+        if 2 * (counts[at.VARIABLES] + more) > self.table.size:
+            self.table = np.zeros(table_size(counts[at.VARIABLES] + more), np.int64)
+            enter_keys(counts[at.VARIABLES], self.table, self.keys)
+
+    def reserve_factors(self, more: int, numbers: int) -> None:
+        """Make room for `more` factors with so many numbers together (measurement, information, scale of a loss)."""
+        counts = self.counts.tolist()
+        if (need := counts[at.FACTORS] + more) > len(self.fac):
+            self.fac = grown(self.fac, need)
+        if (need := counts[at.PAYLOAD] + numbers) > self.payload.size:
+            self.payload = grown(self.payload, need)
+
+    def take(self, other: "Graph") -> None:
+        """Become `other`."""
+        for name, array in other.__getstate__().items():
+            setattr(self, name, array)
+
+    def memory_bytes(self) -> int:
+        """Bytes in use of all arenas."""
+        variables, factors, values, payload, columns, *_ = self.counts.tolist()
+        return 8 * (variables * (at.V_WIDTH + 2) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
+
+    def stamp_last(self, count: int, stamps: I64 | None) -> None:
+        """The last `count` variables, which are new, have these time stamps; None: none."""
+        variables = int(self.counts[at.VARIABLES])
+        self.stamps[variables - count : variables] = at.NO_STAMP if stamps is None else stamps
+        if stamps is not None:
+            self.counts[at.STAMPED] += np.count_nonzero(stamps != at.NO_STAMP)
+
+    def stamps_of(self, rows: I64) -> I64 | None:
+        """The time stamps of the variables at these indices, NO_STAMP of one without; None: none of them has one."""
+        if not self.counts[at.STAMPED]:
+            return None
+        stamps = self.stamps[rows]
+        return stamps if (stamps != at.NO_STAMP).any() else None
+
+    @property
+    def next_id(self) -> int:
+        """The id that the next factor gets."""
+        return int(self.counts[at.FACTORS]) + self.id_shift
+
+    def name_factors(self, ids: I64, following: int) -> None:
+        """The factors that are there have these ids, ascending; the next one gets `following`."""
+        self.ids, self.id_shift = ids, following - ids.size
+
+    def ids_of(self, rows: I64) -> I64:
+        """The ids of the factors in these rows of `fac`."""
+        named = self.ids.size
+        if not named:
+            return rows + self.id_shift
+        return np.where(rows < named, self.ids[np.minimum(rows, named - 1)], rows + self.id_shift)
+
+    def rows_of(self, ids: I64) -> I64:
+        """The rows of the factors with these ids; −1 where there is none."""
+        named, count = self.ids.size, int(self.counts[at.FACTORS])
+        later = ids - self.id_shift
+        found = np.where((later >= named) & (later < count), later, -1)
+        if named:
+            place = np.minimum(np.searchsorted(self.ids, ids), named - 1)
+            found = np.where(self.ids[place] == ids, place, found)
+        return found
+
+    def find(self, key: int) -> int:
+        """Index of the variable `key`, or −1."""
+        return int(find_variable(key, self.table, self.keys))
+
+    def variables(self, picked: I64 | None = None) -> list[Group]:
+        """Values of all variables, or of those at the indices `picked`: a copy, one group per kind and fixedness.
+
+        Of all variables, keys, stamps and the values of fixed ones are read-only: they may have been given before.
+        """
+        if picked is None:
+            spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
+            keys, values, stamps = self.keys, self.values, self.stamps if self.counts.item(at.STAMPED) else None
+            return [span.group(keys, values, stamps) if span.together else self._scattered(span) for span in spans]
+        if (label := label_of(picked, self.places)) >= 0:
+            return [self._gathered(label, picked)]
+        var = self.var[picked]
+        labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
+        return [self._gathered(k, picked[labels == k]) for k in np.flatnonzero(np.bincount(labels)).tolist()]
+
+    def _scattered(self, span: Span) -> Group:
+        values, rows = np.empty((span.count, span.size)), span.rows()
+        gather(rows, self.places, _NO_KEYS, values)
+        values.flags.writeable = not span.fixed  # as where they are together
+        stamps = self.stamps_of(rows)
+        if stamps is not None:
+            stamps.flags.writeable = False
+        return Group(span.kind, span.keys_apart(self.keys), values, span.fixed, stamps)
+
+    def _gathered(self, label: int, rows: I64) -> Group:
+        kind = VARIABLE_KIND_OF_CODE[label // 2]
+        keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
+        gather(rows, self.places, keys, values)
+        return Group(kind.name, keys, values, bool(label % 2), self.stamps_of(rows))
+
+    def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:
+        """All factors, or the first `most`: a copy, a group for each kind and loss.
+
+        apart: rows that are to stay in their order: behind the others, groups for each of these.
+        """
+        fac = self.fac[: self.counts[at.FACTORS]][:most]
+        label = (fac[:, at.F_KIND] << at.LOSS_SHIFT) + (fac[:, at.F_FLAGS] >> at.LOSS_SHIFT)
+        others, runs = np.ones(len(fac), bool), []
+        for rows in apart:
+            of = np.array(rows)[np.array(rows) < len(fac)]
+            others[of] = False
+            runs += np.split(of, np.flatnonzero(np.diff(label[of])) + 1)
+        runs = [np.flatnonzero(others & (label == code)) for code in np.flatnonzero(np.bincount(label[others]))] + runs
+        return [self._group(fac, rows) for rows in runs if rows.size]
+
+    def _group(self, fac: I64, rows: I64) -> FactorGroup:
+        """Factors of one kind and loss."""
+        kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(fac[rows[0], at.F_FLAGS]) >> at.LOSS_SHIFT
+        loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
+        ends = self.keys[picked[:, at.F_I : at.F_I + len(kind.connects)]]
+        width = kind.size + kind.triangle + (1 if loss else 0)
+        numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
+        measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
+        own = scale[:, 0].copy() if loss else None
+        return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
+
+    def factors_of(self, variable: int) -> list[str]:
+        """The factors on one variable, for a person: "between_se2 (x1, x2)"."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        rows = fac[(fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)]
+        return [self.describe(row) for row in rows]
+
+    def count_factors(self, variable: int) -> int:
+        """How many factors are on one variable."""
+        fac = self.fac[: self.counts[at.FACTORS]]
+        return int(np.count_nonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)))
+
+    def columns_bytes(self) -> tuple[int, int]:
+        """Bytes of all variables, and of all factors, as columns, keys and stamps included."""
+        variables, factors, values, payload, *_, stamped = self.counts.tolist()
+        return 8 * (variables * (2 if stamped else 1) + values), 8 * (2 * factors + payload - self.holes)
+
+    def describe(self, row: I64) -> str:
+        """One row of `fac`, for a person."""
+        kind: FactorKind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
+        ends = [int(self.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)]]
+        return f"{kind} ({', '.join(printed(key) for key in ends)})"
+
+
+def grown(array: np.ndarray, need: int) -> np.ndarray:
+    """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
+    larger = lines((roomy(need, len(array)), *array.shape[1:]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def roomy(need: int, size: int) -> int:
+    """How long to make an array of `size` that is to have `need`: four times what it is, or twice if that is much.
+
+    To find that there is no room, and begin again, takes longer than to copy a few pages.  It does not look at how wide
+    rows are: arrays with a row for each of the same things, and as long, stay as long as each other.
+    """
+    return max(need, (4 if size < _MUCH else 2) * size)
+
+
+def table_size(entries: int) -> int:
+    """Slots of a hash table that is to hold `entries` and grow further: a power of two, a quarter full or less."""
+    return 1 << (4 * entries - 1).bit_length()

@@ -1,0 +1,76 @@
+"""What some factors say of their variables together, to second order at the estimate: dense, for a few of them."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VariableKind
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.candidates import evaluate_factors
+
+
+@dataclass(frozen=True, slots=True)
+class Quadratic:
+    """χ² of some factors, x ⊟ y around the estimate: δᵀ Λ δ − 2 ηᵀ δ + ..., over free variables in this order.
+
+    starts: where each begins in δ   plus: the diagonal that Λ would have without factors of negative weight
+    """
+
+    variables: list[int]
+    starts: dict[int, int]
+    information: F64
+    eta: F64
+    plus: F64
+
+
+def quadratic(graph: Graph, rows: Iterable[int], first: list[int]) -> Quadratic:
+    """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending."""
+    rows = list(rows)
+    ends = {v for v in graph.fac[rows, at.F_I : at.F_J + 1].ravel().tolist() if v >= 0} - set(first)
+    variables, starts, size = [*first, *sorted(v for v in ends if graph.var[v, at.V_COLUMN] >= 0)], {}, 0
+    for v in variables:
+        starts[v], size = size, size + kind_of(graph, v).dim
+    information, eta, plus = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+    for kind, of in _by_kind(graph, rows):
+        J, W, r = _evaluated(graph, kind, of)
+        there = graph.fac[of, at.F_I : at.F_I + len(kind.connects)]
+        place = np.array([[starts.get(v, -1) for v in ends] for ends in there.tolist()])
+        for e, end in enumerate(kind.connects):
+            WJ = W @ J[e]
+            at_e = place[:, e, None] + np.arange(end.dim)
+            inside = place[:, e] >= 0
+            np.subtract.at(eta, at_e[inside], (WJ.transpose(0, 2, 1) @ r[:, :, None])[inside, :, 0])
+            for f, other in enumerate(kind.connects):
+                both = inside & (place[:, f] >= 0)
+                at_f = place[:, f, None] + np.arange(other.dim)
+                added = (J[f].transpose(0, 2, 1) @ WJ)[both]
+                np.add.at(information, (at_f[both][:, :, None], at_e[both][:, None, :]), added)
+                if e == f:
+                    np.add.at(plus, at_e[both], np.maximum(added.diagonal(axis1=1, axis2=2), 0.0))
+    return Quadratic(variables, starts, information, eta, plus)
+
+
+def _by_kind(graph: Graph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
+    picked = np.array(rows, np.int64)
+    codes = graph.fac[picked, at.F_KIND]
+    for code in np.unique(codes).tolist():
+        yield FACTOR_KIND_OF_CODE[code], picked[codes == code]
+
+
+def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:
+    """Of factors of one kind the Jacobian of each end (n, dim, d), Ω (n, dim, dim) and r (n, dim)."""
+    fac, n = np.ascontiguousarray(graph.fac[rows]), rows.size
+    r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, 6, 6)) for _ in range(3))
+    evaluate_factors(0, n, graph.var, fac, graph.values, graph.payload, r, A, B, W)
+    d = kind.dim
+    blocks = [J[:, :d, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
+    return blocks, W[:, :d, :d], r[:, :d]
+
+
+def kind_of(graph: Graph, v: int) -> VariableKind:
+    """The kind of the variable with this index."""
+    return VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])]

@@ -1,0 +1,1 @@
+"""The incremental modes of the 2013 paper: R is updated, or computed anew."""

@@ -1,0 +1,145 @@
+"""Taking new variables and factors into the tree's arenas, and out again when their step fails.  MATH §9.2."""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.sizes import size_of
+
+
+@part
+def take_in_variables(
+    v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, turns: F64, state: I64
+) -> None:
+    """Variables up to v1 get a row each; they are linearised at their first values."""
+    for v in range(state[tl.S_VARIABLES], v1):
+        node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
+        node[v, tl.N_PLACE] = node[v, tl.N_LOCAL] = node[v, tl.N_FLAGS] = node[v, tl.N_LISTED] = 0
+        node[v, tl.N_STAMP], node[v, tl.N_SEEN], node[v, tl.N_MOVED] = -1, state[tl.S_STEP], -1
+        node[v, tl.N_LINEARISED] = state[tl.S_STEP]
+        x = var[v, at.V_AT]
+        for a in range(size_of(var[v, at.V_KIND])):
+            lin[0, x + a] = values[x + a]
+        d = var[v, at.V_SCALAR]
+        if d >= 0:
+            for a in range(dim_of_variable(var, v)):
+                scalars[0, d + a] = scalars[1, d + a] = 0.0
+        turns[v, tl.U_LEVER] = 0.0
+        node[v, tl.N_NEAR] = -1
+        note_turn(v, var, lin, turns)
+    state[tl.S_VARIABLES] = v1
+
+
+@inline_kernel
+def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
+    """Which way a plane pose looks where it is linearised."""
+    if var[v, at.V_KIND] == at.SE2:
+        angle = lin[0, var[v, at.V_AT] + 2]
+        turns[v, tl.U_COS], turns[v, tl.U_SIN] = math.cos(angle), math.sin(angle)
+
+
+@part
+def take_in_factors(
+    f1: int, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
+    stiff: F64, turns: F64, moved: I64, saved: F64, state: I64, account: F64,
+) -> bool:  # fmt: skip
+    """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
+
+    A_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
+    linearised, and the factor is then off its model from the start.
+
+    saved (2 per factor, 8): what that changes of variables, for `take_out`
+    """
+    f0, finite = state[tl.S_FACTORS], True
+    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    for f in range(f0, f1):
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
+        link[f, tl.L_KIND] = fac[f, at.F_KIND]
+        if fac[f, at.F_KIND] >= at.IDP_FIRST or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+            link[f, tl.L_KIND] = tl.EXACT
+            state[tl.S_EXACT] += 1
+        link[f, tl.L_AT] = state[tl.S_HESSIAN]
+        state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
+        _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
+        if j >= 0:
+            _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
+        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
+        c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
+        account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
+        if j >= 0:
+            account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
+        account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
+        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
+        list_moved(MODEL, i, node, moved, state)
+        link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
+        node[i, tl.N_SEEN] = state[tl.S_STEP]
+        if j >= 0:
+            link[f, tl.L_J], node[j, tl.N_ADJ] = node[j, tl.N_ADJ], 2 * f + 1
+            node[j, tl.N_SEEN] = state[tl.S_STEP]
+    state[tl.S_FACTORS] = f1
+    return finite
+
+
+@inline_kernel
+def stiffest_of(v: int, var: I64, scalars: F64) -> float:
+    """The largest sum of the diagonals of Hessians of variable v."""
+    d, most = var[v, at.V_SCALAR], 0.0
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            most = max(most, scalars[1, d + a])
+    return most
+
+
+@part
+def take_out(
+    v0: int, f0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, saved: F64, state: I64
+) -> None:
+    """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
+    for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        if link[f, tl.L_KIND] >= tl.EXACT:
+            state[tl.S_EXACT] -= 1
+            state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
+        if j >= 0:
+            node[j, tl.N_ADJ] = link[f, tl.L_J]
+            _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
+        node[i, tl.N_ADJ] = link[f, tl.L_I]
+        _restore(i, saved[2 * (f - f0)], var, node, scalars, turns)
+        state[tl.S_HESSIAN] = link[f, tl.L_AT]
+    state[tl.S_VARIABLES], state[tl.S_FACTORS] = v0, f0
+
+
+@inline_kernel
+def _save(v: int, out: F64, var: I64, node: I64, scalars: F64, turns: F64) -> None:
+    """What a factor is about to change of variable v."""
+    d = var[v, at.V_SCALAR]
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            out[a] = scalars[1, d + a]
+    out[6], out[7] = turns[v, tl.U_LEVER], node[v, tl.N_SEEN]
+
+
+@inline_kernel
+def _restore(v: int, kept: F64, var: I64, node: I64, scalars: F64, turns: F64) -> None:
+    d = var[v, at.V_SCALAR]
+    if d >= 0:
+        for a in range(dim_of_variable(var, v)):
+            scalars[1, d + a] = kept[a]
+    turns[v, tl.U_LEVER], node[v, tl.N_SEEN] = kept[6], int(kept[7])
+
+
+@inline_kernel
+def next_incidence(slot: int, link: I64) -> int:
+    """The next incidence of the same variable."""
+    return int(link[slot // 2, tl.L_I + slot % 2])

@@ -1,0 +1,299 @@
+"""The numbers of fronts: what factors and update matrices of children bring, and those of cliques that are split.
+
+MATH §9.5, and §9.3 for what is split.
+"""
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
+from factorbus.solver.kernels.bayes_tree.fronts import update_layout
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import TILE_ROWS, add_run, put, zero
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.panels import take_off
+from factorbus.solver.kernels.sparse.partial_cholesky import LEAST_PIVOT
+
+
+@inline_kernel
+def number_columns(
+    row: I64, noise: float, var: I64, node: I64, lists: I64, scalars: F64, column: I64, floors: F64
+) -> None:
+    """The first column of each variable of a clique, by its local number, and what each pivot is raised to."""
+    width, start = 0, row[tl.C_LIST]
+    for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        column[node[v, tl.N_LOCAL]] = width
+        dim = dim_of_variable(var, v)
+        if width < row[tl.C_PIVOTS]:
+            d = var[v, at.V_SCALAR]
+            for a in range(dim):
+                floors[width + a] = -max(LEAST_PIVOT * scalars[1, d + a], noise)
+        width += dim
+
+
+@inline_kernel
+def variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
+    """The frontal variable of a clique that has this pivot scalar."""
+    s = row[tl.C_LIST]
+    scalar -= dim_of_variable(var, lists[s])
+    while scalar >= 0:
+        s += 1
+        scalar -= dim_of_variable(var, lists[s])
+    return int(lists[s])
+
+
+@inline_kernel
+def row_of(c: int, row: I64) -> int:
+    """Where column 0 of the row of column c is, in the rows of R or in the update matrix."""
+    p = row[tl.C_PIVOTS]
+    if c < p:
+        return row[tl.C_ROWS] + c * row[tl.C_LD]
+    return row[tl.C_UPDATE] + fr.update_row(c - p, row[tl.C_WIDTH_UPDATE]) - p
+
+
+@part
+def add_hessian(
+    f: int, row: I64, column: I64, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
+) -> None:
+    """Add the Hessian of factor f, its gradient and its χ² to a front."""
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    di = dim_of_variable(var, i)
+    dj = dim_of_variable(var, j) if j >= 0 else 0
+    ci = column[node[i, tl.N_LOCAL]] if var[i, at.V_COLUMN] >= 0 else -1
+    cj = column[node[j, tl.N_LOCAL]] if j >= 0 and var[j, at.V_COLUMN] >= 0 else -1
+    # Sizes as constants, so that each call becomes straight code.
+    if di == 3 and dj == 3:
+        _add_blocks(3, 3, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    elif di == 6 and dj == 6:
+        _add_blocks(6, 6, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    elif di == 3 and dj == 2:
+        _add_blocks(3, 2, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+    else:
+        _add_blocks(di, dj, ci, cj, link[f, tl.L_AT], row, hessian, numbers)
+
+
+@inline_kernel
+def _add_blocks(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F64, numbers: F64) -> None:
+    """`add_hessian` of variables of di and dj scalars, at columns ci and cj; −1: there is none, or it is fixed."""
+    last = row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    g = h + di * di + di * dj + dj * dj
+    if ci >= 0:
+        _add_diagonal(di, ci, last, h, g, row, hessian, numbers)
+    if cj >= 0:
+        _add_diagonal(dj, cj, last, h + di * di + di * dj, g + di, row, hessian, numbers)
+    if ci >= 0 and cj >= 0:
+        h += di * di
+        if ci < cj:
+            for a in range(di):
+                target = row_of(ci + a, row) + cj
+                for b in range(dj):
+                    put(numbers, target + b, load(numbers, target + b) + load(hessian, h + a * dj + b))
+        else:
+            for b in range(dj):
+                target = row_of(cj + b, row) + ci
+                for a in range(di):
+                    put(numbers, target + a, load(numbers, target + a) + load(hessian, h + a * dj + b))
+    corner = row_of(last, row) + last
+    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+
+
+@inline_kernel
+def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: F64, numbers: F64) -> None:
+    for a in range(d):
+        target = row_of(c + a, row)
+        for b in range(a, d):
+            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
+        put(numbers, target + last, load(numbers, target + last) + load(hessian, g + a))
+
+
+@part
+def list_runs(start: int, end: int, column: I64, p: int, m: int, var: I64, node: I64, lists: I64, runs: I64) -> int:
+    """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
+
+    A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.
+    """
+    count, first, stop = 0, 0, -1
+    for s in range(start, end):
+        v = lists[s]
+        into, dim = column[node[v, tl.N_LOCAL]], dim_of_variable(var, v)
+        if into == stop and stop != p:
+            runs[count - 1, 1] += dim
+        else:
+            runs[count, 0], runs[count, 1], runs[count, 2] = first, dim, into
+            count += 1
+        stop = into + dim
+        first += dim
+    runs[count, 0], runs[count, 1], runs[count, 2] = first, 1, p + m
+    return count + 1
+
+
+@part
+def extend_add(a: F64, child: int, width: int, runs: I64, count: int, row: I64) -> None:
+    """Add the update matrix at `child`, its first rows `width` wide, into a front, run by run.
+
+    A pair of runs in another order there is turned.
+    """
+    for s in range(count):
+        first, length, into = runs[s, 0], runs[s, 1], runs[s, 2]
+        for i in range(length):
+            source, target = child + fr.update_row(first + i, width), row_of(into + i, row)
+            add_few(a, target + into + i, source + first + i, length - i)
+            for t in range(s + 1, count):
+                other = runs[t, 2]
+                if other > into:
+                    add_few(a, target + other, source + runs[t, 0], runs[t, 1])
+                else:
+                    for j in range(runs[t, 1]):
+                        turned = row_of(other + j, row) + into + i
+                        put(a, turned, load(a, turned) + load(a, source + runs[t, 0] + j))
+
+
+@inline_kernel
+def add_few(a: F64, i: int, j: int, count: int) -> None:
+    """a[i : i+count] += a[j : j+count]; short runs without a call."""
+    if count >= 16:
+        add_run(a, i, j, count)
+    else:
+        for k in range(count):
+            put(a, i + k, load(a, i + k) + load(a, j + k))
+
+
+@part
+def update_orphans(
+    orphans: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
+    state: I64, update: I64,
+) -> bool:  # fmt: skip
+    """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
+
+    update (orphans, 3): its place, its width, and the size of its block where it was made here (else 0)
+    """
+    stamp, need = state[tl.S_STAMP], state[tl.S_NUMBERS]
+    for e in range(orphans.size):
+        c = orphans[e]
+        update[e, 0], update[e, 1], update[e, 2] = clique[c, tl.C_UPDATE], clique[c, tl.C_WIDTH_UPDATE], 0
+        if clique[c, tl.C_MARK] == stamp:
+            need += size_class(update_layout(split_sizes(c, var, clique, lists)[1])[1])[1]
+    if need > numbers.size:
+        state[tl.S_NEED_NUMBERS] = need
+        return False
+    for e in range(orphans.size):
+        c = orphans[e]
+        if clique[c, tl.C_MARK] == stamp:
+            p, m = split_sizes(c, var, clique, lists)
+            width, size = update_layout(m)
+            u, size = take_numbers(size, numbers, state)
+            update[e, 0], update[e, 1], update[e, 2] = u, width, size
+            split_update(c, p, m, u, width, var, fac, node, link, clique, lists, numbers, hessian)
+    return True
+
+
+@part
+def give_back_updates(update: I64, numbers: F64, state: I64) -> None:
+    """Free what `update_orphans` made."""
+    for e in range(len(update)):
+        if update[e, 2] > 0:
+            give_numbers(update[e, 0], update[e, 2], numbers, state)
+
+
+@inline_kernel
+def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
+    """(p, m) of what is kept of a clique that is split."""
+    p, start = 0, clique[c, tl.C_LIST]
+    for s in range(start, start + clique[c, tl.C_FIRST]):
+        p += dim_of_variable(var, lists[s])
+    return p, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER] - p
+
+
+@part
+def split_update(
+    c: int, p: int, m: int, u: int, wide: int,
+    var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
+) -> None:  # fmt: skip
+    """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)
+
+    u, wide: where it goes, and the width of its first rows
+    """
+    row = clique[c]
+    start, kept = row[tl.C_LIST], row[tl.C_FIRST]
+    width = 0
+    for s in range(start, start + row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]):
+        node[lists[s], tl.N_COLUMN] = width - p
+        width += dim_of_variable(var, lists[s])
+    zero(numbers, u, fr.update_size(m + 1, wide))
+    for s in range(start, start + kept):
+        f = node[lists[s], tl.N_OWN]
+        while f >= 0:
+            _add_far_end(f, lists[s], m, u, wide, var, fac, node, link, hessian, numbers)
+            f = link[f, tl.L_OWN]
+    child = row[tl.C_CHILD]
+    while child >= 0:
+        if clique[child, tl.C_ABOVE] < kept:
+            _add_child(child, m, u, wide, var, node, clique, lists, numbers)
+        child = clique[child, tl.C_NEXT]
+    for i in range(0, m + 1, TILE_ROWS):
+        rows = min(TILE_ROWS, m + 1 - i)
+        line, stride = u + fr.update_row(i, wide), fr.update_stride(i, wide)
+        take_off(numbers, rows, line, stride, row[tl.C_ROWS] + p, row[tl.C_LD], i, i, m + 1, 0, p)
+
+
+@inline_kernel
+def _add_far_end(
+    f: int, v: int, m: int, u: int, wide: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
+) -> None:
+    """What a factor owned by v adds to its other end, if that is not kept, and to the corner."""
+    i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
+    di = dim_of_variable(var, i)
+    dj = dim_of_variable(var, j) if j >= 0 else 0
+    g = h + di * di + di * dj + dj * dj
+    corner = u + fr.update_row(m, wide) + m
+    put(numbers, corner, load(numbers, corner) + load(hessian, g + di + dj))
+    other = j if i == v else i
+    if other < 0 or var[other, at.V_COLUMN] < 0 or node[other, tl.N_COLUMN] < 0:
+        return
+    c, d = node[other, tl.N_COLUMN], dj if i == v else di
+    if i == v:
+        h += di * di + di * dj
+        g += di
+    for a in range(d):
+        target = u + fr.update_row(c + a, wide)
+        for b in range(a, d):
+            put(numbers, target + c + b, load(numbers, target + c + b) + load(hessian, h + a * d + b))
+        put(numbers, target + m, load(numbers, target + m) + load(hessian, g + a))
+
+
+@inline_kernel
+def _add_child(
+    child: int, m: int, u: int, wide: int, var: I64, node: I64, clique: I64, lists: I64, numbers: F64
+) -> None:
+    """Add what a child's update matrix has in the columns of the separator and the right-hand side."""
+    start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
+    end, last = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_BORDER]
+    source, width = clique[child, tl.C_UPDATE], clique[child, tl.C_WIDTH_UPDATE]
+    x = 0
+    for s in range(start, end):
+        v = lists[s]
+        dim, into = dim_of_variable(var, v), node[v, tl.N_COLUMN]
+        if into >= 0:
+            for a in range(dim):
+                line, target = source + fr.update_row(x + a, width), u + fr.update_row(into + a, wide)
+                for b in range(a, dim):
+                    put(numbers, target + into + b, load(numbers, target + into + b) + load(numbers, line + x + b))
+                put(numbers, target + m, load(numbers, target + m) + load(numbers, line + last))
+            y = x + dim
+            for t in range(s + 1, end):
+                w = lists[t]
+                dims, across = dim_of_variable(var, w), node[w, tl.N_COLUMN]
+                if across >= 0:
+                    for a in range(dim):
+                        line = source + fr.update_row(x + a, width) + y
+                        for b in range(dims):
+                            target = u + fr.update_row(into + a, wide) + across + b
+                            if across < into:
+                                target = u + fr.update_row(across + b, wide) + into + a
+                            put(numbers, target, load(numbers, target) + load(numbers, line + b))
+                y += dims
+        x += dim
+    corner = u + fr.update_row(m, wide) + m
+    put(numbers, corner, load(numbers, corner) + load(numbers, source + fr.update_row(last, width) + last))

@@ -1,0 +1,231 @@
+"""Back-substitution from the new roots down, as far as anything changes.  MATH §9.7.
+
+A clique that was there before is solved again only when its separator has changed its shape by more than `ripple`
+standard deviations since the clique was solved last, and where it has moved by more as a whole, all below moves along;
+so what is left undone never adds up over the steps.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree import rigid_subtrees as rg
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved, move_variable
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
+from factorbus.solver.kernels.model import layout as at
+
+NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
+
+
+@part
+def substitute(
+    ids: I64, ripple: float, quiet: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, lin: F64,
+    scalars: F64, turns: F64, values: F64, changed: I64, moved: I64, listed: I64, motions: F64, state: I64,
+    account: F64,
+) -> None:  # fmt: skip
+    """Solve the new cliques and whatever moves with them.
+
+    changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
+    were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  A_LEFT gets
+    the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone, nor what was
+    so below a clique that does not move now
+    """
+    far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
+    if ripple == 0.0 and account[tl.A_LEFT] > 0.0:
+        far = -1.0
+    motion[rg.LEFT] = 0.0
+    shares = np.empty(64)
+    body = count = 0
+    for f in range(ids.size - 1, -1, -1):
+        if clique[ids[f], tl.C_PARENT] >= 0:
+            continue
+        c = ids[f]
+        while c >= 0:
+            row = clique[c]
+            gather_separator(row, var, lists, delta, numbers)
+            if row[tl.C_PIVOTS] > shares.size:
+                shares = np.empty(2 * row[tl.C_PIVOTS])
+            solve_rows(row, numbers, shares)
+            row[tl.C_FIRST] = row[tl.C_MOVES] = 0
+            state[tl.S_SOLVED] += 1
+            move_frontals(row, var, node, lists, numbers, delta, lin[0], lin[2], turns, values, changed, moved, state)
+            child, above = row[tl.C_CHILD], c
+            while True:
+                c = next_clique(
+                    child, above, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
+                )
+                if c < 0 or not moves_along(
+                    c, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
+                ):
+                    break
+                # What is in it nobody outside looks at, so it can move later.
+                if body == rg.BODIES:
+                    rg.move_bodies(
+                        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed,
+                        moved, motions, motion, state,
+                    )  # fmt: skip
+                    body = count = 0
+                count = rg.list_subtree(c, body, clique, motions, motion, listed, count)
+                body += 1
+                child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
+    rg.move_bodies(
+        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed, moved, motions,
+        motion, state,
+    )  # fmt: skip
+    account[tl.A_LEFT] = max(account[tl.A_LEFT] if ripple > 0.0 else 0.0, motion[rg.LEFT])
+
+
+@inline_kernel
+def moves_along(
+    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
+    motions: F64, motion: F64,
+) -> bool:  # fmt: skip
+    """Whether a clique and all below it only move as a whole; motion gets by how much."""
+    row = clique[c]
+    far = far_of(row, far)
+    return (
+        row[tl.C_FIRST] != -1
+        and row[tl.C_ANCHORED] == 0
+        and rg.fit_motion(row, c * tl.M_WIDTH, far, var, lists, numbers, delta, weight, lin, turns, motions, motion)
+    )
+
+
+@inline_kernel
+def next_clique(
+    child: int, above: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64,
+    lin: F64, turns: F64, motions: F64, motion: F64,
+) -> int:  # fmt: skip
+    """The next clique that has moved, from `child` of clique `above` on, depth first; −1: none is left."""
+    while True:
+        while child >= 0:
+            if clique[child, tl.C_FIRST] == -1 or has_moved(
+                child, far, var, clique, lists, numbers, delta, weight, lin, turns, motions, motion
+            ):
+                return child
+            child = clique[child, tl.C_NEXT]
+        if clique[above, tl.C_PARENT] < 0:
+            return -1
+        child, above = clique[above, tl.C_NEXT], clique[above, tl.C_PARENT]
+
+
+@inline_kernel
+def has_moved(
+    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
+    motions: F64, motion: F64,
+) -> bool:  # fmt: skip
+    """Whether a scalar of the separator is further than (9.17) from where the frontals have it, who were solved with
+    it and may have moved since.  motion: gets the largest square of what is left
+    """
+    row = clique[c]
+    far = far_of(row, far)
+    start = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    used, moves, left = row[tl.C_USED] + row[tl.C_PIVOTS], row[tl.C_MOVES] != 0, 0.0
+    for s in range(start, start + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        d = var[v, at.V_SCALAR]
+        if moves:
+            rg.displace(v, var, lin, turns, motions, c * tl.M_WIDTH, motion)
+        for a in range(dim_of_variable(var, v)):
+            gap = load(delta, d + a) - load(numbers, used)
+            if moves:
+                gap -= motion[rg.LOCAL + a]
+            square = gap * gap * load(weight, d + a)
+            if square > far:
+                return True
+            left = max(left, square)
+            used += 1
+    motion[rg.LEFT] = max(motion[rg.LEFT], left)
+    return False
+
+
+@inline_kernel
+def far_of(row: I64, far: float) -> float:
+    """The square of (9.17) for a clique, `far` being that of one with NARROW numbers of R a scalar."""
+    return far * max(1.0, (row[tl.C_BORDER] + 0.5 * row[tl.C_PIVOTS]) / NARROW)
+
+
+@inline_kernel
+def gather_separator(row: I64, var: I64, lists: I64, delta: F64, numbers: F64) -> None:
+    """δ_S behind the place of δ_F."""
+    start = row[tl.C_LIST] + row[tl.C_FRONTALS]
+    x = row[tl.C_USED] + row[tl.C_PIVOTS]
+    for s in range(start, start + row[tl.C_SEPARATORS]):
+        v = lists[s]
+        d = var[v, at.V_SCALAR]
+        for a in range(dim_of_variable(var, v)):
+            put(numbers, x, load(delta, d + a))
+            x += 1
+
+
+@inline_kernel
+def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
+    """δ_F = R_F⁻¹ (d − R_S δ_S).  shares: scratch for the pivots.
+
+    The product first, whose rows do not wait for each other, and what each pivot is divided by, since a division takes
+    longer than all else that the next one waits for.  Rows are taken by threes: a plane pose has three scalars, and six
+    one in space.
+    """
+    p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
+    width = p + row[tl.C_BORDER]
+    for i in range(p):
+        put(shares, i, 1.0 / load(numbers, row[tl.C_ROWS] + i * (ld + 1)))
+    i = 0
+    while i + 3 <= p:
+        line, x, y, z = row[tl.C_ROWS] + i * ld, 0.0, 0.0, 0.0
+        for k in range(p, width):
+            known = load(numbers, used + k)
+            x += load(numbers, line + k) * known
+            y += load(numbers, line + ld + k) * known
+            z += load(numbers, line + 2 * ld + k) * known
+        put(numbers, used + i, load(numbers, line + width) - x)
+        put(numbers, used + i + 1, load(numbers, line + ld + width) - y)
+        put(numbers, used + i + 2, load(numbers, line + 2 * ld + width) - z)
+        i += 3
+    while i < p:
+        line, x = row[tl.C_ROWS] + i * ld, 0.0
+        for k in range(p, width):
+            x += load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, load(numbers, line + width) - x)
+        i += 1
+    while i >= 3:
+        i -= 3
+        line = row[tl.C_ROWS] + i * ld
+        x, y, z = load(numbers, used + i), load(numbers, used + i + 1), load(numbers, used + i + 2)
+        for k in range(i + 3, p):
+            known = load(numbers, used + k)
+            x -= load(numbers, line + k) * known
+            y -= load(numbers, line + ld + k) * known
+            z -= load(numbers, line + 2 * ld + k) * known
+        z *= load(shares, i + 2)
+        y = (y - load(numbers, line + ld + i + 2) * z) * load(shares, i + 1)
+        x = (x - load(numbers, line + i + 2) * z - load(numbers, line + i + 1) * y) * load(shares, i)
+        put(numbers, used + i, x)
+        put(numbers, used + i + 1, y)
+        put(numbers, used + i + 2, z)
+    while i > 0:
+        i -= 1
+        line, x = row[tl.C_ROWS] + i * ld, load(numbers, used + i)
+        for k in range(i + 1, p):
+            x -= load(numbers, line + k) * load(numbers, used + k)
+        put(numbers, used + i, x * load(shares, i))
+
+
+@inline_kernel
+def move_frontals(
+    row: I64, var: I64, node: I64, lists: I64, numbers: F64, delta: F64, lin: F64, before: F64, turns: F64,
+    values: F64, changed: I64, moved: I64, state: I64,
+) -> None:  # fmt: skip
+    """The estimate of the frontals whose δ is another one."""
+    start, solved = row[tl.C_LIST], row[tl.C_USED]
+    for s in range(start, start + row[tl.C_FRONTALS]):
+        v = lists[s]
+        d, differs = var[v, at.V_SCALAR], False
+        for a in range(dim_of_variable(var, v)):
+            differs |= load(numbers, solved) - load(delta, d + a) != 0.0
+            put(delta, d + a, load(numbers, solved))
+            solved += 1
+        if differs:
+            move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
+            list_moved(MODEL, v, node, moved, state)

@@ -1,0 +1,59 @@
+"""Before a step of the tree: room, good first values, and whether everything new is held.  MATH §9.2."""
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.graph.initialize import follow, reach
+from factorbus.solver.kernels.graph.local_init import settle_new
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
+
+# Doubles of the largest Hessian record.
+HESSIAN = 6 * 6 * 3 + 13
+
+
+@part
+def begin(
+    counts: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64,
+    lin: F64, scalars: F64, saved: F64, state: I64,
+) -> int:  # fmt: skip
+    """Gives DONE: the step can begin; NO_ROOM: the arenas by variable and factor are short; UNSURE: see `step`."""
+    v0, v1, f0, f1 = state[tl.S_VARIABLES], counts[at.VARIABLES], state[tl.S_FACTORS], counts[at.FACTORS]
+    if (
+        v1 > len(node)
+        or f1 > len(link)
+        or counts[at.VALUES] > lin.shape[1]
+        or counts[at.SCALARS] > scalars.shape[1]
+        or state[tl.S_HESSIAN] + (f1 - f0) * HESSIAN > hessian.size
+        or 2 * (f1 - f0) > len(saved)
+    ):
+        return tl.NO_ROOM
+    if v1 - v0 <= settings[tl.P_PLACE]:
+        settle_new(v0, v1, f0, f1, settings[tl.P_NEGLIGIBLE], var, fac, values, payload)
+    if state[tl.S_CHECKED] == 0 and v1 > v0:
+        held = np.empty(v1 - v0, np.int64)
+        for v in range(v0, v1):
+            held[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
+        if (
+            not are_held_in_turn(v0, f0, f1, var, fac, values, payload, held)
+            and reach(False, v0, f0, f1, var, fac, values, payload, held) >= 0
+        ):
+            return tl.UNSURE
+    state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
+    state[tl.S_TOLD : tl.S_TOLD_TO] = 0
+    state[tl.S_FAILED] = -1
+    state[tl.S_STEP] += 1
+    state[tl.S_BEGUN] = 1
+    return tl.DONE
+
+
+@inline_kernel
+def are_held_in_turn(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> bool:
+    """Whether the factors f0 .. f1−1, each once and in their order, hold all: as they do where a robot drives on."""
+    left = 0
+    for k in range(held.size):
+        left += 1 - held[k]
+    for f in range(f0, f1):
+        if left > 0 and follow(False, f, v0, var, fac, values, payload, held) >= 0:
+            left -= 1
+    return left == 0

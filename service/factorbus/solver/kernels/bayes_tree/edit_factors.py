@@ -1,0 +1,217 @@
+"""Factors taken out of the tree, or linearised anew with another weight or loss, ahead of a step.  MATH §11.5.
+
+The tree keeps its cliques: what is changed is what their variables own.  The step that follows touches the variables of
+these factors, as if the factors were new there, and eliminates their cliques from what is left.
+
+    1  detach   a factor that goes leaves the lists of its variables, and χ²
+    2  renew    one that stays has another Hessian, and another χ²
+    3  sum      what the variables have of their factors: the diagonals, the largest lever
+    4  list     the variables, so that the step touches and measures them
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.model import layout as at
+
+# Columns of the log of links that were changed: which one, of what, and the factor or incidence that it was.
+LOG_WHAT, LOG_OF, LOG_WAS, LOG_WIDTH = 0, 1, 2, 3
+FIRST_INCIDENCE, NEXT_INCIDENCE, FIRST_OWN, NEXT_OWN = 0, 1, 2, 3
+MOST_LINKS = 3  # that a factor is taken out of
+
+
+@kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[:,::1])")
+def edit_factors(gone: I64, renewed: I64, graph: I64, tree: I64, log: I64) -> int:
+    """Take the factors `gone` out of the tree, and linearise those `renewed` as the graph has them now (rows).
+
+    graph, tree: tables of their arenas (`places`)   log (3 per factor gone, 3): links as they were, for `relink`
+    Gives how many rows of the log were written; −1 less that where any χ² is not a number.
+    """
+    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
+    node, link, hessian = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), floats(tree, tl.T_HESSIAN)
+    scalars, stiff, turns = float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF), float_rows(tree, tl.T_TURNS)
+    moved, state, account = ints(tree, tl.T_MOVED), ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
+    stiffest = 0.0
+    for k in range(gone.size + renewed.size):
+        f = gone[k] if k < gone.size else renewed[k - gone.size]
+        for end in range(2):
+            v = fac[f, at.F_I + end]
+            if v >= 0:
+                stiffest = max(stiffest, stiffest_of(v, var, scalars))
+    # 1
+    count = 0
+    for k in range(gone.size):
+        count = detach_factor(gone[k], var, fac, node, link, hessian, stiff, log, count, state, account)
+    # 2
+    finite = renew_factors(renewed, graph, tree)
+    # 3, 4
+    for k in range(gone.size + renewed.size):
+        f = gone[k] if k < gone.size else renewed[k - gone.size]
+        for end in range(2):
+            v = fac[f, at.F_I + end]
+            if v >= 0:
+                sum_factors(v, var, fac, node, link, hessian, scalars, stiff, turns)
+                account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
+                list_moved(MODEL, v, node, moved, state)
+    if gone.size + renewed.size > 0 and stiffest >= account[tl.A_STIFFEST]:
+        account[tl.A_STIFFEST] = 0.0
+        for v in range(state[tl.S_VARIABLES]):
+            account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
+    account[tl.A_LEAST] = 0.0  # without a factor the optimum may be lower
+    state[tl.S_EDITED], state[tl.S_EDITED_AT] = state[tl.S_MOVED], state[tl.S_STEP] + 1
+    return count if finite else -1 - count
+
+
+@part
+def detach_factor(
+    f: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, stiff: F64, log: I64, count: int, state: I64,
+    account: F64,
+) -> int:  # fmt: skip
+    """Factor f counts no more; gives how many rows of the log are written then."""
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    size = hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
+    state[tl.S_HOLES] += size
+    if link[f, tl.L_KIND] >= tl.EXACT:
+        state[tl.S_EXACT] -= 1
+        state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
+    account[tl.A_CHI2] -= stiff[f, tl.B_CHI2]
+    account[tl.A_ERROR] -= stiff[f, tl.B_ERROR]
+    account[tl.A_COUNTED] -= stiff[f, tl.B_COUNTED]
+    account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + stiff[f, tl.B_ERROR]
+    count = unlink_incidence(2 * f, i, node, link, log, count)
+    if j >= 0:
+        count = unlink_incidence(2 * f + 1, j, node, link, log, count)
+    if has_free(f, var, fac):
+        done = unlink_own(f, i, node, link, log, count)
+        return done if done > count or j < 0 else unlink_own(f, j, node, link, log, count)
+    chi2 = hessian[link[f, tl.L_AT] + size - 1]
+    account[tl.A_CONSTANT] -= chi2
+    account[tl.A_MODEL] -= chi2
+    return count
+
+
+@inline_kernel
+def unlink_incidence(slot: int, v: int, node: I64, link: I64, log: I64, count: int) -> int:
+    """Take an incidence out of the list of variable v."""
+    before, following = node[v, tl.N_ADJ], next_incidence(slot, link)
+    if before == slot:
+        note(FIRST_INCIDENCE, v, slot, log, count)
+        node[v, tl.N_ADJ] = following
+        return count + 1
+    while next_incidence(before, link) != slot:
+        before = next_incidence(before, link)
+    note(NEXT_INCIDENCE, before, slot, log, count)
+    link[before // 2, tl.L_I + before % 2] = following
+    return count + 1
+
+
+@inline_kernel
+def unlink_own(f: int, v: int, node: I64, link: I64, log: I64, count: int) -> int:
+    """Take factor f out of those that variable v owns, if it is among them."""
+    before, following = node[v, tl.N_OWN], link[f, tl.L_OWN]
+    if before == f:
+        note(FIRST_OWN, v, f, log, count)
+        node[v, tl.N_OWN] = following
+        return count + 1
+    while before >= 0 and link[before, tl.L_OWN] != f:
+        before = link[before, tl.L_OWN]
+    if before < 0:
+        return count
+    note(NEXT_OWN, before, f, log, count)
+    link[before, tl.L_OWN] = following
+    return count + 1
+
+
+@inline_kernel
+def note(what: int, of: int, was: int, log: I64, count: int) -> None:
+    """One more row of the log."""
+    log[count, LOG_WHAT], log[count, LOG_OF], log[count, LOG_WAS] = what, of, was
+
+
+@kernel("void(int64, int64[:,::1], int64[::1])")
+def relink(count: int, log: I64, tree: I64) -> None:
+    """All links as they were: the log read backwards."""
+    node, link = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK)
+    for k in range(count - 1, -1, -1):
+        what, of, was = log[k, LOG_WHAT], log[k, LOG_OF], log[k, LOG_WAS]
+        if what == FIRST_INCIDENCE:
+            node[of, tl.N_ADJ] = was
+        elif what == NEXT_INCIDENCE:
+            link[of // 2, tl.L_I + of % 2] = was
+        elif what == FIRST_OWN:
+            node[of, tl.N_OWN] = was
+        else:
+            link[of, tl.L_OWN] = was
+
+
+@part
+def renew_factors(renewed: I64, graph: I64, tree: I64) -> bool:
+    """Linearise factors with the weight and loss that they have now; gives whether all χ² are numbers."""
+    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
+    values, payload = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD)
+    link, hessian, lin = int_rows(tree, tl.T_LINK), floats(tree, tl.T_HESSIAN), float_rows(tree, tl.T_LIN)
+    scalars, stiff, turns = float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF), float_rows(tree, tl.T_TURNS)
+    state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
+    r, H, W, finite = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6)), True
+    for k in range(renewed.size):
+        f = renewed[k]
+        i, j = fac[f, at.F_I], fac[f, at.F_J]
+        di, dj = dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0
+        last = link[f, tl.L_AT] + hessian_size(di, dj) - 1
+        was, linear_was = stiff[f, tl.B_CHI2], hessian[last]
+        if fac[f, at.F_KIND] < at.IDP_FIRST:
+            note_loss(f, fac, link, state)
+        linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
+        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
+        c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        account[tl.A_CHI2] += stiff[f, tl.B_CHI2] - was
+        account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + was
+        if not has_free(f, var, fac):
+            account[tl.A_CONSTANT] += hessian[last] - linear_was
+            account[tl.A_MODEL] += hessian[last] - linear_was
+        finite &= math.isfinite(hessian[last]) and math.isfinite(stiff[f, tl.B_CHI2])
+    return finite
+
+
+@inline_kernel
+def note_loss(f: int, fac: I64, link: I64, state: I64) -> None:
+    """How far a factor with a loss is from its linear model is computed, (9.11)."""
+    was = link[f, tl.L_KIND] >= tl.EXACT
+    robust = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
+    state[tl.S_EXACT] += int(robust) - int(was)
+    link[f, tl.L_KIND] = tl.EXACT if robust else fac[f, at.F_KIND]
+
+
+@part
+def sum_factors(
+    v: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, scalars: F64, stiff: F64, turns: F64
+) -> None:
+    """What variable v has of its factors: the sum of the diagonals of their Hessians, and the largest lever."""
+    d, dim, lever = var[v, at.V_SCALAR], dim_of_variable(var, v), 0.0
+    if d >= 0:
+        for a in range(dim):
+            scalars[1, d + a] = 0.0
+    slot = node[v, tl.N_ADJ]
+    while slot >= 0:
+        f = slot // 2
+        h = link[f, tl.L_AT]
+        if slot % 2 == 0:
+            lever = max(lever, stiff[f, tl.B_LEVER] * stiff[f, tl.B_ROOT])
+        else:
+            di = dim_of_variable(var, fac[f, at.F_I])
+            h += di * di + di * dim
+        if d >= 0:
+            for a in range(dim):
+                scalars[1, d + a] += hessian[h + a * dim + a]
+        slot = next_incidence(slot, link)
+    turns[v, tl.U_LEVER] = lever

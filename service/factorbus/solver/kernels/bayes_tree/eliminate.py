@@ -1,0 +1,278 @@
+"""Eliminating the affected variables: fronts from the leaves to the roots.  MATH §9.5.
+
+    1  sort       factors and orphans by the front that takes them in
+    2  cut        subtrees off, which several threads can eliminate, where that takes long and anybody lends a core
+    3  eliminate  the subtrees, and what is above them, children first
+
+A front takes in the factors that its pivots own and the update matrices of its children, which may be fronts of this
+step or orphans of earlier ones, whose separators may now be eliminated in another order than their columns have.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.affected import separators_of
+from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
+from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_relative
+from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, float_rows, floats, int_rows, ints, put_place
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.sparse import fronts as fr
+from factorbus.solver.kernels.sparse.multifrontal import clear_front
+from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, factor_front
+from factorbus.solver.kernels.sparse.task_queue import (
+    AT,
+    SUBTREES,
+    count_lenders,
+    post,
+    say_done,
+    take_board,
+    take_chunk,
+    wait_and_leave,
+)
+
+# Entries of a plan, a table as in `places`: what a thread has to know to eliminate fronts.
+GRAPH, TREE = 0, 1  # tables
+IDS, RECORDS = 2, 3  # the clique and the record of each front
+FIRST_FACTOR, FACTORS = 4, 5  # those of front f are FACTORS[FIRST_FACTOR[f] : FIRST_FACTOR[f + 1]]
+FIRST_ORPHAN, NEXT_ORPHAN = 6, 7  # of each front, and of each orphan the next one of the same front; −1: none
+ORPHANS, UPDATE = 8, 9  # the cliques, and where their update matrices are and how wide
+CUT = 10  # the subtrees, a row each
+# And words of it behind those: affected variables, the most pivots of a front, the most separator variables of what is
+# taken in.
+N = WIDTH * (CUT + 1)
+MOST_PIVOTS, MOST_SEPARATORS = N + 1, N + 2
+PLAN = MOST_SEPARATORS + 1
+
+# Columns of a subtree, fronts FIRST .. END: when it is eliminated the variable whose pivot failed, or −1, and flops.
+FIRST, END, FAILED, FLOPS = 0, 1, 2, 3
+TURN = 4  # of the row k: the subtree that is eliminated as the k-th one; those that take longest come first
+SUBTREE = 5
+
+PIECES = 3  # for each thread; with more of them more is left above, where there is less to share
+# What a front takes besides the flops of its pivots, in those: to assemble it, by scalars², and as such.  Measured.
+ASSEMBLY, BOOKKEEPING = 150, 80_000
+LONG = 30_000_000  # an elimination that is worth sharing, half a millisecond
+
+
+@part
+def eliminate_fronts(
+    ids: I64, records: I64, n: int, home: I64, place: I64, factors: I64, orphans: I64, lowest: I64, update: I64,
+    graph: I64, tree: I64, board: I64,
+) -> int:  # fmt: skip
+    """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
+
+    update (orphans, 3): where the update matrix of each orphan is, and its width   graph, tree: tables of their arenas
+    board: see `task_queue`
+    """
+    # 1
+    count = ids.size
+    clique, state = int_rows(tree, tl.T_CLIQUE), ints(tree, tl.T_STATE)
+    first_factor, factor_of = _by_front(count, factors, home, place, graph, tree)
+    first_orphan, next_orphan = np.full(count, -1), np.empty(orphans.size, np.int64)
+    for e in range(orphans.size - 1, -1, -1):
+        f = home[place[lowest[e]]]
+        next_orphan[e], first_orphan[f] = first_orphan[f], e
+    pivots, separators = 0, 0
+    for f in range(count):
+        pivots = max(pivots, records[f, fr.PIVOTS])
+        separators = max(separators, clique[ids[f], tl.C_SEPARATORS])
+    for e in range(orphans.size):
+        first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)
+        separators = max(separators, end - first)
+    plan = np.empty(PLAN, np.int64)
+    plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = n, pivots, separators
+    # 2, 3.  What a plan tells of has to be there for as long: these are, while the next one runs.
+    failed, flops = _eliminate_sorted(
+        plan, ids, records, first_factor, factor_of, first_orphan, next_orphan, orphans, update, graph, tree, board
+    )
+    if failed < 0:
+        state[tl.S_FLOPS] += flops
+    return failed
+
+
+@part
+def _eliminate_sorted(
+    plan: I64, ids: I64, records: I64, first_factor: I64, factor_of: I64, first_orphan: I64, next_orphan: I64,
+    orphans: I64, update: I64, graph: I64, tree: I64, board: I64,
+) -> tuple[int, int]:  # fmt: skip
+    """Write the plan, and go by it; gives the variable whose pivot failed, or −1, and flops."""
+    put_place(plan, GRAPH, address_of(graph), graph.size, 1)
+    put_place(plan, TREE, address_of(tree), tree.size, 1)
+    put_place(plan, IDS, address_of(ids), ids.size, 1)
+    put_place(plan, RECORDS, address_of(records), len(records), fr.FRONT)
+    put_place(plan, FIRST_FACTOR, address_of(first_factor), first_factor.size, 1)
+    put_place(plan, FACTORS, address_of(factor_of), factor_of.size, 1)
+    put_place(plan, FIRST_ORPHAN, address_of(first_orphan), first_orphan.size, 1)
+    put_place(plan, NEXT_ORPHAN, address_of(next_orphan), next_orphan.size, 1)
+    put_place(plan, ORPHANS, address_of(orphans), orphans.size, 1)
+    put_place(plan, UPDATE, address_of(update), len(update), update.shape[1])
+    lenders = count_lenders(board)
+    if lenders > 0:
+        return _eliminate_in_pieces(plan, records, lenders, board)
+    return eliminate_range(plan, 0, ids.size, 0, board)
+
+
+@part
+def _eliminate_in_pieces(plan: I64, records: I64, lenders: int, board: I64) -> tuple[int, int]:
+    """Subtrees on several cores, if it is worth it, and then what is above them; what fails first is what counts."""
+    cut = cut_subtrees(records, lenders)
+    pieces = len(cut)
+    if pieces > 0 and take_board(board):
+        put_place(plan, CUT, address_of(cut), pieces, SUBTREE)
+        _eliminate_together(plan, pieces, board)
+    else:
+        pieces = 0
+    f, flops = 0, 0
+    for k in range(pieces):
+        failed, spent = eliminate_range(plan, f, cut[k, FIRST], 0, board)
+        if failed < 0:
+            failed = cut[k, FAILED]
+        if failed >= 0:
+            return failed, 0
+        f = cut[k, END]
+        flops += spent + cut[k, FLOPS]
+    failed, spent = eliminate_range(plan, f, len(records), 0, board)
+    return failed, flops + spent
+
+
+@part
+def cut_subtrees(records: I64, lenders: int) -> I64:
+    """Subtrees of neighbours in postorder that take a small share of the whole; none where it is not worth it."""
+    count = len(records)
+    takes, first = np.zeros(count), np.arange(count)  # with all below
+    total = 0.0
+    for f in range(count):
+        scalars = records[f, fr.PIVOTS] + records[f, fr.BORDER] + 1
+        own = (records[f, fr.PIVOTS] + ASSEMBLY) * scalars * scalars + BOOKKEEPING
+        takes[f] += own
+        total += own
+        above = records[f, fr.PARENT]
+        if above >= 0:
+            takes[above] += takes[f]
+            first[above] = min(first[above], first[f])
+    if total < LONG:
+        return np.empty((0, SUBTREE), np.int64)
+    cut, size, pieces = np.empty((count, SUBTREE), np.int64), np.empty(count), 0
+    most = total / (PIECES * (1 + lenders))
+    for f in range(count):
+        above = records[f, fr.PARENT]
+        if takes[f] > most or (above >= 0 and takes[above] <= most):
+            continue
+        if pieces > 0 and cut[pieces - 1, END] == first[f] and size[pieces - 1] + takes[f] <= most:
+            size[pieces - 1] += takes[f]
+        else:
+            cut[pieces, FIRST], size[pieces] = first[f], takes[f]
+            pieces += 1
+        cut[pieces - 1, END] = f + 1
+    for turn in range(pieces):
+        largest = 0
+        for k in range(1, pieces):
+            if size[k] > size[largest]:
+                largest = k
+        cut[turn, TURN], size[largest] = largest, -1.0
+    return cut[:pieces]
+
+
+@part
+def _eliminate_together(plan: I64, subtrees: int, board: I64) -> None:
+    """All subtrees; the board is this thread's."""
+    put_place(board, AT, address_of(plan), plan.size, 1)
+    post(board, SUBTREES, subtrees)
+    chunk = take_chunk(board)
+    while chunk >= 0:
+        make_subtree(board, chunk, 0)
+        say_done(board)
+        chunk = take_chunk(board)
+    wait_and_leave(board)
+
+
+@part
+def make_subtree(board: I64, chunk: int, t: int) -> None:
+    """Eliminate a subtree of the plan that the board has, with the scratch at t."""
+    plan = ints(board, AT)
+    subtrees = int_rows(plan, CUT)
+    subtree = subtrees[subtrees[chunk, TURN]]
+    subtree[FAILED], subtree[FLOPS] = eliminate_range(plan, subtree[FIRST], subtree[END], t, board)
+
+
+@part
+def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tuple[int, int]:
+    """Eliminate fronts begin .. end, whose children are; gives the variable whose pivot failed, or −1, and flops."""
+    graph, tree = ints(plan, GRAPH), ints(plan, TREE)
+    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
+    node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
+    lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
+    scalars, stamp = float_rows(tree, tl.T_SCALARS), ints(tree, tl.T_STATE)[tl.S_STAMP]
+    noise = ROUNDING * floats(tree, tl.T_ACCOUNT)[tl.A_STIFFEST]
+    ids, records = ints(plan, IDS), int_rows(plan, RECORDS)
+    orphans, update = ints(plan, ORPHANS), int_rows(plan, UPDATE)
+    first_factor, factor_of = ints(plan, FIRST_FACTOR), ints(plan, FACTORS)
+    first_orphan, next_orphan = ints(plan, FIRST_ORPHAN), ints(plan, NEXT_ORPHAN)
+    column, floors = np.empty(plan[N], np.int64), np.empty(plan[MOST_PIVOTS])
+    runs = np.empty((plan[MOST_SEPARATORS] + 1, fr.RUN), np.int64)
+    flops = 0
+    for f in range(begin, end):
+        row = clique[ids[f]]
+        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+        number_columns(row, noise, var, node, lists, scalars, column, floors)
+        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
+        anchored = 0
+        for q in range(first_factor[f], first_factor[f + 1]):
+            anchored |= int(not is_relative(factor_of[q], var, fac))
+            add_hessian(factor_of[q], row, column, var, fac, node, link, hessian, numbers)
+        child = records[f, fr.CHILD]
+        while child >= 0:
+            other = clique[ids[child]]
+            start = other[tl.C_LIST] + other[tl.C_FRONTALS]
+            k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
+            extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, k, row)
+            anchored |= other[tl.C_ANCHORED]
+            child = records[child, fr.SIBLING]
+        e = first_orphan[f]
+        while e >= 0:
+            start = clique[orphans[e], tl.C_LIST]
+            low, high = separators_of(orphans[e], stamp, clique)
+            k = list_runs(start + low, start + high, column, p, m, var, node, lists, runs)
+            extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
+            anchored |= clique[orphans[e], tl.C_ANCHORED]
+            e = next_orphan[e]
+        row[tl.C_ANCHORED] = anchored
+        failed = factor_front(
+            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0, t,
+            board,
+        )  # fmt: skip
+        if failed >= 0:
+            return variable_at(failed, row, var, lists), flops
+        if failed == RAISED:
+            ints(tree, tl.T_STATE)[tl.S_RAISED] = 1
+        flops += p * (p + m + 1) * (p + m + 1)
+    return -1, flops
+
+
+@part
+def _by_front(count: int, factors: I64, home: I64, place: I64, graph: I64, tree: I64) -> tuple[I64, I64]:
+    """The factors sorted by the front that takes them in."""
+    var, fac, node = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC), int_rows(tree, tl.T_NODE)
+    begin, front = np.zeros(count + 2, np.int64), np.empty(factors.size, np.int64)
+    for q in range(factors.size):
+        front[q] = home[first_end(factors[q], place, var, fac, node)]
+        begin[front[q] + 2] += 1
+    for f in range(count):
+        begin[f + 2] += begin[f + 1]
+    out = np.empty(factors.size, np.int64)
+    for q in range(factors.size):
+        out[begin[front[q] + 1]] = factors[q]
+        begin[front[q] + 1] += 1
+    return begin, out
+
+
+@inline_kernel
+def first_end(f: int, place: I64, var: I64, fac: I64, node: I64) -> int:
+    """The place in the order of the first end of factor f that is eliminated."""
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    if j < 0 or var[j, at.V_COLUMN] < 0:
+        return int(place[node[i, tl.N_LOCAL]])
+    if var[i, at.V_COLUMN] < 0:
+        return int(place[node[j, tl.N_LOCAL]])
+    return int(min(place[node[i, tl.N_LOCAL]], place[node[j, tl.N_LOCAL]]))

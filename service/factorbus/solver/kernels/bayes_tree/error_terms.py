@@ -1,0 +1,155 @@
+"""How far a factor is bent between its linearisation point and the estimate.  MATH §9.6.
+
+What a pose i sees of j at a distance d is u = Rᵢᵀ (tⱼ − tᵢ), and between factors and sightings are linear in it.  With
+a turn of i by φ, and shifts sᵢ and sⱼ in the map's frame, the linear model misses of it, to second order,
+
+    bend = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                                     (9.4)
+
+standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearisation point of i alone
+makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range bend with the shift as well,
+
+    bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
+
+and there both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted
+against the pose, the Jacobian of the pose's turn is off by that share of d, and with it the gradient, whatever φ is:
+
+    slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
+
+r being the residual at the linearisation point.  A pose seen from another one slips as well, with the residual r(x) at
+the estimate,
+
+    slip = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                           (9.13)
+
+As a bound it counts in full.  But errors of the gradient largely cancel along a path, so for what is relinearized as
+the drive goes on LINKS of it counts.  Where the slip is more than the bend, both ends move.
+
+Angles of the plane add up; turns in space do not.  With ψ the turn of j as seen from i since both were linearized, and
+φ that of i, the vector part of the error is off by
+
+    √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
+
+ω_θ being the information of the angle: in the Hessian of j, as a residual counts half of it.  And the force √Ω r(x)
+turns with i, and that of the rotation alone, r_θ, with j as seen from i, by half of which the gradient is off on the
+way:
+
+    ½ φ |√Ω r(x)| + ½ ψ |√Ω_θ r_θ(x)|                                                         (9.30)
+
+That counts as a bound only.  How a sight is
+bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
+standard deviations,
+
+    bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
+
+and both ends move.  As a bound the force counts as well, (9.31) in `exact_error`.
+"""
+
+import math
+
+from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.se3 import quat_product
+from factorbus.solver.lenses.layout import FU
+
+LINKS = 0.1
+# So much of the bend counts of what sees a landmark.  With all of it Σ bend² came to 4 to 5 times what χ² was above its
+# optimum where landmarks are seen, and to 1 to 2 times between poses.
+SEEN = 0.45
+
+
+@inline_kernel
+def turn_of(kind: int, delta: F64, d: int) -> float:
+    """The angle by which δ at offset d turns a pose; 0 of a point."""
+    if kind == at.SE2:
+        return abs(load(delta, d + 2))
+    if kind == at.SE3:
+        a, b, c = load(delta, d + 3), load(delta, d + 4), load(delta, d + 5)
+        return math.sqrt(a * a + b * b + c * c)
+    return 0.0
+
+
+@inline_kernel
+def shift_between(planar: bool, x: int, y: int, values: F64, lin: F64) -> float:
+    """|sⱼ − sᵢ| of the values at offsets x and y."""
+    total = 0.0
+    for a in range(2 if planar else 3):
+        gap = load(values, y + a) - load(lin, y + a) - (load(values, x + a) - load(lin, x + a))
+        total += gap * gap
+    return math.sqrt(total)
+
+
+@inline_kernel
+def bend_of(root: float, d: float, phi: float, shift: float) -> float:
+    """(9.4)"""
+    return root * (0.5 * d * phi * phi + phi * shift)
+
+
+@part
+def add_sighting(
+    kind: int, bend: float, root: float, d: float, shift: float, pull: float
+) -> tuple[float, float]:  # fmt: skip
+    """The bend, with what (9.5) has beside (9.4), and the slip (9.12) of what sees a landmark, √ω |r| as |Ω r| / √ω;
+    pull is |Ω r|.  Of all other kinds the bend, and 0.
+    """
+    if d > 0.0:
+        if kind == at.BEARING_RANGE_SE2:
+            return bend + root * shift * shift / d, 0.0
+        if kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3:
+            return bend, (pull / root + root * shift) * shift / d
+    return bend, 0.0
+
+
+@inline_kernel
+def slip_weight(root: float, d: float, stiff_turn: float) -> float:
+    """√ω / √(d² + ω_θ/ω) of poses: times |r(x)| and |sⱼ − sᵢ| it is (9.13)."""
+    return root / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
+
+
+@inline_kernel
+def turn_between(i: int, j: int, values: F64, lin: F64) -> float:
+    """ψ of the poses in space at offsets i and j: by how much j has turned as seen from i."""
+    now = relative_turn(i, j, values)
+    was = relative_turn(i, j, lin)
+    x, y, z, _ = quat_product(-was[0], -was[1], -was[2], was[3], now[0], now[1], now[2], now[3])
+    return 2.0 * math.sqrt(x * x + y * y + z * z)
+
+
+@inline_kernel
+def turn_error(phi: float, psi: float, stiff_turn: float) -> float:
+    """(9.26), the first pose turned by phi; stiff_turn is ω_θ of the angle."""
+    return math.sqrt(stiff_turn) * psi * (0.5 * phi + psi * psi / 24.0)
+
+
+@inline_kernel
+def relative_turn(i: int, j: int, x: F64) -> tuple:
+    """qᵢ⁻¹ ⊗ qⱼ of the poses at offsets i and j, x y z w."""
+    return quat_product(-x[i + 3], -x[i + 4], -x[i + 5], x[i + 6], x[j + 3], x[j + 4], x[j + 5], x[j + 6])
+
+
+@inline_kernel
+def lever_of(kind: int, p: F64, k: int) -> float:
+    """d: the distance at which a factor sees something; its measurement is at offset k of the payload."""
+    if kind == at.BETWEEN_SE2 or kind == at.LANDMARK_SE2:
+        return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1])
+    if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
+        return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1] + p[k + 2] * p[k + 2])
+    if kind == at.BEARING_RANGE_SE2:
+        return p[k + 1]
+    if at.IDP_FIRST <= kind < at.POSITION_SE2:  # of a pixel: how many a radian has
+        return p[k + (4 if kind == at.IDP_FIRST else 3) + FU]
+    return 0.0
+
+
+@inline_kernel
+def root_weight(kind: int, w: F64, d: float) -> float:
+    """√ω of (9.4); 0 of a prior: in the plane it is linear, and in space (9.11) is computed."""
+    if kind == at.BEARING_RANGE_SE2:
+        return math.sqrt(w[1, 1]) + math.sqrt(w[0, 0]) / d
+    if kind == at.BETWEEN_SE2 or kind == at.LANDMARK_SE2:
+        return math.sqrt(max(w[0, 0], w[1, 1]))
+    if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
+        return math.sqrt(max(w[0, 0], w[1, 1], w[2, 2]))
+    if at.IDP_FIRST <= kind < at.POSITION_SE2:
+        a = 3 if kind == at.IDP_FIRST else 0
+        return math.sqrt(max(w[a, a], w[a + 1, a + 1]))
+    return 0.0

@@ -1,0 +1,82 @@
+"""The linearization error of a factor, computed: of sights, of factors with a loss, and of kinds that no closed form
+bounds.  MATH (9.11), (9.31)
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
+from factorbus.solver.lenses.layout import GOOD
+
+SWITCHED = 30.0  # of a sight that has lost its pixel or found it again: by which that counts in χ², see `sights`
+
+
+@part
+def exact_error(
+    f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
+) -> tuple[float, float, float]:  # fmt: skip
+    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
+    residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ² there.
+    """
+    r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
+    A_now, B_now = np.zeros((6, 6)), np.zeros((6, 6))
+    chi2 = evaluate_apart(f, var, fac, values, payload, now, A_now, B_now)
+    evaluate_apart(f, var, fac, lin, payload, r, A, B)
+    kind = fac[f, at.F_KIND]
+    dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
+    # It has fallen asleep, or woken.
+    switched = kind >= at.IDP_FIRST and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD)
+    add_slope(fac[f, at.F_I], dim, var, delta, A, r)
+    if fac[f, at.F_J] >= 0:
+        add_slope(fac[f, at.F_J], dim, var, delta, B, r)
+    force = force_of(fac[f, at.F_I], dim, p, var, payload, now, A, A_now)
+    if fac[f, at.F_J] >= 0:
+        force += force_of(fac[f, at.F_J], dim, p, var, payload, now, B, B_now)
+    total = 0.0
+    for a in range(dim):
+        gap = now[a] - r[a]
+        total += gap * payload[p] * gap
+        chi2 += now[a] * payload[p] * now[a]
+        p += 1
+        for b in range(a + 1, dim):
+            total += 2.0 * gap * payload[p] * (now[b] - r[b])
+            chi2 += 2.0 * now[a] * payload[p] * now[b]
+            p += 1
+    return SWITCHED if switched else math.sqrt(max(total, 0.0)), math.sqrt(force), chi2
+
+
+@part
+def force_of(v: int, dim: int, p: int, var: I64, payload: F64, r: F64, J: F64, J_now: F64) -> float:
+    """The square of (9.31), the share of variable v: Σ ((J_now − J)ᵀ Ω r)² / (J_nowᵀ Ω J_now) over its scalars."""
+    if var[v, at.V_SCALAR] < 0:
+        return 0.0
+    total = 0.0
+    for c in range(dim_of(var[v, at.V_KIND])):
+        turned = stiff = 0.0
+        q = p
+        for a in range(dim):
+            for b in range(a, dim):
+                w = payload[q]
+                q += 1
+                turned += (J_now[a, c] - J[a, c]) * w * r[b]
+                stiff += J_now[a, c] * w * J_now[b, c]
+                if b > a:
+                    turned += (J_now[b, c] - J[b, c]) * w * r[a]
+                    stiff += J_now[a, c] * w * J_now[b, c]
+        if stiff > 0.0:
+            total += turned * turned / stiff
+    return total
+
+
+@part
+def add_slope(v: int, dim: int, var: I64, delta: F64, J: F64, r: F64) -> None:
+    """r += J δ of variable v."""
+    d = var[v, at.V_SCALAR]
+    if d >= 0:
+        for a in range(dim):
+            for c in range(dim_of(var[v, at.V_KIND])):
+                r[a] += J[a, c] * delta[d + c]

@@ -1,0 +1,190 @@
+"""The Hessian of a factor at its variables' linearisation points, kept until one of them moves.  MATH §9.2."""
+
+import math
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, slip_weight
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_round
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put, six
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart, multiply
+from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
+from factorbus.solver.lenses.layout import GOOD
+
+
+@inline_kernel
+def hessian_size(di: int, dj: int) -> int:
+    """Doubles that the Hessian of a factor takes; dj is 0 where there is no second variable."""
+    return di * di + di * dj + dj * dj + di + dj + 1
+
+
+@part
+def linearise_factor(
+    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, stiff: F64, r: F64, H: F64, W: F64,
+    state: I64,
+) -> None:  # fmt: skip
+    """Write the Hessian of factor f at the linearisation points, and what its slip depends on there.
+
+    r (7,), H (4, 6, 6), W (6, 6) are scratch
+    """
+    kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
+    p = fac[f, at.F_AT] + information_at(kind)
+    more = evaluate_apart(f, var, fac, lin, payload, r, H[0], H[1])
+    # Sizes as constants, so that each call becomes straight code.
+    if kind == at.BETWEEN_SE2:
+        _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
+        stiff[f, tl.B_TURN] = hessian[h + 9 + 9 + 8]
+    elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
+        _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
+        stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
+    elif kind == at.BETWEEN_SE3:
+        _write_between_se3(p, more, payload, r, H, W, h, hessian)
+        stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
+    elif kind == at.LANDMARK_SE3:
+        _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
+        stiff[f, tl.B_PULL] = gradient_norm(3, h + 36 + 18 + 9, hessian)
+    else:
+        _write_other(kind, p, more, payload, r, H, W, h, hessian)
+        if kind >= at.IDP_FIRST:
+            note_sleep(f, r[at.R_STATUS] != GOOD, link, state)
+
+
+@inline_kernel
+def gradient_norm(count: int, g: int, hessian: F64) -> float:
+    """|Ω r| of what is seen: the gradient of the pose's translation, from offset g on."""
+    total = 0.0
+    for a in range(count):
+        total += hessian[g + a] * hessian[g + a]
+    return math.sqrt(total)
+
+
+@inline_kernel
+def note_sleep(f: int, asleep: bool, link: I64, state: I64) -> None:
+    """Count a sight that has no pixel any more, or has one again."""
+    if asleep != (link[f, tl.L_KIND] == tl.ASLEEP):
+        state[tl.S_ASLEEP] += 1 if asleep else -1
+        link[f, tl.L_KIND] = tl.ASLEEP if asleep else tl.EXACT
+
+
+@part
+def _write_other(kind: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+    """Of the kinds that are not worth straight code."""
+    di, dj = end_dims(kind)
+    _write(residual_dim(kind), di, dj, p, more, payload, r, H, W, h, out)
+
+
+@part
+def _write_between_se3(p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+    """`_write`, in half its products: the lower left quarter of both Jacobians and the upper right one of B are zero.
+
+    Of A, B, Ω A and Ω B side by side in J, six a row, all places are constants: so rows become vectors.
+    """
+    J, M = H.reshape(144), W.reshape(36)
+    for a in range(6):
+        for b in range(a, 6):
+            M[6 * a + b] = M[6 * b + a] = payload[p]
+            p += 1
+    chi2 = more
+    for a in range(6):
+        e = 0.0
+        for b in range(6):
+            e += load(M, 6 * a + b) * r[b]
+        chi2 += r[a] * e
+    for a in range(6):
+        six(M, 6 * a, 1, 6, J, 0, J, 72 + 6 * a)
+        six(M, 6 * a, 1, 6, J, 36, J, 108 + 6 * a)
+    for a in range(3):
+        six(J, a, 6, 3, J, 72, out, h + 6 * a)
+        six(J, a, 6, 3, J, 108, out, h + 36 + 6 * a)
+        six(J, 36 + a, 6, 3, J, 108, out, h + 72 + 6 * a)
+    for a in range(3, 6):
+        six(J, a, 6, 6, J, 72, out, h + 6 * a)
+        six(J, a, 6, 6, J, 108, out, h + 36 + 6 * a)
+        six(J, 54 + a, 6, 3, J, 126, out, h + 72 + 6 * a)
+    for a in range(6):
+        r[a] = -r[a]
+    six(r, 0, 1, 6, J, 72, out, h + 108)
+    six(r, 0, 1, 6, J, 108, out, h + 114)
+    put(out, h + 120, chi2)
+
+
+@inline_kernel
+def _write(
+    dr: int, di: int, dj: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64
+) -> None:
+    A, B, WA, WB = H[0], H[1], H[2], H[3]
+    for a in range(dr):
+        for b in range(a, dr):
+            W[a, b] = W[b, a] = payload[p]
+            p += 1
+    chi2 = more
+    for a in range(dr):
+        e = 0.0
+        for b in range(dr):
+            e += W[a, b] * r[b]
+        chi2 += r[a] * e
+    multiply(dr, di, W, A, WA)
+    h = _product(dr, di, di, A, WA, h, out)
+    if dj > 0:
+        multiply(dr, dj, W, B, WB)
+        h = _product(dr, di, dj, A, WB, h, out)
+        h = _product(dr, dj, dj, B, WB, h, out)
+    h = _gradient(dr, di, WA, r, h, out)
+    if dj > 0:
+        h = _gradient(dr, dj, WB, r, h, out)
+    put(out, h, chi2)
+
+
+@inline_kernel
+def _product(dr: int, d: int, e: int, A: F64, WB: F64, h: int, out: F64) -> int:
+    """Aᵀ Ω B, row by row."""
+    for a in range(d):
+        for b in range(e):
+            total = 0.0
+            for k in range(dr):
+                total += A[k, a] * WB[k, b]
+            put(out, h + a * e + b, total)
+    return h + d * e
+
+
+@inline_kernel
+def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
+    """−Aᵀ Ω r."""
+    for a in range(d):
+        total = 0.0
+        for k in range(dr):
+            total += WA[k, a] * r[k]
+        put(out, h + a, -total)
+    return h + d
+
+
+@part
+def weigh_factor(
+    f: int, var: I64, fac: I64, payload: F64, link: I64, hessian: F64, scalars: F64, stiff: F64, turns: F64, W: F64
+) -> None:
+    """Add a factor that was just linearised to what measures δ: the diagonal sums, and how it bends.
+
+    W holds its information, as `linearise_factor` left it.
+    """
+    kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
+    i, j = fac[f, at.F_I], fac[f, at.F_J]
+    di = dim_of(var[i, at.V_KIND])
+    dj = dim_of(var[j, at.V_KIND]) if j >= 0 else 0
+    s = var[i, at.V_SCALAR]
+    if s >= 0:
+        for a in range(di):
+            scalars[1, s + a] += hessian[h + a * di + a]
+    distance = lever_of(kind, payload, fac[f, at.F_AT])
+    root = root_weight(kind, W, distance)
+    turns[i, tl.U_LEVER] = max(turns[i, tl.U_LEVER], distance * root)
+    if j >= 0:
+        s = var[j, at.V_SCALAR]
+        if s >= 0:
+            for a in range(dj):
+                scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
+    stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
+    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        stiff[f, tl.B_PULL] = slip_weight(root, distance, stiff[f, tl.B_TURN])
+    stiff[f, tl.B_ROUND] = 1.0 if is_round(kind, fac[f, at.F_AT], payload) else 0.0

@@ -1,0 +1,235 @@
+"""The tree of cliques: what its records hold and where its numbers lie.  MATH §9.
+
+A clique is a set of variables eliminated together (its frontals, F) given those they still depend on (its separator,
+S).  It keeps its rows of R, with d as the last column, and its update matrix U: what eliminating its subtree leaves on
+S, with a last column for the right-hand side and a corner for χ²,
+
+    rows   p × (p + m + 1):   [ R_F  R_S  d ]           U   (m + 1) × (m + 1):   [ Λ'_S  η'_S ; ·  χ²' ]
+
+p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
+
+The arenas of a tree are, each from the start of a cache line on:
+    node    (n, 16) int64    one row per variable, by its index in the graph
+    link    (m, 8) int64     one row per factor, by its id
+    clique  (c, 24) int64    records of cliques
+    lists   int64            variables of cliques
+    numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
+    hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
+    stiff   (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearised, (9.12);
+                             between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is that of a
+                             disc and an angle; at the estimate χ², error² in full, and as it counts
+    lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
+                             before the step, of what it changes
+    scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
+                             back to while variables are relinearised
+    turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; cosine and sine where a plane pose is
+                             linearised
+    pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that moved
+                             since their factors were evaluated last
+    marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
+    motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
+    saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
+    settings (24,) float64   see P_RIPPLE and so on
+    state   int64            counters and the heads of free lists
+    account (13,) float64     what a step found
+"""
+
+# The arenas of a tree in its table (`places`).
+ARENAS = (
+    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "turns",
+    "pending",
+    "changed", "moved", "marked", "motions", "saved", "state", "account",
+)  # fmt: skip
+(
+    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_TURNS,
+    T_PENDING,
+    T_CHANGED, T_MOVED, T_MARKED, T_MOTIONS, T_SAVED, T_STATE, T_ACCOUNT,
+) = range(len(ARENAS))  # fmt: skip
+
+# Columns of `node`, a cache line each: what most steps look at,
+N_CLIQUE = 0  # where it is a frontal; -1: nowhere yet, or fixed
+N_PLACE = 1  # its index in that clique's list
+N_STAMP = 2  # the last elimination it took part in
+N_LOCAL = 3  # its index there
+N_ADJ = 4  # first incidence, 2 · factor + end; -1: none
+N_MOVED = 5  # the last step that changed its estimate
+N_LISTED = 6  # not 0: it is in `moved`, see `move_estimate`
+N_FLAGS = 7  # 1: waits to be relinearised; 2: is being
+# and the rest.
+N_OWN = 8  # first factor that is added where this variable is eliminated; -1: none
+N_SEEN = 9  # the last step that brought a factor of it
+N_COLUMN = 10  # scratch: its column in the clique at hand
+N_LINEARISED = 11  # the last step that gave it a linearisation point
+N_NEAR = 12  # the last elimination that looked whether to bring it near the root,
+N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
+N_WIDTH = 16
+
+# Columns of `stiff`: d, √ω, |Ω r| or what (9.13) is by the shift and |r|, ω_θ, 1 for an Ω of a disc and an angle; χ² at
+# the estimate, error² in full, and as it counts.
+B_LEVER, B_ROOT, B_PULL, B_TURN, B_ROUND, B_CHI2, B_ERROR, B_COUNTED, B_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 8
+
+# Columns of `turns`.
+U_LEVER, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 4
+
+# Columns of `link`.
+L_OWN = 0  # next factor added at the same variable
+L_I = 1  # next incidence of the first variable
+L_J = 2  # next incidence of the second one
+L_AT = 3  # where its Hessian starts
+L_STAMP = 4  # the last sweep that linearised it
+L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
+L_WIDTH = 8  # a cache line
+
+# In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
+EXACT, ASLEEP = 1000, 1001
+
+# Columns of `clique`, a cache line each: what back-substitution reads of a clique,
+C_LIST = 0
+C_FRONTALS = 1  # variables
+C_SEPARATORS = 2  # variables
+C_PIVOTS = 3  # p
+C_USED = 4  # where δ_F and δ_S are as the frontals were solved last, p + m doubles
+C_CHILD = 5
+C_NEXT = 6  # next child of the same parent; next free record
+C_PARENT = 7  # -1: a root
+# what it reads of one that has moved,
+C_FIRST = 8  # the first place touched by the elimination C_MARK; -1: not solved yet
+C_ANCHORED = 9  # 1: a factor in it or below tells where in the world its variables are
+C_MOVES = 10  # 1: it has moved as a whole since it was solved
+C_BORDER = 11  # m
+C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
+C_LD = 13
+C_UPDATE = 14  # column j of row i of U is at UPDATE + update_row(i, WIDTH_UPDATE) + j, see `fronts`
+C_WIDTH_UPDATE = 15
+# and the rest.
+C_ABOVE = 16  # place in the parent's list of the first separator variable to be eliminated
+C_MARK = 17  # the last elimination that touched it
+C_BLOCK = 18  # the block that holds the rows and what is at USED, and its size
+C_BLOCK_SIZE = 19
+C_UPDATE_BLOCK_SIZE = 20
+C_LIST_SIZE = 21
+C_WIDTH = 24
+
+# Entries of `motions`, by clique.
+M_SINCE = 0  # ξ since it was solved, (9.20), MOTION numbers: t, ω
+M_BODY = 6  # scratch: the body it moves with,
+M_TURN = 7  # and the angle that it has turned by since it was solved
+MOTION, M_WIDTH = 6, 8
+
+# Entries of `state`.
+S_STAMP = 0  # of the present elimination
+S_STEP = 1
+S_CLIQUES = 2  # records ever used
+S_FREE_CLIQUE = 3  # first free record; -1: none
+S_LISTS = 4  # end of `lists` in use
+S_NUMBERS = 5  # end of `numbers` in use
+S_HESSIAN = 6
+S_VARIABLES = 7  # of the graph, taken in
+S_FACTORS = 8
+S_PENDING = 9  # variables that wait to be relinearised
+S_ALIVE = 10  # cliques
+S_NEED_CLIQUES = 11  # what the last call lacked
+S_NEED_LISTS = 12
+S_NEED_NUMBERS = 13
+S_FAILED = 14  # variable whose pivot failed, or -1
+# The account of the last step, from S_TOLD_FROM to before S_TOLD_TO.
+S_TOLD_FROM = 15
+S_NONZEROS = 15  # of R, doubles of rows on and above the diagonal
+S_ASLEEP = 16  # sights that had no pixel where they were linearised
+S_TOLD = 17  # variables whose estimate has other bits than before the step, new ones included
+S_ELIMINATED = 18  # variables eliminated,
+S_RELINEARISED = 19  # linearisation points moved,
+S_SOLVED = 20  # cliques solved again
+S_CHANGED = 21  # variables whose estimate changed
+S_FLOPS = 22
+S_ROUNDS = 23  # eliminations
+S_CYCLES = 24  # of the phases, PHASES of them
+S_TOLD_TO = 31
+S_TAKEN = 31  # factors that are in the tree: S_FACTORS but for those of a step under way
+S_SWEEP = 32  # counts relinearisations
+S_FIRST_NEW = 33  # variables that are in the tree: S_VARIABLES but for those of a step under way
+S_WAIT = 34  # 1: the step under way relinearises nothing, because that failed
+S_MOVED = 35  # variables in `moved`
+S_ROOTS = 36
+S_BEGUN = 37  # 1: a step is under way; the arenas lacked room
+S_CHECKED = 38  # 1: that everything is held has been made sure of otherwise
+S_CHANGED_BEFORE = 39  # S_CHANGED of the step before, for when this one fails
+S_EXACT = 40  # factors whose bend is computed exactly
+S_WAITING = 41  # the step since when any variable waits to be relinearised
+S_DUE = 42  # 1: what waits is relinearised in the next step
+S_OLD = 43  # variables before the step
+S_MOVING_ROOT = 44  # flops of the last elimination that brought variables near the root,
+S_SPENT = 45  # and of all others since
+S_RELINEARISED_AT = 46  # the step that relinearised last
+S_CONTINUES = 47  # 1: the step under way has nothing new
+S_IDLE = 48  # doubles of free blocks of `numbers`,
+S_GIVEN = 49  # of those given back since they were joined,
+S_LARGEST = 50  # and no class above this one has any
+S_RELINEARISING = 51  # flops of the last elimination that relinearised
+S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of few flops
+S_RISES = 53  # 1: the last round of the step raised χ²
+S_ONCE = 54  # 1: the step under way has one round
+S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
+S_AFTER = 56  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
+S_EDITED = 57  # variables in `moved` whose factors were edited since the last step; they come first
+S_EDITED_AT = 58  # the last step that such factors went before
+S_HOLES = 59  # doubles of `hessian` that no factor has any more
+S_FREE = 60  # heads of free lists: numbers, then lists
+CLASSES = 256
+S_SIZE = S_FREE + 2 * CLASSES
+
+# What a step comes to.
+DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
+
+# In S_AFTER: the step raised χ², or its last round did, or a pivot was raised.
+WORSE, ROSE, RAISED = 1, 2, 4
+
+# Settings of a step.
+P_RIPPLE = 0  # in units of (9.17): how far a separator moves before its clique is solved again
+P_BENT = 1  # what is bent by more waits to be relinearised
+P_BENT_NOW = 2  # it is so at once, where all that is bent adds more than this share to χ²
+P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
+P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
+P_CONVERGED = (
+    5  # a step goes on while a Gauss–Newton step may lower χ² by more than this share; one that raised it so ends
+)
+P_NEGLIGIBLE = 6  # a χ² that is nothing
+P_RECENT = 7  # variables with a factor in the last so many steps go last
+P_ROUNDS = 8  # eliminations in a step, at most
+P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
+P_SOON = 10  # and in the next step where it adds more than this share,
+P_PATIENCE = 11  # has waited for so many steps,
+P_MOST = 12  # or something is bent by more than this
+P_HEAVY = 13  # an elimination of more flops brings what is near to the root,
+P_WORTH = 14  # when with it this share has been spent of what that took the last time
+P_NEAR = 15  # so many scalars, times the cube root of the flops
+P_REST = 16  # for so many steps after a relinearisation P_SOON and P_BENT_NOW are more,
+P_RELUCTANCE = 17  # up to so many times
+P_MANY = 18  # P_SOON and P_BENT_NOW are for so many scalars that wait, (9.22)
+P_DEAR = 19  # P_REST is for a relinearisation of so many flops
+P_AROUND = 20  # or so many times its square, if that is more,
+P_RINGS = 21  # in rings, each with all inside it so many times as large as the next one,
+P_DETOUR = 22  # unless that takes more than this share of the elimination in addition
+P_SIZE = 23
+
+# The phases of a step, in the order of `step`.
+PHASES = ("linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute")
+LINEARISE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
+
+# Entries of `account`.
+A_MODEL = 0  # χ² of the linear problem at its solution
+A_CHI2 = 1  # χ² at the estimate
+A_CONSTANT = 2  # in A_MODEL: χ² of factors between fixed variables
+A_ERROR = 3  # Σ error² of all factors, which bounds what a Gauss–Newton step would take off χ²
+A_ALLOWED = 4  # the Σ error² up to which the last step has converged, (9.32)
+A_BEFORE = 5  # χ² at the estimate before the step, new factors and first values of new variables included
+A_ADDED = 6  # of that: of the new factors
+A_LEFT = 7  # by how much back-substitution left something undone, σ², the largest of all scalars
+A_ADDED_UP = 8  # what A_CHI2 and A_ERROR have gained and lost since they were summed
+A_COUNTED = 9  # Σ error² as it counts for what is relinearized
+A_STIFFEST = 10  # the largest sum of the diagonals of Hessians of any scalar,
+A_STIFFEST_BEFORE = 11  # and before the step
+A_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
+A_GAINED = 13  # by how much a round of the last step lowered χ², or all of it, at most
+A_UNIT = 14  # (9.6), as it was before the step
+A_SIZE = 15

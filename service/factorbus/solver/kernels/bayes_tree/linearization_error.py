@@ -1,0 +1,262 @@
+"""What a step moved is measured: χ² of its factors, and how far each is from its linear model.  MATH §9.6
+
+Every factor with a variable that moved, in its value or in its linearization point, is evaluated.  So after every step
+χ² is that of the estimate, and the sum of squared linearization errors is known of all factors: nothing waits for a
+later look.  Variables with a factor whose error is above the threshold wait to be relinearized, together.
+"""
+
+import math
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
+from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
+from factorbus.solver.kernels.bayes_tree.error_terms import (
+    LINKS,
+    SEEN,
+    add_sighting,
+    bend_of,
+    shift_between,
+    turn_between,
+    turn_error,
+    turn_of,
+)
+from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, factor_chi2, heading_of
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, STAYED
+from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.sorting import put_in_order
+from factorbus.solver.kernels.model import layout as at
+
+LEAST_BURDEN = 0.02
+IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
+MUCH = 8  # where more than one variable in so many has moved, all factors are gone through
+# The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
+CANCELLED = 1e5
+NOTHING = 1e-6  # χ²
+ROBUST = 2.0  # times the error of a factor with a loss in the bound: Gauss-Newton with weights converges slowly
+FORCE = 0.5  # of φ |√Ω r| and ψ |√Ω_θ r_θ|, (9.30)
+MOST_ERROR = 1e100  # of a factor: its square is still a number
+
+
+@part
+def measure(
+    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
+    values: F64, turns: F64, pending: I64, moved: I64, state: I64, account: F64,
+) -> float:  # fmt: skip
+    """Evaluate the factors of what `moved`, which empties that, and see whether what waits is due.
+
+    Gives Σ error² of what waits, as a multiple of (9.22).
+    """
+    if state[tl.S_PENDING] == 0:
+        state[tl.S_WAITING] = state[tl.S_STEP]
+    most = 0.0
+    if state[tl.S_MOVED] > 0:
+        most = evaluate_moved(
+            settings[tl.P_BENT], var, fac, payload, node, link, stiff, lin, scalars, values, turns, pending, moved,
+            state, account,
+        )  # fmt: skip
+        if not account[tl.A_ADDED_UP] <= CANCELLED * (account[tl.A_CHI2] + NOTHING):
+            sum_anew(stiff, state, account)
+    scaled = weighed(account[tl.A_COUNTED], settings, var, pending, state)
+    waited = state[tl.S_STEP] - state[tl.S_WAITING]
+    if scaled > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
+        state[tl.S_DUE] = 1
+    return scaled
+
+
+@part
+def evaluate_moved(
+    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
+    values: F64, turns: F64, pending: I64, moved: I64, state: I64, account: F64,
+) -> float:  # fmt: skip
+    """χ² and linearization error of every factor of what `moved`, which is empty then; gives the largest error.
+
+    Factors are gone through in the order of their ids where many variables moved, else variable by variable.
+    """
+    delta, most = scalars[0], 0.0
+    chi2, sizes, full, counted = account[tl.A_CHI2], account[tl.A_ADDED_UP], account[tl.A_ERROR], account[tl.A_COUNTED]
+    if state[tl.S_MOVED] * MUCH > state[tl.S_VARIABLES]:
+        last, c, s = -1, 1.0, 0.0
+        for f in range(state[tl.S_FACTORS]):
+            v = fac[f, at.F_I]
+            how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
+            if how != STAYED:
+                if v != last:
+                    c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
+                    last = v
+                error, more, size, more_full, more_counted = evaluate_factor(
+                    f, v, c, s, how, bent, var, fac, payload, node, stiff, lin, delta, values, pending, state
+                )
+                most, chi2, sizes = max(most, error), chi2 + more, sizes + size
+                full, counted = full + more_full, counted + more_counted
+    else:
+        put_in_order(moved[: state[tl.S_MOVED]], state[tl.S_VARIABLES])
+        for k in range(state[tl.S_MOVED]):
+            u, slot = moved[k], node[moved[k], tl.N_ADJ]
+            cu, su = heading_of(u, var[u, at.V_KIND] == at.SE2, var, delta, values, turns)
+            while slot >= 0:
+                f = slot // 2
+                v = fac[f, at.F_I]
+                if v == u or node[v, tl.N_LISTED] == STAYED:
+                    c, s = cu, su
+                    if v != u:
+                        c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
+                    how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
+                    error, more, size, more_full, more_counted = evaluate_factor(
+                        f, v, c, s, how, bent, var, fac, payload, node, stiff, lin, delta, values, pending, state
+                    )
+                    most, chi2, sizes = max(most, error), chi2 + more, sizes + size
+                    full, counted = full + more_full, counted + more_counted
+                slot = next_incidence(slot, link)
+    account[tl.A_CHI2], account[tl.A_ADDED_UP] = chi2, sizes
+    account[tl.A_ERROR], account[tl.A_COUNTED] = max(full, 0.0), max(counted, 0.0)
+    for k in range(state[tl.S_MOVED]):
+        node[moved[k], tl.N_LISTED] = STAYED
+    state[tl.S_MOVED] = 0
+    return most
+
+
+@inline_kernel
+def moved_ends(first: int, second: int, node: I64) -> int:
+    """How the variables of a factor moved: not at all, both as one body, or so that its linear model is asked."""
+    if second < 0:
+        return first
+    also = node[second, tl.N_LISTED]
+    return first if first == also else MODEL
+
+
+@inline_kernel
+def evaluate_factor(
+    f: int, v: int, c: float, s: float, how: int, bent: float, var: I64, fac: I64, payload: F64, node: I64, stiff: F64,
+    lin: F64, delta: F64, values: F64, pending: I64, state: I64,
+) -> tuple[float, float, float, float, float]:  # fmt: skip
+    """χ² of factor f, whose first variable is v, and its linearization error, where more of it than its place moved.
+
+    Gives the error; by what χ² is more than before; the sum of both, and of error² now and before; by what error² in
+    full and as it counts is more.
+    """
+    error = full = 0.0
+    kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
+    if kind >= at.IDP_FIRST or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+        if how < MODEL:
+            chi2 = any_chi2(f, var, fac, values, payload)
+        else:
+            error, force, chi2 = exact_error(f, var, fac, lin, values, payload, delta)
+            error = min(error, MOST_ERROR)
+            full = min(error + force, MOST_ERROR)
+            full = ROBUST * full if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else full
+            if error > bent:
+                await_ends(f, fac, var, node, pending, state)
+    else:
+        chi2, gap, turned = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
+        if second >= 0 and how == MODEL:
+            error, full = error_of(
+                f, v, kind, second, bent, gap, chi2, turned, var, node, stiff, lin, delta, values, pending, state
+            )
+    was = stiff[f, tl.B_CHI2]
+    stiff[f, tl.B_CHI2] = chi2
+    if how < MODEL:
+        return error, chi2 - was, chi2 + was, 0.0, 0.0
+    full, counted = full * full, error * error if error > bent else 0.0
+    full_before, counted_before = stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED]
+    stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED] = full, counted
+    size = chi2 + was + full + full_before
+    return error, chi2 - was, size, full - full_before, counted - counted_before
+
+
+@inline_kernel
+def error_of(
+    f: int, v: int, kind: int, second: int, bent: float, gap: float, chi2: float, turned: float, var: I64, node: I64,
+    stiff: F64, lin: F64, delta: F64, values: F64, pending: I64, state: I64,
+) -> tuple[float, float]:  # fmt: skip
+    """How far factor f from v to `second` is from its linear model, as it counts and in full.  Where that is more than
+    `bent`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
+    """
+    x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
+    phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
+    d, root, shift = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], shift_between(planar, x, y, values, lin)
+    bend = bend_of(root, d, phi, shift)
+    if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
+        slip, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
+        if kind == at.BETWEEN_SE3:
+            psi = turn_between(x, y, values, lin)
+            bend += turn_error(phi, psi, stiff[f, tl.B_TURN])
+            force = FORCE * (phi * math.sqrt(chi2) + psi * math.sqrt(max(turned, 0.0)))
+        full, error = min(bend + slip + force, MOST_ERROR), min(bend + LINKS * slip, MOST_ERROR)
+        both = LINKS * slip > bend
+    else:
+        bend, slip = add_sighting(kind, bend, root, d, shift, stiff[f, tl.B_PULL])
+        full = error = min(SEEN * (bend + slip), MOST_ERROR)
+        both = kind == at.BEARING_RANGE_SE2 or slip > bend
+    if error > bent:
+        if free:
+            await_move(v, node, pending, state)
+        if (both or not free) and var[second, at.V_COLUMN] >= 0:
+            await_move(second, node, pending, state)
+    return error, full
+
+
+@part
+def await_all(least: float, var: I64, fac: I64, node: I64, stiff: F64, pending: I64, state: I64) -> None:
+    """The variables of all factors whose error² in full is more than `least` wait."""
+    for f in range(state[tl.S_FACTORS]):
+        if stiff[f, tl.B_ERROR] > least:
+            await_ends(f, fac, var, node, pending, state)
+
+
+@inline_kernel
+def await_ends(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
+    """The variables of factor f that are free are to be relinearized."""
+    for end in range(2):
+        v = fac[f, at.F_I + end]
+        if v >= 0 and var[v, at.V_COLUMN] >= 0:
+            await_move(v, node, pending, state)
+
+
+@inline_kernel
+def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
+    """Variable v is to be relinearized."""
+    if node[v, tl.N_FLAGS] == 0:
+        node[v, tl.N_FLAGS] = WAITS
+        pending[state[tl.S_PENDING]] = v
+        state[tl.S_PENDING] += 1
+
+
+@inline_kernel
+def weighed(total: float, settings: F64, var: I64, pending: I64, state: I64) -> float:
+    """Σ error² as a multiple of what it has to be worth, (9.22)."""
+    if total <= LEAST_BURDEN * min(settings[tl.P_SOON], settings[tl.P_BENT_NOW]):
+        return 0.0
+    scalars, dearest = 0, 1.0
+    for k in range(state[tl.S_PENDING]):
+        scalars += dim_of_variable(var, pending[k])
+        dearest = max(dearest, dearness(var[pending[k], at.V_KIND]))
+    return total / (dearest * burden(scalars, settings))
+
+
+@part
+def sum_anew(stiff: F64, state: I64, account: F64) -> None:
+    """χ² and Σ error² from what is kept of each factor: running sums lose digits."""
+    chi2 = full = counted = 0.0
+    for f in range(state[tl.S_FACTORS]):
+        chi2 += stiff[f, tl.B_CHI2]
+        full += stiff[f, tl.B_ERROR]
+        counted += stiff[f, tl.B_COUNTED]
+    account[tl.A_CHI2], account[tl.A_ADDED_UP] = chi2, 0.0
+    account[tl.A_ERROR], account[tl.A_COUNTED] = full, counted
+
+
+@inline_kernel
+def burden(count: int, settings: F64) -> float:
+    """The share that so many scalars have to be worth of what `many` have to, to be relinearized.  (9.22)"""
+    share = count / settings[tl.P_MANY]
+    return min(max(share * share * share, LEAST_BURDEN), 1.0)
+
+
+@inline_kernel
+def dearness(kind: int) -> float:
+    """How many times as much as planar poses a variable has to be worth, with all that wait beside it.  (9.22)"""
+    if kind == at.SE2:
+        return 1.0
+    return IN_SPACE if kind == at.SE3 else WITH_LANDMARKS

@@ -1,0 +1,1 @@
+"""Variables and factors as they come in: admission, first values, observability, the block pattern of Λ."""

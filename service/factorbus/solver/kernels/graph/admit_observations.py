@@ -1,0 +1,43 @@
+"""Can a camera have seen what is said that it saw?  Asked when a sight comes in.  MATH §3.1."""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.lenses.layout import GOOD, VERTICAL
+from factorbus.solver.lenses.models import ray
+
+_VERTICAL = 1e-6
+
+
+@kernel("UniTuple(int64, 2)(boolean, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1])")
+def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64) -> tuple:
+    """(the first sight of factors f0 .. f1−1 that has no pixel at `values`, and why); or (−1, GOOD).
+
+    new: it has to be possible as well: a ray through the pixel, and of a first sight one that has an azimuth
+    """
+    r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
+    for f in range(f0, f1):
+        kind = fac[f, at.F_KIND]
+        if at.IDP_FIRST <= kind < at.POSITION_SE2:
+            x, y, p = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
+            status = status_of_pixel(kind, payload, p) if new else GOOD
+            if status == GOOD:
+                sight(kind, values, x, y, payload, p, r, A, B)
+                status = int(r[at.R_STATUS])
+            if status == GOOD and new and kind == at.IDP_FIRST and abs(math.cos(values[y + 4])) < _VERTICAL:
+                status = VERTICAL
+            if status != GOOD:
+                return f, status
+    return -1, GOOD
+
+
+@inline_kernel
+def status_of_pixel(kind: int, payload: F64, p: int) -> int:
+    """GOOD where a ray belongs to the measured pixel."""
+    n = p + (3 if kind == at.IDP_FIRST else 2)
+    status, _, _, _, _, _, _, _, _, _ = ray(int(payload[n]), payload[n + 1 :], payload[p], payload[p + 1])
+    return int(status)

@@ -1,0 +1,160 @@
+"""What follows from what: values composed along factors, and variables held by factors.  MATH §2.4, §5.4.
+
+Both walk the new factors in their order; a factor that comes before what it could follow from waits on its ends.
+Every factor is looked at no more than three times, in whatever order they come.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import place_idp
+from factorbus.solver.kernels.model.se2 import (
+    compose_inverse_se2,
+    compose_se2,
+    place_bearing_range_se2,
+    place_landmark_se2,
+)
+from factorbus.solver.kernels.model.se3 import compose_inverse_se3, compose_se3, place_landmark_se3
+from factorbus.solver.kernels.model.sizes import size_of
+
+_NOTHING = -1
+_WAITS = -2
+
+
+@kernel("int64(boolean, int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
+def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64) -> int:
+    """Mark in `reached` (one entry per variable from v0 on, 1: reached) what factors f0 .. f1−1 lead to.
+
+    Variables before v0 are reached.  With `compose` the first factor that reaches a variable gives it its value.
+    Gives the first variable that is not reached, or −1.
+    """
+    f = f0
+    while f < f1 and follow(compose, f, v0, var, fac, values, payload, reached) != _WAITS:
+        f += 1
+    if f < f1:
+        reach_on(compose, v0, f, f1, var, fac, values, payload, reached)
+    for v in range(reached.size):
+        if reached[v] == 0:
+            return v0 + v
+    return -1
+
+
+@part
+def reach_on(
+    compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64
+) -> None:
+    """The same from the first factor that has to wait."""
+    n = reached.size
+    head, tail = np.full(n, -1), np.full(n, -1)  # per variable: the factors that wait for it
+    after = np.full(2 * (f1 - f0), -1)  # 2 (f − f0) + end: the next in that list
+    queue = np.empty(n, np.int64)
+    for f in range(f0, f1):
+        new = follow(compose, f, v0, var, fac, values, payload, reached)
+        if new == _WAITS:
+            for end in range(2):
+                v = fac[f, at.F_I + end] - v0
+                if v >= 0:
+                    slot = 2 * (f - f0) + end
+                    if tail[v] < 0:
+                        head[v] = slot
+                    else:
+                        after[tail[v]] = slot
+                    tail[v] = slot
+            continue
+        if new < 0:
+            continue
+        queue[0], done, todo = new, 0, 1
+        while done < todo:
+            slot = head[queue[done] - v0]
+            done += 1
+            while slot >= 0:
+                new = follow(compose, f0 + slot // 2, v0, var, fac, values, payload, reached)
+                if new >= 0:
+                    queue[todo] = new
+                    todo += 1
+                slot = after[slot]
+
+
+@inline_kernel
+def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
+    """The variable that factor `f` reaches now, or _NOTHING, or _WAITS: both ends are still out of reach."""
+    kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
+    if kind == at.IDP_SEEN or kind >= at.POINT_SEEN:  # a pixel alone places nothing, nor what is behind it in the list
+        return _NOTHING
+    has_i = i < v0 or reached[i - v0] != 0
+    if j < 0:
+        if has_i:
+            return _NOTHING
+        if compose:
+            start = var[i, at.V_AT]
+            for c in range(size_of(var[i, at.V_KIND])):
+                x[start + c] = p[z + c]
+        reached[i - v0] = 1
+        return i
+    has_j = j < v0 or reached[j - v0] != 0
+    if has_i == has_j:
+        return _NOTHING if has_i else _WAITS
+    between = kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3
+    if not has_i and not between:  # a point does not place a pose
+        return _WAITS
+    new = j if has_i else i
+    if compose:
+        compose_end(kind, has_i, var[i, at.V_AT], var[j, at.V_AT], z, x, p)
+    reached[new - v0] = 1
+    return new
+
+
+@inline_kernel
+def compose_end(kind: int, forward: bool, i: int, j: int, z: int, x: F64, p: F64) -> None:
+    """Give the end that has no value the one that makes the residual zero."""
+    if kind == at.BETWEEN_SE2:
+        if forward:
+            compose_se2(x, i, p, z, j)
+        else:
+            compose_inverse_se2(x, j, p, z, i)
+    elif kind == at.BETWEEN_SE3:
+        if forward:
+            compose_se3(x, i, p, z, j)
+        else:
+            compose_inverse_se3(x, j, p, z, i)
+    elif kind == at.LANDMARK_SE2:
+        place_landmark_se2(x, i, p, z, j)
+    elif kind == at.LANDMARK_SE3:
+        place_landmark_se3(x, i, p, z, j)
+    elif kind == at.BEARING_RANGE_SE2:
+        place_bearing_range_se2(x, i, p, z, j)
+    elif kind == at.IDP_FIRST:
+        place_idp(x, i, p, z, j)
+
+
+@kernel("int64(int64, int64, int64, int64, int64[:,::1], int64[::1], int64[::1])")
+def join(v0: int, v1: int, f0: int, f1: int, fac: I64, anchored: I64, root: I64) -> int:
+    """The first new variable (v0 .. v1−1) that no chain of new factors joins to an anchored one, or −1.
+
+    anchored (v1 − v0,): 1 where a prior or being fixed holds it; all variables before v0 are.  root: scratch, one more
+    entry than that; entry 0 stands for all that is anchored.
+    """
+    for k in range(v1 - v0 + 1):
+        root[k] = k
+    for v in range(v0, v1):
+        if anchored[v - v0] != 0:
+            root[v - v0 + 1] = 0
+    for f in range(f0, f1):
+        if fac[f, at.F_J] >= 0:
+            a = find_root(max(fac[f, at.F_I] - v0 + 1, 0), root)
+            b = find_root(max(fac[f, at.F_J] - v0 + 1, 0), root)
+            root[max(a, b)] = min(a, b)
+    for v in range(v0, v1):
+        if find_root(v - v0 + 1, root) != 0:
+            return v
+    return -1
+
+
+@inline_kernel
+def find_root(k: int, root: I64) -> int:
+    """The representative of k's set, halving the path to it."""
+    while root[k] != k:
+        root[k] = root[root[k]]
+        k = root[k]
+    return k

@@ -1,0 +1,116 @@
+"""Good first values for what is new: each new variable goes where its own factors want it, all else held.  MATH §8.6.
+
+A variable composed from the first factor that reached it has none of the others in it.  Moving it alone costs what its
+few factors cost, and what is left for the whole system to solve is much smaller.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.small_cholesky import cholesky
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import move_idp
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.se2 import move_se2
+from factorbus.solver.kernels.model.se3 import move_se3
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
+
+_ITERATIONS = 5
+
+
+@kernel("void(int64, int64, int64, int64, float64, int64[:,::1], int64[:,::1], float64[::1], float64[::1])")
+def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F64, payload: F64) -> None:
+    """Gauss-Newton on one free variable of v0 .. v1−1 after the other, with those of factors f0 .. f1−1 that are on it.
+
+    Goes on while a step lowers the χ² of those factors, and by more than `least` and a thousandth of it.
+    """
+    for v in range(v0, v1):
+        if var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, fac):
+            settle(v, f0, f1, least, var, fac, values, payload)
+
+
+@part
+def settle(v: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F64, payload: F64) -> None:
+    """The same for one variable."""
+    M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
+    r, H, W = np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6))
+    x, kind = var[v, at.V_AT], var[v, at.V_KIND]
+    dim, size = dim_of(kind), size_of(kind)
+    chi2 = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+    for _ in range(_ITERATIONS):
+        if not chi2 > least or cholesky(dim, M, z) >= 0:
+            break
+        for i in range(dim - 1, -1, -1):
+            step[i] = z[i]
+            for j in range(i + 1, dim):
+                step[i] -= M[i, j] * step[j]
+            step[i] /= M[i, i]
+        for c in range(size):
+            before[c] = values[x + c]
+        move_one(kind, values, x, step)
+        reached = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+        if not reached <= chi2:
+            for c in range(size):
+                values[x + c] = before[c]
+            break
+        gained, chi2 = chi2 - reached, reached
+        if gained <= least + 1e-3 * chi2:
+            break
+
+
+@inline_kernel
+def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
+    """Whether more than one of the factors f0 .. f1−1 is on variable v."""
+    count = 0
+    for f in range(f0, f1):
+        if fac[f, at.F_I] == v or fac[f, at.F_J] == v:
+            count += 1
+            if count > 1:
+                return True
+    return False
+
+
+@part
+def gather_system(
+    v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, H: F64, W: F64, M: F64, z: F64
+) -> float:
+    """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ².
+
+    scratch  r (7,), H (2, 6, 6), W (6, 6)
+    """
+    width, chi2 = dim_of(var[v, at.V_KIND]), 0.0
+    M[:, :], z[:] = 0.0, 0.0
+    for f in range(f0, f1):
+        end = 0 if fac[f, at.F_I] == v else 1
+        if fac[f, at.F_I + end] != v:
+            continue
+        chi2 += evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
+        dim, p = residual_dim(fac[f, at.F_KIND]), fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
+        for a in range(dim):
+            for b in range(a, dim):
+                W[a, b] = W[b, a] = payload[p]
+                p += 1
+        for a in range(dim):
+            for b in range(dim):
+                chi2 += r[a] * W[a, b] * r[b]
+                for i in range(width):
+                    z[i] -= H[end, a, i] * W[a, b] * r[b]
+                    for j in range(i, width):
+                        M[i, j] += H[end, a, i] * W[a, b] * H[end, b, j]
+    return chi2
+
+
+@part
+def move_one(kind: int, values: F64, x: int, step: F64) -> None:
+    """The value at offset x := itself ⊞ step; each ⊞ has read what it needs before it writes."""
+    if kind == at.SE2:
+        move_se2(values, x, step, 0, values)
+    elif kind == at.SE3:
+        move_se3(values, x, step, 0, values)
+    elif kind == at.POINT2:
+        move_point2(values, x, step, 0, values)
+    elif kind == at.IDP:
+        move_idp(values, x, step, 0, values)
+    else:
+        move_point3(values, x, step, 0, values)

@@ -1,0 +1,61 @@
+"""New variables that several factors hold together: a point by two pixels, a camera by those of known points.  MATH §7.
+
+A variable is held where the Hessian of its own factors, with all that they join it to held already, is positive
+definite with room to spare.  What that does not show, the numbers of the whole system may.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, kernel
+from factorbus.solver.kernels.jit.small_cholesky import cholesky
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
+
+# The share of its diagonal entry that a pivot keeps: a point 1000 baselines away keeps 1e-6.
+_ROOM = 1e-8
+
+
+@kernel("int64(int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
+def hold(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> int:
+    """Mark in `held` (one entry per variable from v0 on, 1: held) what factors f0 .. f1−1 hold; gives how many."""
+    r, H, z = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros(6)
+    place, count = np.full(held.size, -1), 0
+    for k in range(held.size):
+        if held[k] == 0:
+            place[k] = count
+            count += 1
+    M = np.zeros((count, 6, 6))
+    for f in range(f0, f1):
+        i, j = fac[f, at.F_I] - v0, fac[f, at.F_J] - v0
+        loose_i, loose_j = i >= 0 and held[i] == 0, j >= 0 and held[j] == 0
+        if loose_i == loose_j:
+            continue
+        evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
+        end, k = (0, i) if loose_i else (1, j)
+        dim, width = residual_dim(fac[f, at.F_KIND]), dim_of(var[v0 + k, at.V_KIND])
+        p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
+        for a in range(dim):
+            for b in range(a, dim):
+                for c in range(width):
+                    for e in range(c, width):
+                        both = H[end, a, c] * H[end, b, e]
+                        if b > a:
+                            both += H[end, b, c] * H[end, a, e]
+                        M[place[k], c, e] += payload[p] * both
+                p += 1
+    found, diagonal = 0, np.empty(6)
+    for k in range(held.size):
+        if place[k] < 0:
+            continue
+        dim, good, block = dim_of(var[v0 + k, at.V_KIND]), True, M[place[k]]
+        for a in range(dim):
+            diagonal[a] = block[a, a]
+            good &= block[a, a] > 0.0
+        if good and cholesky(dim, block, z) < 0:
+            for a in range(dim):
+                good &= block[a, a] * block[a, a] > _ROOM * diagonal[a]
+            if good:
+                held[k] = 1
+                found += 1
+    return found

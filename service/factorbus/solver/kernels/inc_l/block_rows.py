@@ -1,0 +1,283 @@
+"""R in block rows that are cheap to change in structure and in numbers: their layout, growth, and solves with them.
+
+Position k is the k-th block column of the elimination order.  Block row k of R holds the blocks (k, j) for the
+positions j of its list, ascending, itself first; new positions are appended behind all others.
+
+    rec      (n, 10) int64    one record per position
+    index    int64            the lists of positions, each with room to grow
+    numbers  float64          the rows: `DIM` scalar rows of `LD` doubles, the first `WIDTH` in use, block after block;
+                              below the diagonal of the diagonal block they are zero
+    place    (columns,) int64 position of each block column of Λ
+    counts   (4,)    int64    how much of rec, scalars, index and numbers is in use
+
+The first off-diagonal entry of a row is its parent in the elimination tree, and the rest of the row is in the parent's.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.sorting import sort
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.sparse import fronts as fr
+
+COLUMN = 0  # block column of Λ
+DIM = 1
+SCALAR = 2  # first scalar in elimination order
+START = 3  # first scalar in insertion order
+LIST = 4  # its positions are index[LIST : LIST + COUNT], with room for ROOM
+COUNT = 5
+ROOM = 6
+ROW = 7  # numbers[ROW : ROW + DIM * LD]
+WIDTH = 8
+LD = 9
+RECORD = 10
+
+POSITIONS = 0
+SCALARS = 1
+INDEX = 2
+NUMBERS = 3
+COUNTS = 4
+
+_NEW_ROOM = 4  # positions a new row has room for
+
+
+@kernel(
+    "void(int64, int64, int64[:,::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], "
+    "int64[::1])"
+)
+def append_rows(
+    v0: int, v1: int, var: I64, dims: I64, rec: I64, index: I64, numbers: F64, place: I64, d: F64, counts: I64
+) -> None:
+    """Append zero rows, without information, for the free variables v0 .. v1−1."""
+    for v in range(v0, v1):
+        c = var[v, at.V_COLUMN]
+        if c < 0:
+            continue
+        k, dim = counts[POSITIONS], dims[c]
+        row = rec[k]
+        row[COLUMN], row[DIM], row[SCALAR], row[START] = c, dim, counts[SCALARS], var[v, at.V_SCALAR]
+        row[LIST], row[COUNT], row[ROOM] = counts[INDEX], 1, _NEW_ROOM
+        row[ROW], row[WIDTH], row[LD] = counts[NUMBERS], dim, 3 * _NEW_ROOM
+        index[row[LIST]], place[c] = k, k
+        zero(numbers, row[ROW], dim * row[LD])
+        zero(d, row[SCALAR], dim)
+        counts[POSITIONS] += 1
+        counts[SCALARS] += dim
+        counts[INDEX] += row[ROOM]
+        counts[NUMBERS] += dim * row[LD]
+
+
+@kernel(
+    "void(int64[::1], int64[::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[:,::1], int64[::1], "
+    "float64[::1], int64[::1], int64[::1])"
+)
+def take_fronts(
+    order: I64, dims: I64, starts: I64, fronts: I64, border: I64, arena: F64, rec: I64, index: I64, numbers: F64,
+    place: I64, counts: I64,
+) -> None:  # fmt: skip
+    """Copy R from the fronts of a factorisation, block by block.
+
+    The zeros of joined fronts come along: the lists are those of the fronts.
+    """
+    n = order.size
+    position = np.empty(starts[n], np.int64)  # of each scalar in elimination order
+    scalar = 0
+    for k in range(n):
+        row, dim = rec[k], dims[order[k]]
+        row[COLUMN], row[DIM], row[SCALAR], row[START] = order[k], dim, scalar, starts[order[k]]
+        place[order[k]] = k
+        for _ in range(dim):
+            position[scalar] = k
+            scalar += 1
+    put_list, put_row = 0, 0
+    for f in range(fronts.shape[0]):
+        front = fronts[f]
+        p, m, ld, b = front[fr.PIVOTS], front[fr.BORDER], front[fr.LD_ROWS], front[fr.BORDER_AT]
+        first = front[fr.VARIABLE]
+        last = fronts[f + 1, fr.VARIABLE] if f + 1 < fronts.shape[0] else n
+        for k in range(first, last):
+            row = rec[k]
+            dim, skip = row[DIM], row[SCALAR] - front[fr.COLUMN]
+            row[LIST], row[ROW], row[WIDTH] = put_list, put_row, p - skip + m
+            row[LD] = row[WIDTH]
+            for j in range(k, last):
+                index[put_list] = j
+                put_list += 1
+            j = 0
+            while j < m:
+                index[put_list] = position[border[b + j]]
+                j += rec[index[put_list], DIM]
+                put_list += 1
+            row[COUNT] = row[ROOM] = put_list - row[LIST]
+            source = front[fr.ROWS] + skip * ld + skip
+            for i in range(dim):
+                zero(numbers, put_row, i)
+                for j in range(i, row[WIDTH]):
+                    put(numbers, put_row + j, load(arena, source + i * ld + j))
+                put_row += row[WIDTH]
+    counts[POSITIONS], counts[SCALARS], counts[INDEX], counts[NUMBERS] = n, scalar, put_list, put_row
+
+
+@kernel(
+    "int64(int64, int64, int64[:,::1], int64[:,::1], int64[::1], int64[:,::1], int64[::1], int64[::1], int64[::1], "
+    "int64[::1])"
+)
+def reach_rows(
+    f0: int, f1: int, var: I64, fac: I64, place: I64, rec: I64, index: I64, mark: I64, out: I64, seen: I64
+) -> int:
+    """The rows of R that factors f0 .. f1−1 change: their variables' and the ancestors of those.  MATH (8.5)
+
+    in   mark: zero for every position; stays so
+    out  out: the positions, ascending   seen (1,): their scalars
+    Gives how many positions there are.
+    """
+    n = scalars = 0
+    for f in range(f0, f1):
+        for end in range(2):
+            v = fac[f, at.F_I + end]
+            k = place[var[v, at.V_COLUMN]] if v >= 0 and var[v, at.V_COLUMN] >= 0 else -1
+            while k >= 0 and mark[k] == 0:
+                mark[k] = 1
+                out[n] = k
+                n += 1
+                scalars += rec[k, DIM]
+                k = index[rec[k, LIST] + 1] if rec[k, COUNT] > 1 else -1
+    sort(out[:n])
+    for e in range(n):
+        mark[out[e]] = 0
+    seen[0] = scalars
+    return n
+
+
+@kernel("void(int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], float64[::1], float64[::1])")
+def solve_block_rows(rec: I64, index: I64, numbers: F64, counts: I64, d: F64, x: F64, delta: F64) -> None:
+    """R x = d by blocks from the last row up; x in elimination order, δ = Pᵀ x in insertion order."""
+    row_of_x = np.empty(counts[SCALARS])
+    for k in range(counts[POSITIONS] - 1, -1, -1):
+        row = rec[k]
+        dim, width, base, ld = row[DIM], row[WIDTH], row[ROW], row[LD]
+        gather_row(row, index, rec, x, row_of_x)
+        for i in range(dim - 1, -1, -1):
+            line, total = base + i * ld, 0.0
+            for j in range(dim, width):
+                total += load(numbers, line + j) * load(row_of_x, j)
+            for j in range(i + 1, dim):
+                total += load(numbers, line + j) * load(x, row[SCALAR] + j)
+            put(x, row[SCALAR] + i, (load(d, row[SCALAR] + i) - total) / load(numbers, line + i))
+        for i in range(dim):
+            put(delta, row[START] + i, load(x, row[SCALAR] + i))
+
+
+@inline_kernel
+def gather_row(row: I64, index: I64, rec: I64, x: F64, out: F64) -> None:
+    """out[dim:width] = x at the off-diagonal blocks of a row."""
+    j = row[DIM]
+    for e in range(row[LIST] + 1, row[LIST] + row[COUNT]):
+        other = rec[index[e]]
+        for c in range(other[DIM]):
+            put(out, j, load(x, other[SCALAR] + c))
+            j += 1
+
+
+@kernel("float64(int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], float64[::1])")
+def solve_block_rows_transposed(rec: I64, index: I64, numbers: F64, counts: I64, eta: F64, d: F64) -> float:
+    """Rᵀ d = P η by blocks; η in insertion order, d in elimination order.  Gives dᵀ d."""
+    taken = np.empty(counts[SCALARS])
+    for k in range(counts[POSITIONS]):
+        row = rec[k]
+        for i in range(row[DIM]):
+            put(d, row[SCALAR] + i, load(eta, row[START] + i))
+    total = 0.0
+    for k in range(counts[POSITIONS]):
+        row = rec[k]
+        dim, width, base, ld, s = row[DIM], row[WIDTH], row[ROW], row[LD], row[SCALAR]
+        for i in range(dim):
+            y = load(d, s + i) / load(numbers, base + i * ld + i)
+            put(d, s + i, y)
+            total += y * y
+            for j in range(i + 1, dim):
+                put(d, s + j, load(d, s + j) - load(numbers, base + i * ld + j) * y)
+            line = base + i * ld
+            if i == 0:
+                for j in range(dim, width):
+                    put(taken, j, load(numbers, line + j) * y)
+            else:
+                for j in range(dim, width):
+                    put(taken, j, load(taken, j) + load(numbers, line + j) * y)
+        j = dim
+        for e in range(row[LIST] + 1, row[LIST] + row[COUNT]):
+            other = rec[index[e]]
+            for c in range(other[DIM]):
+                put(d, other[SCALAR] + c, load(d, other[SCALAR] + c) - load(taken, j))
+                j += 1
+    return total
+
+
+@kernel("void(int64[:,::1], int64[::1], float64[::1], int64[::1], int64[::1], float64[::1])")
+def compact_rows(rec: I64, index: I64, numbers: F64, counts: I64, new_index: I64, new_numbers: F64) -> None:
+    """Copy the rows to other arenas without the gaps that moved rows left behind."""
+    put_list, put_row = 0, 0
+    for k in range(counts[POSITIONS]):
+        row = rec[k]
+        for e in range(row[COUNT]):
+            new_index[put_list + e] = index[row[LIST] + e]
+        size = row[DIM] * row[LD]
+        for j in range(size):
+            put(new_numbers, put_row + j, load(numbers, row[ROW] + j))
+        row[LIST], row[ROW] = put_list, put_row
+        put_list += row[ROOM]
+        put_row += size
+    counts[INDEX], counts[NUMBERS] = put_list, put_row
+
+
+@part
+def widen_row(k: int, list_: I64, count: int, width: int, rec: I64, index: I64, numbers: F64, counts: I64) -> None:
+    """Give row k the positions list_[:count] of `width` scalars, which include those it has; new blocks are zero.
+
+    The row stays where it is if there is room, else it moves to the end of the arenas and gets room to grow.
+    """
+    row = rec[k]
+    if row[COUNT] == count:
+        return
+    old_list, old, old_ld, source = row[LIST], row[COUNT], row[LD], row[ROW]
+    if row[LD] < width:
+        row[LD] = width + width // 2 + 24
+        row[ROW] = counts[NUMBERS]
+        counts[NUMBERS] += row[DIM] * row[LD]
+    for i in range(row[DIM]):
+        spread(
+            list_, count, width, index, old_list, old, row[WIDTH], rec, numbers, source + i * old_ld,
+            row[ROW] + i * row[LD],
+        )  # fmt: skip
+    row[WIDTH] = width
+    if row[ROOM] < count:
+        row[LIST], row[ROOM] = counts[INDEX], count + count // 2 + 4
+        counts[INDEX] += row[ROOM]
+    for e in range(count):
+        index[row[LIST] + e] = list_[e]
+    row[COUNT] = count
+
+
+@inline_kernel
+def spread(
+    list_: I64, count: int, width: int, held: I64, first: int, old: int, old_width: int, rec: I64, a: F64, source: int,
+    target: int,
+) -> None:  # fmt: skip
+    """Move a row with the blocks held[first : first+old] to the layout of list_[:count]; new blocks become zero.
+
+    Goes from the end, so that source and target may be the same place.
+    """
+    e, m, x, y = old - 1, count - 1, old_width, width
+    while m >= 0 and (m > e or source != target):
+        dim = rec[list_[m], DIM]
+        y -= dim
+        if e >= 0 and held[first + e] == list_[m]:
+            x -= dim
+            for c in range(dim - 1, -1, -1):
+                put(a, target + y + c, load(a, source + x + c))
+            e -= 1
+        else:
+            zero(a, target + y, dim)
+        m -= 1

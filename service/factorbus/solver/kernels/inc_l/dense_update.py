@@ -1,0 +1,145 @@
+"""Updates that reach few rows: dense, up to 5 × 5 blocks.  MATH §8.4, (18) and (19) of the 2013 paper.
+
+M = R₂₂ᵀ R₂₂ + Ω,  z = R₂₂ᵀ d₂ + ω;  then R̃₂₂ = chol(M) and d̃₂ = R̃₂₂⁻ᵀ z.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.jit.compile import F64, I64, kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put
+from factorbus.solver.kernels.jit.small_cholesky import cholesky
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
+
+MOST_BLOCKS = 5
+_MOST = 6 * MOST_BLOCKS
+
+
+@kernel(
+    "int64(int64, int64, int64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[:,::1], int64[::1], "
+    "float64[::1], int64[::1], float64[::1], int64[::1])"
+)
+def dense_omega_update(
+    f0: int, f1: int, reached: I64, var: I64, fac: I64, values: F64, payload: F64, rec: I64, index: I64, numbers: F64,
+    place: I64, d: F64, counts: I64,
+) -> int:  # fmt: skip
+    """Fold factors f0 .. f1−1, linearised at `values`, into R and d by (18) and (19) as they stand.
+
+    reached: the positions that the factors reach, at most MOST_BLOCKS.  Gives −1, or a position whose pivot failed.
+    """
+    start, size = np.empty(reached.size, np.int64), 0
+    for t in range(reached.size):
+        start[t] = size
+        size += rec[reached[t], br.DIM]
+    T, M, y, z = np.zeros((_MOST, _MOST)), np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST)
+    read_tail(reached, start, rec, index, numbers, d, T, y)
+    for i in range(size):
+        total = 0.0
+        for k in range(i + 1):
+            total += T[k, i] * y[k]
+        z[i] = total
+        for j in range(i, size):
+            total = 0.0
+            for k in range(i + 1):
+                total += T[k, i] * T[k, j]
+            M[i, j] = total
+    add_omega(f0, f1, reached, start, var, fac, values, payload, place, M, z)
+    failed = cholesky(size, M, z)
+    if failed >= 0:
+        t = 0
+        while t + 1 < reached.size and start[t + 1] <= failed:
+            t += 1
+        return reached[t]
+    write_tail(reached, start, size, M, z, rec, index, numbers, d, counts)
+    return -1
+
+
+@part
+def read_tail(reached: I64, start: I64, rec: I64, index: I64, numbers: F64, d: F64, T: F64, y: F64) -> None:
+    """The reached rows as one dense matrix, and their part of d."""
+    for t in range(reached.size):
+        row = rec[reached[t]]
+        x, u = 0, t
+        for e in range(row[br.LIST], row[br.LIST] + row[br.COUNT]):
+            while reached[u] != index[e]:
+                u += 1
+            for c in range(rec[index[e], br.DIM]):
+                for i in range(row[br.DIM]):
+                    T[start[t] + i, start[u] + c] = load(numbers, row[br.ROW] + i * row[br.LD] + x)
+                x += 1
+        for i in range(row[br.DIM]):
+            y[start[t] + i] = load(d, row[br.SCALAR] + i)
+
+
+@part
+def add_omega(
+    f0: int, f1: int, reached: I64, start: I64, var: I64, fac: I64, values: F64, payload: F64, place: I64, M: F64,
+    z: F64,
+) -> None:  # fmt: skip
+    """M += Ω = Σ Hᵀ Ω_k H, z += ω = −Σ Hᵀ Ω_k r; on and above the diagonal."""
+    r, H, W, WH, first = (
+        np.zeros(at.R_SIZE),
+        np.zeros((2, 6, 6)),
+        np.zeros((6, 6)),
+        np.zeros((6, 6)),
+        np.empty(2, np.int64),
+    )
+    for f in range(f0, f1):
+        evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
+        kind = fac[f, at.F_KIND]
+        dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
+        for a in range(dim):
+            for b in range(a, dim):
+                W[a, b] = W[b, a] = payload[p]
+                p += 1
+        for end in range(2):
+            v = fac[f, at.F_I + end]
+            first[end] = -1
+            if v >= 0 and var[v, at.V_COLUMN] >= 0:
+                u = 0
+                while reached[u] != place[var[v, at.V_COLUMN]]:
+                    u += 1
+                first[end] = start[u]
+        for end in range(2):
+            if first[end] < 0:
+                continue
+            width = dim_of(var[fac[f, at.F_I + end], at.V_KIND])
+            for a in range(dim):
+                for c in range(width):
+                    total = 0.0
+                    for b in range(dim):
+                        total += W[a, b] * H[end, b, c]
+                    WH[a, c] = total
+            for c in range(width):
+                total = 0.0
+                for a in range(dim):
+                    total += WH[a, c] * r[a]
+                z[first[end] + c] -= total
+            for other in range(2):
+                if first[other] < 0 or first[other] > first[end]:
+                    continue
+                for q in range(dim_of(var[fac[f, at.F_I + other], at.V_KIND])):
+                    for c in range(q if other == end else 0, width):
+                        total = 0.0
+                        for a in range(dim):
+                            total += H[other, a, q] * WH[a, c]
+                        M[first[other] + q, first[end] + c] += total
+
+
+@part
+def write_tail(
+    reached: I64, start: I64, size: int, M: F64, z: F64, rec: I64, index: I64, numbers: F64, d: F64, counts: I64
+) -> None:
+    """The rows get all reached positions from their own on, and the numbers of M and z."""
+    for t in range(reached.size):
+        k, width = reached[t], size - start[t]
+        br.widen_row(k, reached[t:], reached.size - t, width, rec, index, numbers, counts)
+        row = rec[k]
+        for i in range(row[br.DIM]):
+            for c in range(width):
+                value = M[start[t] + i, start[t] + c] if c >= i else 0.0
+                put(numbers, row[br.ROW] + i * row[br.LD] + c, value)
+            put(d, row[br.SCALAR] + i, z[start[t] + i])

@@ -1,0 +1,237 @@
+"""The Λ-update: R̃₂₂ᵀ R̃₂₂ = Λ₂₂ − R₁₂ᵀ R₁₂, d̃₂ with it.  MATH §8.3, (17) and (20) of the 2013 paper.
+
+"2" are the rows that the new factors reach; with a row its ancestors are among them, so what the other rows hold of
+them is the end of those rows.  The reached rows are made anew one after the other, each from its blocks of Λ less the
+products of the rows before it (left-looking; a row waits in the list of the position whose turn it is next).
+"""
+
+import math
+
+import numpy as np
+
+from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.jit.simd import put, zero
+from factorbus.solver.kernels.jit.sorting import sort
+from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE
+
+NONE = -1
+
+
+@kernel(
+    "int64(int64[::1], int64, int64[:,::1], float64[::1], float64[::1], int64[:,::1], int64[::1], float64[::1], "
+    "int64[::1], float64[::1], int64[::1])"
+)
+def lambda_update(
+    reached: I64, blocks: int, pattern: I64, data: F64, eta: F64, rec: I64, index: I64, numbers: F64, place: I64,
+    d: F64, counts: I64,
+) -> int:  # fmt: skip
+    """Make the rows at the positions `reached` (ascending) anew from η and the `blocks` blocks of Λ in `pattern`.
+
+    Gives −1, or a position whose pivot failed.
+    """
+    n = counts[br.POSITIONS]
+    is_reached = np.zeros(n, np.int64)
+    for j in reached:
+        is_reached[j] = 1
+    begin, block_of = blocks_by_row(reached, is_reached, blocks, pattern, place)
+    renew_structure(reached, begin, block_of, pattern, place, rec, index, numbers, counts)
+    # the entry of each row that is next to be used, and its first scalar in the row
+    entry, offset, head, after = np.empty(n, np.int64), np.empty(n, np.int64), np.full(n, NONE), np.empty(n, np.int64)
+    for k in range(n):
+        if is_reached[k] == 0:
+            queue_row(k, is_reached, rec, index, entry, offset, head, after)
+    where = np.empty(n, np.int64)  # of each position in the row that is being made
+    for t in range(reached.size):
+        j = reached[t]
+        fill_row(j, begin[t], begin[t + 1], block_of, pattern, data, eta, rec, index, numbers, place, d, where)
+        k = head[j]
+        while k != NONE:
+            following = after[k]
+            take_product(j, k, entry[k], offset[k], rec, index, numbers, d, where)
+            advance(k, entry, offset, head, after, rec, index)
+            k = following
+        if not factor_row(rec[j], load_floor(j, begin[t], block_of, pattern, data, rec), numbers, d):
+            return j
+        entry[j], offset[j] = 0, 0
+        advance(j, entry, offset, head, after, rec, index)
+    return -1
+
+
+@part
+def blocks_by_row(reached: I64, is_reached: I64, blocks: int, pattern: I64, place: I64) -> tuple[I64, I64]:
+    """The blocks of Λ between reached positions, sorted by the lower position, the diagonal block first."""
+    row_of = np.full(is_reached.size, NONE)
+    for t in range(reached.size):
+        row_of[reached[t]] = t
+    begin = np.zeros(reached.size + 2, np.int64)
+    for b in range(blocks):
+        i, j = place[pattern[0, b]], place[pattern[1, b]]
+        if is_reached[i] and is_reached[j]:
+            begin[row_of[min(i, j)] + 2] += 1
+    for t in range(reached.size):
+        begin[t + 2] += begin[t + 1]
+    start, out = begin.copy(), np.empty(begin[-1], np.int64)
+    for b in range(blocks):
+        i, j = place[pattern[0, b]], place[pattern[1, b]]
+        if is_reached[i] and is_reached[j]:
+            t = row_of[min(i, j)] + 1
+            out[begin[t]] = b
+            if i == j:  # to the front
+                out[begin[t]], out[start[t]] = out[start[t]], b
+            begin[t] += 1
+    return begin, out
+
+
+@part
+def renew_structure(
+    reached: I64, begin: I64, block_of: I64, pattern: I64, place: I64, rec: I64, index: I64, numbers: F64, counts: I64
+) -> None:
+    """Rows get the positions of the new blocks of Λ and of their children in the tree."""
+    n = counts[br.POSITIONS]
+    seen, head, after = np.full(n, NONE), np.full(n, NONE), np.full(n, NONE)
+    list_ = np.empty(n, np.int64)
+    for t in range(reached.size):
+        j = reached[t]
+        count = 0
+        for e in range(rec[j, br.LIST], rec[j, br.LIST] + rec[j, br.COUNT]):
+            seen[index[e]] = j
+            list_[count] = index[e]
+            count += 1
+        for e in range(begin[t], begin[t + 1]):
+            b = block_of[e]
+            i = max(place[pattern[0, b]], place[pattern[1, b]])
+            if seen[i] != j:
+                seen[i] = j
+                list_[count] = i
+                count += 1
+        child = head[j]
+        while child != NONE:
+            for e in range(rec[child, br.LIST] + 1, rec[child, br.LIST] + rec[child, br.COUNT]):
+                if seen[index[e]] != j:
+                    seen[index[e]] = j
+                    list_[count] = index[e]
+                    count += 1
+            child = after[child]
+        if count != rec[j, br.COUNT]:
+            sort(list_[:count])
+            width = 0
+            for e in range(count):
+                width += rec[list_[e], br.DIM]
+            br.widen_row(j, list_, count, width, rec, index, numbers, counts)
+        if count > 1:
+            parent = index[rec[j, br.LIST] + 1]
+            after[j], head[parent] = head[parent], j
+
+
+@inline_kernel
+def queue_row(k: int, is_reached: I64, rec: I64, index: I64, entry: I64, offset: I64, head: I64, after: I64) -> None:
+    """A row that stays waits for the first reached position in its list, if there is one."""
+    first, e, x = rec[k, br.LIST], rec[k, br.COUNT], rec[k, br.WIDTH]
+    while e > 1 and is_reached[index[first + e - 1]]:
+        e -= 1
+        x -= rec[index[first + e], br.DIM]
+    if e < rec[k, br.COUNT]:
+        j = index[first + e]
+        entry[k], offset[k] = e, x
+        after[k], head[j] = head[j], k
+
+
+@inline_kernel
+def advance(k: int, entry: I64, offset: I64, head: I64, after: I64, rec: I64, index: I64) -> None:
+    """Row k waits for the next position in its list."""
+    first = rec[k, br.LIST]
+    offset[k] += rec[index[first + entry[k]], br.DIM]
+    entry[k] += 1
+    if entry[k] < rec[k, br.COUNT]:
+        j = index[first + entry[k]]
+        after[k], head[j] = head[j], k
+
+
+@part
+def fill_row(
+    j: int, begin: int, end: int, block_of: I64, pattern: I64, data: F64, eta: F64, rec: I64, index: I64, numbers: F64,
+    place: I64, d: F64, where: I64,
+) -> None:  # fmt: skip
+    """Row j of Λ and η; `where` says where its positions are in it."""
+    row = rec[j]
+    x = 0
+    for e in range(row[br.LIST], row[br.LIST] + row[br.COUNT]):
+        where[index[e]] = x
+        x += rec[index[e], br.DIM]
+    for i in range(row[br.DIM]):
+        zero(numbers, row[br.ROW] + i * row[br.LD], row[br.WIDTH])
+        put(d, row[br.SCALAR] + i, load(eta, row[br.START] + i))
+    for e in range(begin, end):
+        b = block_of[e]
+        a, c, source = place[pattern[0, b]], place[pattern[1, b]], pattern[2, b]
+        other = c if a == j else a
+        height, width, target = row[br.DIM], rec[other, br.DIM], row[br.ROW] + where[other]
+        for i in range(height):
+            for q in range(width):
+                turned = a != j
+                value = load(data, source + (q * height + i if turned else i * width + q))
+                put(numbers, target + i * row[br.LD] + q, value)
+
+
+@part
+def take_product(
+    j: int, k: int, entry: int, offset: int, rec: I64, index: I64, numbers: F64, d: F64, where: I64
+) -> None:
+    """Row j −= R_kjᵀ (row k from j on), d_j −= R_kjᵀ d_k.  Neighbours that stay neighbours go together."""
+    row, other = rec[j], rec[k]
+    height, base, ld = row[br.DIM], other[br.ROW], other[br.LD]
+    for q in range(other[br.DIM]):
+        y = load(d, other[br.SCALAR] + q)
+        for i in range(height):
+            scalar = row[br.SCALAR] + i
+            put(d, scalar, load(d, scalar) - load(numbers, base + q * ld + offset + i) * y)
+    e, last, x = entry, other[br.COUNT], offset
+    while e < last:
+        target = where[index[other[br.LIST] + e]]
+        source, end = x, target
+        while e < last and where[index[other[br.LIST] + e]] == end:
+            dim = rec[index[other[br.LIST] + e], br.DIM]
+            end += dim
+            x += dim
+            e += 1
+        width = end - target
+        for i in range(height):
+            line = row[br.ROW] + i * row[br.LD] + target
+            for q in range(other[br.DIM]):
+                factor, from_ = load(numbers, base + q * ld + offset + i), base + q * ld + source
+                for c in range(width):
+                    put(numbers, line + c, load(numbers, line + c) - factor * load(numbers, from_ + c))
+
+
+@inline_kernel
+def load_floor(j: int, begin: int, block_of: I64, pattern: I64, data: F64, rec: I64) -> float:
+    """The least pivot allowed in row j."""
+    dim, source, least = rec[j, br.DIM], pattern[2, block_of[begin]], math.inf
+    for i in range(dim):
+        least = min(least, load(data, source + i * dim + i))
+    return PIVOT_TOLERANCE * least
+
+
+@part
+def factor_row(row: I64, floor: float, numbers: F64, d: F64) -> bool:
+    """Row := R_jj⁻ᵀ row and d_j := R_jj⁻ᵀ d_j, R_jj the factor of its diagonal block; False: a pivot failed."""
+    dim, base, ld, width, scalar = row[br.DIM], row[br.ROW], row[br.LD], row[br.WIDTH], row[br.SCALAR]
+    for i in range(dim):
+        line = base + i * ld
+        for q in range(i):
+            factor = load(numbers, base + q * ld + i)
+            for c in range(i, width):
+                put(numbers, line + c, load(numbers, line + c) - factor * load(numbers, base + q * ld + c))
+            put(d, scalar + i, load(d, scalar + i) - factor * load(d, scalar + q))
+        pivot = load(numbers, line + i)
+        if not (pivot > floor and pivot > 0.0 and pivot < math.inf):
+            return False
+        scale = 1.0 / math.sqrt(pivot)
+        for c in range(i, width):
+            put(numbers, line + c, load(numbers, line + c) * scale)
+        for c in range(i):
+            put(numbers, line + c, 0.0)
+        put(d, scalar + i, load(d, scalar + i) * scale)
+    return True

@@ -1,0 +1,1 @@
+"""How kernels are compiled and kept, and what all of them use: tables of arrays, atomics, vectors, bit sets."""

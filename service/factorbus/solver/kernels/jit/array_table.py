@@ -1,0 +1,102 @@
+"""Arrays that a kernel finds by their addresses: a table of them is one argument, which costs what one array costs.
+
+A row of a table is the address of an array and its shape; of one with one dimension the second size is 1.  Who passes
+a table keeps its arrays alive, and as C-contiguous, aligned rows of eight bytes an entry
+(`factorbus.solver.graph.arenas`).
+"""
+
+import ctypes
+from typing import Any
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import DISABLED, inline_kernel, intrinsic, ir, types
+
+WIDTH = 3
+_WORD = 8
+
+ints: Any
+floats: Any
+int_rows: Any
+float_rows: Any
+address_of: Any
+
+if DISABLED:
+
+    def _first_entry(array: Any) -> int:
+        """Where it is."""
+        return int(array.ctypes.data)
+
+    def _plain(kind: type, dimensions: int) -> Any:
+        def found(table: Any, entry: int) -> Any:
+            address, *shape = table[WIDTH * entry : WIDTH * entry + 1 + dimensions].tolist()
+            room: Any = (ctypes.c_char * (_WORD * int(np.prod(shape)))).from_address(address)
+            return np.frombuffer(room, kind).reshape(shape)
+
+        return found
+
+    address_of = _first_entry
+    ints, int_rows = _plain(np.int64, 1), _plain(np.int64, 2)
+    floats, float_rows = _plain(np.float64, 1), _plain(np.float64, 2)
+
+else:
+
+    @intrinsic
+    def _entry(_typing: Any, array: Any) -> Any:
+        """Where the first entry of the array is."""
+
+        def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            data = context.make_array(signature.args[0])(context, builder, args[0]).data
+            return builder.ptrtoint(data, ir.IntType(64))
+
+        return types.int64(array), emit
+
+    def _compiled(kind: Any, dimensions: int) -> Any:
+        made = types.Array(kind, dimensions, "C")
+
+        @intrinsic
+        def found(_typing: Any, table: Any, _entry: Any) -> Any:
+            """The array at this entry of the table."""
+
+            def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+                words = context.make_array(signature.args[0])(context, builder, args[0]).data
+                first = builder.mul(args[1], ir.IntType(64)(WIDTH))
+                row = [
+                    builder.load(builder.gep(words, [builder.add(first, ir.IntType(64)(k))]))
+                    for k in range(1 + dimensions)
+                ]
+                return _array(context, builder, made, row[0], row[1:])
+
+            return made(table, types.int64), emit
+
+        return found
+
+    def _array(context: Any, builder: Any, made: Any, address: Any, shape: list[Any]) -> Any:
+        """An array that nobody counts the references of."""
+        array = context.make_array(made)(context, builder)
+        size = context.get_constant(types.intp, _WORD)
+        strides = [size] if len(shape) == 1 else [builder.mul(shape[1], size), size]
+        array.meminfo = context.get_constant_null(types.voidptr)
+        array.parent = context.get_constant_null(types.pyobject)
+        array.nitems = shape[0] if len(shape) == 1 else builder.mul(shape[0], shape[1])
+        array.itemsize = size
+        array.data = builder.inttoptr(address, array.data.type)
+        array.shape = _tuple(builder, shape)
+        array.strides = _tuple(builder, strides)
+        return array._getvalue()
+
+    def _tuple(builder: Any, values: list[Any]) -> Any:
+        made = ir.Constant(ir.ArrayType(values[0].type, len(values)), ir.Undefined)
+        for k, value in enumerate(values):
+            made = builder.insert_value(made, value, k)
+        return made
+
+    address_of = _entry
+    ints, int_rows = _compiled(types.int64, 1), _compiled(types.int64, 2)
+    floats, float_rows = _compiled(types.float64, 1), _compiled(types.float64, 2)
+
+
+@inline_kernel
+def put_place(table: Any, entry: int, address: int, rows: int, columns: int) -> None:
+    """Have the table tell of an array, for as long as that is there."""
+    table[WIDTH * entry], table[WIDTH * entry + 1], table[WIDTH * entry + 2] = address, rows, columns

@@ -1,0 +1,390 @@
+"""How kernels are compiled and kept: numba is imported here, in `lowering` and `compile_time`; flags are chosen here.
+
+`kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
+                 those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
+`inline_kernel`  melts into the kernels that call it; for what runs in their innermost loops.
+`part`           a step of a kernel, called by it and compiled apart: one large function takes far longer to compile.
+
+Numba types a part once in a process; each kernel that calls it, also by way of other parts, links a copy of its own.
+A kernel that is called by another is a part there.
+
+The disk cache is a folder named by a hash of every file beside this one, the flags, the versions of Python, numpy,
+numba and llvmlite, and the processor.  Numba itself looks only at the file that holds a kernel, so it would run a
+stale kernel after a callee in another file was edited.  Hence the rule: a kernel uses nothing from outside this folder
+and the files that its `KernelFolder` names.  Kernels of another folder have a `KernelFolder` of their own, and the same
+rule for that one.
+
+No slice is assigned an array, and none is sorted by NumPy's way: to compile what the one says of unlike sizes, and the
+other, takes three seconds in each process.
+
+An index is 0 or more, or a constant that is written where it is used, as in `a[-1]`; ends of slices may be anything.
+Python counts other negative ones from the end; a kernel does not look for them, which saves a twentieth of a step.
+With every index checked they are errors.
+
+FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).  What is in them is run as code, so it
+is used only if nobody but this user and root can write there, to a folder or a file; what is made is for them alone.
+NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
+"""
+
+import atexit
+import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import secrets
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import llvmlite
+import llvmlite.binding
+import numba
+import numba.extending
+import numpy as np
+from llvmlite import ir
+from numba.core import caching, cgutils, config, event, types
+from numba.core.compiler_lock import global_compiler_lock
+from numpy.typing import NDArray
+
+from factorbus.ownership import check_file, make_private
+
+# From beside this file: a copy of all three elsewhere is one by itself.
+from . import compile_time, lowering
+from .lowering import KernelCompiler, PartCompiler
+
+__all__ = [
+    "BOUNDSCHECK",
+    "DISABLED",
+    "F64",
+    "I64",
+    "KernelFolder",
+    "cache_folder",
+    "cgutils",
+    "compiled_seconds",
+    "inline_kernel",
+    "intrinsic",
+    "ir",
+    "is_on_disk",
+    "iter_compile",
+    "kernel",
+    "part",
+    "sources_hash",
+    "types",
+    "vector_lanes",
+]
+
+intrinsic: Any = numba.extending.intrinsic
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+DISABLED = bool(getattr(config, "DISABLE_JIT"))  # noqa: B009  (numba sets these when it is imported)
+BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
+
+# Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
+_FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
+_FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
+# Of numba's variables, those that leave the code as it is: no kernel is parallel.
+_NO_MATTER = {"NUMBA_NUM_THREADS", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"}
+_KEPT_FOLDERS = 6
+
+
+class KernelFolder:
+    """The decorators for the kernels of one folder of sources, and where they are kept.
+
+    family: names the folder of cache folders, of which the last few are kept.  exact: every operation is rounded as it
+    is written, none is fused or reordered: the bits depend neither on how a loop is cut up nor on the processor.
+    quick: exact, and a call keeps the interpreter lock, because it is done before the lock could be given back.
+    also: files outside the folder whose constants or inline kernels its kernels use.
+    """
+
+    def __init__(
+        self, sources: Path, family: str, exact: bool = False, quick: bool = False, also: tuple[Path, ...] = ()
+    ) -> None:
+        self._sources, self._family, self._also = sources, family, also
+        self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
+        self._cache = _cache_in(self)
+        self._path: Path | None = None
+
+    def kernel(self, *signatures: Any) -> Any:
+        """`@kernel` or `@kernel("int64(float64[::1])", ...)`: see the head of this file."""
+        if len(signatures) == 1 and callable(signatures[0]):
+            return self._compiled(signatures[0], ())
+        return lambda function: self._compiled(function, signatures)
+
+    def inline_kernel(self, function: Callable[..., Any]) -> Any:
+        """A small function that is always inlined into the kernels that call it, so it needs no cache of its own."""
+        if DISABLED:
+            return function
+        return self._linked(function, forceinline=True)
+
+    def part(self, function: Callable[..., Any]) -> Any:
+        """A step of a kernel, kept on disk with the kernel that calls it."""
+        if DISABLED:
+            return function
+        return self._linked(function)
+
+    def path(self) -> Path:
+        """The cache folder, made when it is first asked for.  Raises UnsafeFolder: others can write to it."""
+        if self._path is None:
+            self._path = self._make()
+        return self._path
+
+    def _compiled(self, function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
+        if DISABLED:
+            return function
+        dispatcher = _ours(numba.njit(pipeline_class=KernelCompiler, **self._flags)(function))
+        part = functools.cache(lambda: self._linked(function))  # what other kernels link
+        dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
+        dispatcher.get_overload = lambda signature: part().get_overload(signature)
+        dispatcher._cache = self._cache(function)
+        dispatcher.factorbus_signatures = signatures
+        if signatures:
+            dispatcher._compile_for_args = _on_first_call(dispatcher)
+        return dispatcher
+
+    def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
+        """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
+        dispatcher = _ours(numba.njit(pipeline_class=PartCompiler, **flags, **self._flags)(function))
+        find = dispatcher.get_call_template
+        dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
+
+        @functools.cache
+        def alone() -> Any:
+            return _ours(numba.njit(pipeline_class=KernelCompiler, **self._flags)(function))
+
+        dispatcher.add_overload = lambda result: dispatcher.overloads.update({tuple(result.signature.args): result})
+        dispatcher._compile_for_args = lambda *_args, **_kwargs: alone()
+        return dispatcher
+
+    def _make(self) -> Path:
+        base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
+        path = base / self._family / sources_hash(self._sources, *self._also)
+        try:
+            make_private("the cache of compiled kernels", path)
+            tempfile.TemporaryFile(dir=path).close()
+            os.utime(path)
+        except OSError as problem:
+            return _temporary(path.parent, problem)
+        _prune(path.parent, keep=path)
+        return path
+
+
+def compiled_seconds() -> float:
+    """Seconds spent compiling kernels in this process; 0.0 when all came from disk."""
+    return _COMPILATIONS.duration if _COMPILATIONS.done else 0.0
+
+
+def iter_compile(*kernels: Any) -> Iterator[str]:
+    """Compile (or load) kernels that have signatures, one per turn; gives the name of the one that comes next."""
+    for function in kernels:
+        yield function.__name__
+        if not DISABLED:
+            _compile_declared(function)
+
+
+def is_on_disk(function: Any) -> bool:
+    """Whether a kernel with signatures has been compiled before, as these sources have it."""
+    return DISABLED or Path(function._cache._cache_file._index_path).is_file()
+
+
+def vector_lanes() -> int:
+    """Doubles in the widest vector register of this processor."""
+    features = llvmlite.binding.get_host_cpu_features()
+    if features.get("avx512f"):
+        return 8
+    return 4 if features.get("avx") else 2
+
+
+def cache_folder() -> Path:
+    """The folder where kernels of these sources, flags, versions and processor are kept."""
+    return _FOLDER.path()
+
+
+def sources_hash(folder: Path, *also: Path) -> str:
+    """The name of the cache folder for kernels whose sources are the Python files in `folder`, those that make
+    kernels, and `also`."""
+    digest = hashlib.sha256()
+    makers = (Path(one) for one in (__file__, compile_time.__file__, lowering.__file__))
+    for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
+        text = path.read_bytes()
+        digest.update(f"{path.name} {len(text)}\n".encode() + text)
+    features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
+    digest.update(
+        repr(
+            (
+                sys.version,
+                platform.machine(),
+                (np.__version__, numba.__version__, llvmlite.__version__),
+                (llvmlite.binding.get_host_cpu_name(), features),
+                sorted((name, value) for name, value in os.environ.items() if _changes_code(name)),
+                sorted(_FASTMATH),
+            )
+        ).encode()
+    )
+    return digest.hexdigest()[:20]
+
+
+def _changes_code(variable: str) -> bool:
+    return variable.startswith("NUMBA_") and variable not in _NO_MATTER
+
+
+def _compile_declared(dispatcher: Any) -> None:
+    """Compile (or load) the declared signatures once and close the door to others."""
+    with global_compiler_lock:
+        if dispatcher._can_compile:
+            for signature in dispatcher.factorbus_signatures:
+                dispatcher.compile(signature)
+            dispatcher.disable_compile()
+            del dispatcher._compile_for_args
+
+
+def _on_first_call(dispatcher: Any) -> Callable[..., Any]:
+    """Numba calls what this hook returns with the same arguments: the dispatcher, which then knows or refuses them."""
+
+    def compile_for_args(*_args: Any, **_kwargs: Any) -> Any:
+        _compile_declared(dispatcher)
+        return dispatcher
+
+    return compile_for_args
+
+
+def _common(kind: Any) -> Any:
+    """The kind of an argument.  Constants are kinds of their own, and a part is compiled apart for each: for sizes.  A
+    zero is no size but the place where something begins, and what is true or false decides nothing inside a loop."""
+    is_zero = isinstance(kind, types.IntegerLiteral) and kind.literal_value == 0
+    return types.intp if is_zero else types.boolean if isinstance(kind, types.BooleanLiteral) else kind
+
+
+def _ours(dispatcher: Any) -> Any:
+    dispatcher.factorbus = True
+    return dispatcher
+
+
+class _Compilations(event.TimingListener):
+    """Adds up the time of the outermost compilations of our kernels; the compiler lock makes them sequential."""
+
+    def notify(self, event: Any) -> None:
+        if getattr(event.data["dispatcher"], "factorbus", False):
+            super().notify(event)
+
+
+def _temporary(base: Path, problem: OSError) -> Path:
+    path = Path(tempfile.mkdtemp(prefix="factorbus-kernels-"))
+    atexit.register(shutil.rmtree, path, ignore_errors=True)
+    warnings.warn(
+        f"compiled kernels cannot be kept in {base} ({problem.strerror}): they go to {path} and are compiled again at "
+        "the next start; make the folder writable or set FACTORBUS_CACHE to one that is",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+    return path
+
+
+def _prune(base: Path, keep: Path) -> None:
+    """Remove all but the folders used last.  A process that still runs from one of them has its code in memory."""
+    folders = [path for path in base.iterdir() if path.is_dir() and path != keep]
+    folders.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in folders[_KEPT_FOLDERS - 1 :]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _cache_in(folder: KernelFolder) -> type[caching.FunctionCache]:
+    """Numba's cache of a function, in `folder`.  The folder's name stands for the sources: nothing else is stamped."""
+
+    class Locator(caching._CacheLocator):
+        def __init__(self, function: Callable[..., Any]) -> None:
+            self._name = f"{function.__module__}.{function.__qualname__}"
+
+        def get_cache_path(self) -> str:
+            return str(folder.path())
+
+        def get_source_stamp(self) -> str:
+            return self._name
+
+        def get_disambiguator(self) -> str:
+            return hashlib.sha256(self._name.encode()).hexdigest()[:8]
+
+        @classmethod
+        def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "Locator":
+            return cls(py_func)
+
+    class Content(caching.CompileResultCacheImpl):
+        _locator_classes = (Locator,)
+
+    class Cache(caching.FunctionCache):
+        _impl_class = Content
+
+        def __init__(self, function: Callable[..., Any]) -> None:
+            super().__init__(function)
+            # As numba makes it, but for how files are opened.
+            content = self._impl
+            self._cache_file = _OwnFiles(self._cache_path, content.filename_base, content.locator.get_source_stamp())
+
+    return Cache
+
+
+class _OwnFiles(caching.IndexDataCacheFile):
+    """The files of one function: written for this user alone, and read only if nobody else can have written them.
+
+    Folders are checked once, when a process begins; a file is checked as it is opened, so that none can be put in its
+    place in between.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            with _opened(self._index_path) as file:
+                version, data = pickle.load(file), file.read()
+        except FileNotFoundError:
+            return {}
+        if version != self._version:
+            return {}
+        stamp, overloads = pickle.loads(data)
+        return overloads if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        with _opened(self._data_path(name)) as file:
+            return pickle.loads(file.read())
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
+        beside = f"{filepath}.tmp.{secrets.token_hex(8)}"
+        try:
+            with open(beside, "xb", opener=_for_us_alone) as file:
+                yield file
+            os.replace(beside, filepath)
+        except Exception:
+            Path(beside).unlink(missing_ok=True)
+            raise
+
+
+def _opened(path: str) -> IO[bytes]:
+    """A file of the cache, to be read.  Raises UnsafeFolder: somebody else may have written it; OSError."""
+    file = open(path, "rb")  # noqa: SIM115
+    try:
+        check_file("the compiled kernel", Path(path), os.fstat(file.fileno()))
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _for_us_alone(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+_COMPILATIONS = _Compilations()
+event.register("numba:compile", _COMPILATIONS)
+
+_KERNELS = Path(__file__).parents[1]
+_LENSES = _KERNELS.with_name("lenses")
+_FOLDER = KernelFolder(_KERNELS, "kernels", also=tuple(_LENSES.glob("*.py")))
+kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -1,0 +1,213 @@
+"""How Numba makes machine code of our functions: its own compiler, but for what is changed here.
+
+Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A part stays as it was
+written until a kernel links it, and what a kernel links is its own.
+"""
+
+from typing import Any
+
+import llvmlite.binding
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core import ir as numba_ir
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, Flags
+from numba.core.compiler_machinery import register_pass
+from numba.core.lowering import Lower
+from numba.core.runtime.context import NRTContext
+from numba.core.typed_passes import NativeLowering
+from numba.np import arrayobj
+
+# From beside this file: a copy of both elsewhere is one by itself.
+from .compile_time import QuickFlags, keep_needed
+
+_from_the_end = arrayobj.fix_integer_index
+
+
+def _fix_integer_index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
+    """In our own code only constants count from the end."""
+    constant = isinstance(kind, types.IntegerLiteral) or isinstance(index, ir.Constant)
+    if constant or not getattr(builder.module, "factorbus", False):
+        return _from_the_end(context, builder, kind, index, size)
+    return context.cast(builder, index, kind, types.intp)
+
+
+arrayobj.fix_integer_index = _fix_integer_index
+
+
+class OurLower(Lower):
+    """The code of our functions: it says that it is, and borrows arrays.
+
+    Arrays that a function is given belong to its caller, who keeps them until it returns: it counts no references.
+
+    Numba counts one more and one less for each row or block of them that is looked at, by atomic operations: up to
+    four fifths of the time of short kernels.  A function that gives back an array may give back one that it was given,
+    so such a one does count.  One that has no arrays but those, and their rows and blocks, counts nothing at all.
+    """
+
+    def pre_lower(self) -> None:
+        super().pre_lower()
+        self.module.factorbus = True
+        self.module.factorbus_borrows = self._is_plain(self.fndesc.restype) and not any(
+            self._is_owner(expression, signature) for expression, signature in self.fndesc.calltypes.items()
+        )
+
+    def _is_owner(self, expression: Any, signature: Any) -> bool:
+        """Whether what it comes to may be, or have, an array of its own."""
+        if signature is None or self._is_plain(signature.return_type):
+            return False
+        looks_at = getattr(expression, "op", None) in {"getitem", "static_getitem"}
+        return not looks_at or any(map(_has_array, signature.args[1:]))
+
+    def _is_plain(self, kind: Any) -> bool:
+        """Whether there are no references to count in it."""
+        return not self.context.data_model_manager[kind].contains_nrt_meminfo()
+
+    def lower_assign(self, ty: Any, inst: Any) -> Any:
+        given = inst.value
+        borrowed = isinstance(given, numba_ir.Arg) and isinstance(ty, types.Array)
+        if not (borrowed and self._is_plain(self.fndesc.restype)):
+            return super().lower_assign(ty, inst)
+        value = self.context.cast(self.builder, self.fnargs[given.index], self.typeof(f"arg.{given.name}"), ty)
+        array = self.context.make_array(ty)(self.context, self.builder, value)
+        array.meminfo, array.parent = (cgutils.get_null_value(owner.type) for owner in (array.meminfo, array.parent))
+        return array._getvalue()
+
+
+def _has_array(kind: Any) -> bool:
+    """An index that has one makes a copy of what it looks at."""
+    return isinstance(kind, types.Array) or any(map(_has_array, getattr(kind, "types", ())))
+
+
+_count = NRTContext._call_incref_decref
+
+
+def _count_owned(self: Any, builder: Any, typ: Any, value: Any, funcname: str) -> None:
+    """One more or one less, unless the function has only borrowed arrays."""
+    if not getattr(builder.module, "factorbus_borrows", False):
+        _count(self, builder, typ, value, funcname)
+
+
+NRTContext._call_incref_decref = _count_owned
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Lowering(NativeLowering):
+    _name = "borrowing_lowering"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        return OurLower
+
+
+class _PartLibrary(JITCodeLibrary):
+    """The code of a part as it was written.  It is linked, optimised and made machine code in the kernels that call it.
+
+    Numba's own libraries do all of that at every level of calls, and wrap each function for Python and for C.
+    """
+
+    def add_linking_library(self, library: Any) -> None:
+        _add_linked(self._linking_libraries, library)
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Only what makes it smaller: the rest is done where it is linked."""
+        ll_module.data_layout = self._codegen._data_layout
+        passes, builder = self._codegen._function_pass_manager(opt=1)
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def finalize(self) -> None:
+        self._finalized = True
+
+
+class _KernelLibrary(JITCodeLibrary):
+    """The code of a kernel and of all parts that it calls, directly or not."""
+
+    def add_linking_library(self, library: Any) -> None:
+        library._ensure_finalized()
+        _add_linked(self._linking_libraries, library)
+
+    def _optimize_final_module(self) -> None:
+        """What the kernel calls is made its own first: nothing of another kernel is taken for it, whatever came before,
+        and LLVM passes no argument that nobody reads.  An array is nine words of them, of which two or three are read.
+
+        Numba runs cheap passes before, to see the counting of references in one function; here hardly any is left.
+        """
+        for function in self._final_module.functions:
+            if function.linkage == llvmlite.binding.Linkage.linkonce_odr and not function.is_declaration:
+                function.linkage = llvmlite.binding.Linkage.internal
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
+
+    def _get_module_for_linking(self) -> Any:
+        """What is kept on disk beside the machine code, to be linked by others: nobody does, so only the names."""
+        if self._shared_module is None:
+            external = llvmlite.binding.Linkage.external
+            names = [function.name for function in self.get_defined_functions() if function.linkage == external]
+            text = "\n".join(f'define void @"{name}"() {{ ret void }}' for name in names)
+            self._shared_module = llvmlite.binding.parse_assembly(text)
+        return self._shared_module
+
+
+def _add_linked(linked: list[Any], library: Any) -> None:
+    """`library`, and what it links itself if it is a part's.  Callers stand before what they call: LLVM links only what
+    it knows to be called."""
+    for one in (library, *library._linking_libraries) if isinstance(library, _PartLibrary) else (library,):
+        if one in linked:
+            linked.remove(one)
+        linked.append(one)
+
+
+class _Compiler(Compiler):
+    """Numba's own compiler, with our lowering."""
+
+    lowering = _Lowering
+
+    def define_pipelines(self) -> list[Any]:
+        pipelines = super().define_pipelines()
+        for pipeline in pipelines:
+            keep_needed(pipeline)
+            pipeline.passes = [(self.lowering if one is NativeLowering else one, why) for one, why in pipeline.passes]
+            pipeline.finalize()
+        return pipelines
+
+
+class KernelCompiler(_Compiler):
+    """The same with our library for a kernel."""
+
+    def __init__(
+        self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
+    ) -> None:
+        if library is None:
+            library = _KernelLibrary(targetctx.codegen(), "kernel")
+            library.enable_object_caching()
+        ours: Any = QuickFlags(flags)
+        ours.no_cfunc_wrapper = True  # nobody calls it from C
+        super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _PartLowering(_Lowering):
+    """Lowering that ends with the code that others link."""
+
+    _name = "part_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = state.flags.no_compile = True
+        super().run_pass(state)
+        state.library.finalize()
+        called_by = object()  # the name by which the code of others calls it
+        state.cr = state.cr._replace(cfunc=called_by)
+        state.targetctx.insert_user_function(called_by, state.cr.fndesc, [state.library])
+        return True
+
+
+class PartCompiler(_Compiler):
+    lowering = _PartLowering
+
+    def __init__(
+        self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
+    ) -> None:
+        library = library or _PartLibrary(targetctx.codegen(), "part")
+        super().__init__(typingctx, targetctx, library, args, return_type, QuickFlags(flags), names)

@@ -1,0 +1,23 @@
+"""Loads, stores and register tiles on a float64 array, written in LLVM vectors.
+
+Why not plain indexing: `a[i + j]` with signed indices compiles to a compare and a select for negative ones, which
+keeps loops from being vectorised, and no compiler keeps a tile of a product in registers by itself.
+
+There are three sets of these functions with one meaning: `simd_llvm` (fast, no checks), `simd_checked` (the same
+behind range checks, NUMBA_BOUNDSCHECK=1) and `simd_plain` (NumPy, NUMBA_DISABLE_JIT=1; read that one first).
+"""
+
+from factorbus.solver.kernels.jit.compile import BOUNDSCHECK, DISABLED, vector_lanes
+
+if DISABLED:
+    from factorbus.solver.kernels.jit.simd_plain import add_run, at, put, six, solve_rows, tile, zero
+elif BOUNDSCHECK:
+    from factorbus.solver.kernels.jit.simd_checked import add_run, at, put, six, solve_rows, tile, zero
+else:
+    from factorbus.solver.kernels.jit.simd_llvm import add_run, at, put, six, solve_rows, tile, zero
+
+__all__ = ["LANES", "TILE_ROWS", "TILE_VECTORS", "add_run", "at", "put", "six", "solve_rows", "tile", "zero"]
+
+LANES = vector_lanes()
+TILE_ROWS = 4
+TILE_VECTORS = 3  # 4 x 3 sums, 3 loads and a broadcast: the 16 registers of AVX2

@@ -1,0 +1,65 @@
+"""The functions of `simd` behind range checks: what NUMBA_BOUNDSCHECK=1 runs."""
+
+from typing import Any
+
+from factorbus.solver.kernels.jit import simd_llvm
+from factorbus.solver.kernels.jit.compile import F64, inline_kernel, vector_lanes
+
+_LANES = vector_lanes()
+_at, _put, _zero, _add_run = simd_llvm.at, simd_llvm.put, simd_llvm.zero, simd_llvm.add_run
+_tile, _solve_rows, _six = simd_llvm.tile, simd_llvm.solve_rows, simd_llvm.six
+
+
+@inline_kernel
+def at(a: F64, i: int) -> Any:
+    """See `simd_plain`; likewise below."""
+    _within(a, i, 1)
+    return _at(a, i)
+
+
+@inline_kernel
+def put(a: F64, i: int, x: float) -> None:
+    _within(a, i, 1)
+    _put(a, i, x)
+
+
+@inline_kernel
+def zero(a: F64, i: int, count: int) -> None:
+    _within(a, i, count)
+    _zero(a, i, count)
+
+
+@inline_kernel
+def add_run(a: F64, i: int, j: int, count: int) -> None:
+    _within(a, i, count)
+    _within(a, j, count)
+    _add_run(a, i, j, count)
+
+
+@inline_kernel
+def tile(a: F64, rows: int, vectors: int, c: int, ldc: int, x: int, y: int, ld: int, depth: int) -> None:
+    _within(a, c, (rows - 1) * ldc + vectors * _LANES)
+    _within(a, x, (depth - 1) * ld + rows)
+    _within(a, y, (depth - 1) * ld + vectors * _LANES)
+    _tile(a, rows, vectors, c, ldc, x, y, ld, depth)
+
+
+@inline_kernel
+def solve_rows(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None:
+    _within(a, c, (rows - 1) * ld + vectors * _LANES)
+    _within(a, t, 10)
+    _solve_rows(a, rows, vectors, c, ld, t)
+
+
+@inline_kernel
+def six(x: F64, i: int, stride: int, depth: int, y: F64, j: int, out: F64, to: int) -> None:
+    _within(x, i, (depth - 1) * stride + 1)
+    _within(y, j, 6 * depth)
+    _within(out, to, 6)
+    _six(x, i, stride, depth, y, j, out, to)
+
+
+@inline_kernel
+def _within(a: F64, first: int, count: int) -> None:
+    if first < 0 or first + count > a.size:
+        raise IndexError("a kernel reached outside its array")

@@ -1,0 +1,49 @@
+"""What the functions of `simd` mean, in NumPy.  Offsets count doubles from the start of the array."""
+
+from factorbus.solver.kernels.jit.compile import F64, vector_lanes
+
+_LANES = vector_lanes()
+# Where the ten doubles of a 4 x 4 upper triangle T sit: 1/T₀₀ 1/T₁₁ 1/T₂₂ 1/T₃₃, then what is above the diagonal.
+TRIANGLE = {(0, 1): 4, (0, 2): 5, (1, 2): 6, (0, 3): 7, (1, 3): 8, (2, 3): 9}
+
+
+def at(a: F64, i: int) -> float:
+    """a[i]"""
+    return a[i]
+
+
+def put(a: F64, i: int, x: float) -> None:
+    """a[i] = x"""
+    a[i] = x
+
+
+def zero(a: F64, i: int, count: int) -> None:
+    """a[i : i+count] = 0"""
+    a[i : i + count] = 0.0
+
+
+def add_run(a: F64, i: int, j: int, count: int) -> None:
+    """a[i : i+count] += a[j : j+count]; the runs do not overlap"""
+    a[i : i + count] += a[j : j + count]
+
+
+def tile(a: F64, rows: int, vectors: int, c: int, ldc: int, x: int, y: int, ld: int, depth: int) -> None:
+    """C −= XᵀY: C (rows, vectors·LANES) at c, X (depth, rows) at x, Y (depth, vectors·LANES) at y; X and Y share ld."""
+    width = vectors * _LANES
+    for i in range(rows):
+        for k in range(depth):
+            a[c + i * ldc : c + i * ldc + width] -= a[x + k * ld + i] * a[y + k * ld : y + k * ld + width]
+
+
+def solve_rows(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None:
+    """C = T⁻ᵀC: C (rows, vectors·LANES) at c, T (rows, rows) at t as TRIANGLE says"""
+    lines = [a[c + i * ld : c + i * ld + vectors * _LANES] for i in range(rows)]
+    for i in range(rows):
+        for k in range(i):
+            lines[i] -= a[t + TRIANGLE[k, i]] * lines[k]
+        lines[i] *= a[t + i]
+
+
+def six(x: F64, i: int, stride: int, depth: int, y: F64, j: int, out: F64, to: int) -> None:
+    """out[to : to+6] = Σ x[i + k stride] y[j + 6 k : j + 6 k + 6], k from 0 to depth − 1"""
+    out[to : to + 6] = sum(x[i + k * stride] * y[j + 6 * k : j + 6 * k + 6] for k in range(depth))

@@ -1,0 +1,28 @@
+"""Residuals, Jacobians and information of factors as plain arrays: for questions about them.  MATH §3, §10.3."""
+
+from factorbus.solver.kernels.jit.compile import F64, I64, kernel
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.sizes import information_at, residual_dim
+
+
+@kernel(
+    "void(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[:,::1], float64[:,:,::1],"
+    " float64[:,:,::1], float64[:,:,::1])"
+)
+def evaluate_factors(
+    first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, A: F64, B: F64, W: F64
+) -> None:
+    """The factors first .. last−1 at `values`.
+
+    out  r (n, 6), A, B, W (n, 6, 6): upper left corners
+    """
+    for f in range(first, last):
+        k = f - first
+        evaluate_apart(f, var, fac, values, payload, r[k], A[k], B[k])
+        dim = residual_dim(fac[f, at.F_KIND])
+        p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])
+        for a in range(dim):
+            for b in range(a, dim):
+                W[k, a, b] = W[k, b, a] = payload[p]
+                p += 1

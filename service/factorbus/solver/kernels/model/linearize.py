@@ -1,0 +1,198 @@
+"""Factors to normal equations: residuals and Jacobians, and their sum into Λ and η.  MATH §3, §4.
+
+    Λ = Σ Hᵀ Ω H,   η = −Σ Hᵀ Ω r,   χ² = Σ rᵀ Ω r          (4.1)
+
+of a factor with a loss ρ with r and H times √ρ'(rᵀ Ω r), and ρ(rᵀ Ω r) in χ² (`losses`).
+
+Factors are taken in the order of their ids, whatever their kinds.  So the sums over all factors have the same bits
+whether they were made at once or as the factors arrived; taking back a refused insert rests on that.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.kernels.model.linear import linear, linear_se2
+from factorbus.solver.kernels.model.losses import soften
+from factorbus.solver.kernels.model.points import prior_point2, prior_point3
+from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
+from factorbus.solver.kernels.model.range_bearing import bearing_se2, bearing_se3, range_se2, range_se3
+from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
+from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
+from factorbus.solver.kernels.model.sizes import end_dims, information_at, residual_dim
+from factorbus.solver.lenses.layout import GOOD
+
+
+@kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
+def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, data: F64, eta: F64) -> float:
+    """Add the factors first .. last−1, linearised at `values`, to Λ's blocks in `data` and to `eta`; gives their χ²."""
+    r = np.zeros(at.R_SIZE)
+    H = np.zeros((4, 6, 6))
+    W = np.zeros((6, 6))
+    chi2 = 0.0
+    for f in range(first, last):
+        kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
+        chi2 += evaluate(f, var, fac, values, payload, r, H[0], H[1])
+        # Sizes as constants, so that each call becomes straight code.
+        if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2:
+            chi2 += add_factor(3, 3, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
+        elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
+            chi2 += add_factor(2, 3, 2, f, var, fac, payload[p + 2 :], r, H, W, data, eta)
+        elif kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3:
+            chi2 += add_factor(6, 6, 6, f, var, fac, payload[p + 7 :], r, H, W, data, eta)
+        elif kind == at.LANDMARK_SE3 or kind == at.PRIOR_POINT3:
+            first_size = 6 if kind == at.LANDMARK_SE3 else 3
+            chi2 += add_factor(3, first_size, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
+        else:
+            chi2 += add_other(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
+    return chi2
+
+
+@part
+def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
+    """`evaluate`, compiled apart: for kernels that have more to do than this."""
+    return evaluate(f, var, fac, x, payload, r, A, B)
+
+
+@inline_kernel
+def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
+    """The residual kernel of the kind of factor `f`, and its loss; gives what χ² has beside rᵀ Ω r."""
+    more = 0.0
+    kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
+    i = var[fac[f, at.F_I], at.V_AT]
+    j = var[max(fac[f, at.F_J], 0), at.V_AT]
+    if kind == at.BETWEEN_SE2:
+        between_se2(x, i, j, payload, p, r, A, B)
+    elif kind == at.LANDMARK_SE2:
+        landmark_se2(x, i, j, payload, p, r, A, B)
+    elif kind == at.BEARING_RANGE_SE2:
+        bearing_range_se2(x, i, j, payload, p, r, A, B)
+    elif kind == at.PRIOR_SE2:
+        prior_se2(x, i, j, payload, p, r, A, B)
+    elif kind == at.BETWEEN_SE3:
+        between_se3(x, i, j, payload, p, r, A, B)
+    elif kind == at.LANDMARK_SE3:
+        landmark_se3(x, i, j, payload, p, r, A, B)
+    elif kind == at.PRIOR_SE3:
+        prior_se3(x, i, j, payload, p, r, A, B)
+    elif kind == at.PRIOR_POINT2:
+        prior_point2(x, i, j, payload, p, r, A, B)
+    elif kind == at.PRIOR_POINT3:
+        prior_point3(x, i, j, payload, p, r, A, B)
+    elif kind < at.POSITION_SE2:
+        more = sight(kind, x, i, j, payload, p, r, A, B)
+    else:
+        evaluate_other(kind, x, i, j, payload, p, r, A, B)
+    loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
+    if loss != at.NO_LOSS:
+        more = soften(kind, loss, p, payload, more, r, A, B)
+    return more
+
+
+@part
+def evaluate_other(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
+    """The kinds from POSITION_SE2 on."""
+    r[at.R_STATUS] = GOOD
+    if kind == at.POSITION_SE2:
+        position_se2(x, i, p, k, r, A)
+    elif kind == at.POSITION_SE3:
+        position_se3(x, i, p, k, r, A)
+    elif kind == at.HEADING_SE2:
+        heading_se2(x, i, p, k, r, A)
+    elif kind == at.ATTITUDE_SE3:
+        attitude_se3(x, i, p, k, r, A)
+    elif kind == at.RANGE_SE2:
+        range_se2(x, i, j, p, k, r, A, B)
+    elif kind == at.RANGE_SE3:
+        range_se3(x, i, j, p, k, r, A, B)
+    elif kind == at.BEARING_SE2:
+        bearing_se2(x, i, j, p, k, r, A, B)
+    elif kind == at.BEARING_SE3:
+        bearing_se3(x, i, j, p, k, r, A, B)
+    elif kind == at.LINEAR_SE2 or kind == at.LINEAR_PAIR_SE2:
+        linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
+    else:
+        linear(kind, x, i, j, p, k, r, A, B)
+
+
+@part
+def add_other(kind: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64) -> float:
+    """`add_factor` of the kinds that are not worth straight code."""
+    di, dj = end_dims(kind)
+    return add_factor(residual_dim(kind), di, dj, f, var, fac, info, r, H, W, data, eta)
+
+
+@inline_kernel
+def add_factor(
+    dr: int, di: int, dj: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64
+) -> float:
+    """Add Hᵀ Ω H and −Hᵀ Ω r of one factor where they belong; gives rᵀ Ω r.
+
+    H holds A, B and gets Ω A, Ω B; `info` starts with the upper triangle of Ω.  Ends without a block are fixed.
+    """
+    A, B, WA, WB = H[0], H[1], H[2], H[3]
+    k = 0
+    for a in range(dr):
+        for b in range(a, dr):
+            W[a, b] = info[k]
+            W[b, a] = info[k]
+            k += 1
+    chi2 = 0.0
+    for a in range(dr):
+        e = 0.0
+        for b in range(dr):
+            e += W[a, b] * r[b]
+        chi2 += r[a] * e
+    ii, jj, ij = fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ]
+    if ii >= 0:
+        multiply(dr, di, W, A, WA)
+        add_end(dr, di, A, WA, r, data[ii:], eta[var[fac[f, at.F_I], at.V_SCALAR] :])
+    if jj >= 0:
+        multiply(dr, dj, W, B, WB)
+        add_end(dr, dj, B, WB, r, data[jj:], eta[var[fac[f, at.F_J], at.V_SCALAR] :])
+    if ij >= 0:
+        if fac[f, at.F_FLAGS] & at.SWAPPED:
+            add_pair(dr, dj, di, B, WA, data[ij:])
+        else:
+            add_pair(dr, di, dj, A, WB, data[ij:])
+    return chi2
+
+
+@inline_kernel
+def multiply(dr: int, d: int, W: F64, A: F64, out: F64) -> None:
+    """out = Ω A."""
+    for a in range(dr):
+        for c in range(d):
+            total = 0.0
+            for b in range(dr):
+                total += W[a, b] * A[b, c]
+            out[a, c] = total
+
+
+@inline_kernel
+def add_end(dr: int, d: int, A: F64, WA: F64, r: F64, block: F64, eta: F64) -> None:
+    """block += Aᵀ Ω A, symmetric to the bit; eta −= (Ω A)ᵀ r."""
+    for a in range(d):
+        total = 0.0
+        for k in range(dr):
+            total += WA[k, a] * r[k]
+        eta[a] -= total
+        for b in range(a, d):
+            total = 0.0
+            for k in range(dr):
+                total += A[k, a] * WA[k, b]
+            block[a * d + b] += total
+            if b > a:
+                block[b * d + a] = block[a * d + b]
+
+
+@inline_kernel
+def add_pair(dr: int, d: int, e: int, A: F64, WB: F64, block: F64) -> None:
+    """block += Aᵀ Ω B."""
+    for a in range(d):
+        for b in range(e):
+            total = 0.0
+            for k in range(dr):
+                total += A[k, a] * WB[k, b]
+            block[a * e + b] += total

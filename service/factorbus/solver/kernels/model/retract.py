@@ -1,0 +1,96 @@
+"""x ⊞ δ for all variables, which of them changed, and their values gathered per kind.  MATH §2."""
+
+from factorbus.solver.kernels.jit.array_table import floats, int_rows, ints
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import move_idp
+from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.se2 import move_se2
+from factorbus.solver.kernels.model.se3 import move_se3
+from factorbus.solver.kernels.model.sizes import size_of
+
+
+@kernel("void(int64, int64[:,::1], float64[::1], float64[::1], float64[::1])")
+def move(count: int, var: I64, values: F64, step: F64, out: F64) -> None:
+    """out = values ⊞ step, variable by variable; fixed ones are copied."""
+    for v in range(count):
+        kind, x, d = var[v, at.V_KIND], var[v, at.V_AT], var[v, at.V_SCALAR]
+        if d < 0:
+            for c in range(size_of(kind)):
+                out[x + c] = values[x + c]
+        elif kind == at.SE2:
+            move_se2(values, x, step, d, out)
+        elif kind == at.SE3:
+            move_se3(values, x, step, d, out)
+        elif kind == at.POINT2:
+            move_point2(values, x, step, d, out)
+        elif kind == at.IDP:
+            move_idp(values, x, step, d, out)
+        else:
+            move_point3(values, x, step, d, out)
+
+
+@kernel("int64(int64, int64, int64[:,::1], int64[::1], int64[::1], int64[::1])")
+def differing(old: int, count: int, var: I64, before: I64, values: I64, out: I64) -> int:
+    """List in `out` the variables whose values differ from `before`, and all from `old` on; gives how many.
+
+    The values are given as the integers that their bits are, so that −0.0 is not 0.0.
+    """
+    n = 0
+    for v in range(count):
+        x = var[v, at.V_AT]
+        if v >= old or differs(x, size_of(var[v, at.V_KIND]), before, values):
+            out[n] = v
+            n += 1
+    return n
+
+
+@inline_kernel
+def differs(x: int, size: int, a: I64, b: I64) -> bool:
+    """Whether any of `size` numbers from offset x on differ."""
+    for c in range(size):  # noqa: SIM110  (compiled)
+        if a[x + c] != b[x + c]:
+            return True
+    return False
+
+
+@kernel("int64(int64[::1], int64[::1])")
+def label_of(picked: I64, graph: I64) -> int:
+    """2 · kind of the picked variables, and 1 more where they are fixed; −1: they differ, or there are none."""
+    var, label = int_rows(graph, at.T_VAR), -1
+    for n in range(picked.size):
+        own = 2 * var[picked[n], at.V_KIND] + int(var[picked[n], at.V_COLUMN] < 0)
+        if n > 0 and own != label:
+            return -1
+        label = own
+    return label
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1], float64[:,::1])")
+def gather(picked: I64, graph: I64, out_keys: I64, out_values: F64) -> None:
+    """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
+
+    graph: the table of its arenas (`places`).  Without room in out_keys only the values.
+    """
+    var, keys, values = int_rows(graph, at.T_VAR), ints(graph, at.T_KEYS), floats(graph, at.T_VALUES)
+    size, out = out_values.shape[1], out_values.reshape(-1)
+    n = 0
+    while n < picked.size:
+        v, run = picked[n], 1
+        while n + run < picked.size and picked[n + run] == v + run:
+            run += 1
+        x = var[v, at.V_AT]
+        for k in range(run if out_keys.size > 0 else 0):
+            out_keys[n + k] = keys[v + k]
+        for c in range(run * size):
+            out[n * size + c] = values[x + c]
+        n += run
+
+
+@kernel("float64(float64[::1], float64[::1])")
+def inner(a: F64, b: F64) -> float:
+    """aᵀ b, on one core: a threaded BLAS would wake the others for it."""
+    total = 0.0
+    for k in range(a.size):
+        total += a[k] * b[k]
+    return total

@@ -1,0 +1,1 @@
+"""Sparse Cholesky in fronts: minimum degree, symbolic analysis, multifrontal factorization, triangular solves."""

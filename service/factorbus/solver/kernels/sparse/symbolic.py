@@ -1,0 +1,348 @@
+"""From a pattern and an elimination order to fronts: elimination tree, counts, amalgamation, maps.
+
+The tree is Liu's with path compression; the structure of a row is found by walking the tree from its entries.  Columns
+are joined into fronts bottom-up, first where no zero appears, then where few do; zeros are counted over all that was
+joined so far, or a chain would collapse into one giant front.
+"""
+
+import numpy as np
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.sparse import fronts as fr
+
+NONE = -1
+SMALL_PIVOTS, SMALL_ZEROS = 12, 1.0 / 3.0
+ZEROS = 0.08
+
+
+@kernel(
+    "Tuple((int64[::1], int64[::1], int64[:,::1], int64[:,::1], int64[::1], int64[:,::1], int64[::1], float64[::1]))"
+    "(int64[::1], int64[::1], int64[::1], int64[::1])"
+)
+def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
+    """The fronts of Λ eliminated in the order `perm`, or in one with the same fill that suits them better.
+
+    in   dims (n,)   rows, cols (nb,): blocks, diagonal ones included   perm (n,)
+    out  order (n,): variables as eliminated   place (n,): first scalar of each variable in elimination order
+         fronts, runs, blocks: records (see `fronts`)   border: scalars in elimination order
+         sizes (2,): doubles of R, doubles of the arena   work (2,): nonzeros of R, flops
+    """
+    n = dims.size
+    label, dim = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        label[perm[k]], dim[k] = k, dims[perm[k]]
+    begin, earlier = by_later(n, label, rows, cols)
+    parent = elimination_tree(n, begin, earlier)
+    variables, scalars = count_rows(n, begin, earlier, parent, dim)
+    top_of, pivots = join_columns(n, parent, dim, scalars)
+    order, home, tops, front_of = arrange_fronts(n, perm, parent, top_of)
+    work = _work(n, dim, scalars)
+
+    first_scalar = np.empty(n + 1, np.int64)
+    first_scalar[0] = 0
+    for k in range(n):
+        label[order[k]], dim[k] = k, dims[order[k]]
+        first_scalar[k + 1] = first_scalar[k] + dim[k]
+    records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
+    sizes = _place(records)
+    begin, earlier = by_later(n, label, rows, cols)
+    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
+    border = _border_scalars(records, border_at, border_of, dim, first_scalar)
+    runs, blocks = _maps(label, rows, cols, dim, first_scalar, border_at, border_of, records)
+    place = np.empty(n, np.int64)
+    for v in range(n):
+        place[v] = first_scalar[label[v]]
+    return order, place, records, runs, border, blocks, sizes, work
+
+
+@part
+def by_later(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
+    """Off-diagonal blocks sorted by the end that is eliminated later; gives the other ends."""
+    begin = np.zeros(n + 2, np.int64)
+    for b in range(rows.size):
+        if rows[b] != cols[b]:
+            begin[max(label[rows[b]], label[cols[b]]) + 2] += 1
+    for k in range(n):
+        begin[k + 2] += begin[k + 1]
+    earlier = np.empty(begin[n + 1], np.int64)
+    for b in range(rows.size):
+        i, j = label[rows[b]], label[cols[b]]
+        if i != j:
+            earlier[begin[max(i, j) + 1]] = min(i, j)
+            begin[max(i, j) + 1] += 1
+    return begin, earlier
+
+
+@part
+def elimination_tree(n: int, begin: I64, earlier: I64) -> I64:
+    """The elimination tree: parent[k] is the first off-diagonal entry in row k of R."""
+    parent, ancestor = np.empty(n, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        parent[i] = ancestor[i] = NONE
+        for e in range(begin[i], begin[i + 1]):
+            k = earlier[e]
+            while k != NONE and k < i:
+                above, ancestor[k] = ancestor[k], i
+                if above == NONE:
+                    parent[k] = i
+                k = above
+    return parent
+
+
+@part
+def count_rows(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple[I64, I64]:
+    """Off-diagonal variables and scalars in row k of R."""
+    variables, scalars, seen = np.zeros(n, np.int64), np.zeros(n, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        seen[i] = i
+        for e in range(begin[i], begin[i + 1]):
+            k = earlier[e]
+            while seen[k] != i:
+                variables[k] += 1
+                scalars[k] += dim[i]
+                seen[k] = i
+                k = parent[k]
+    return variables, scalars
+
+
+@part
+def join_columns(n: int, parent: I64, dim: I64, border: I64) -> tuple[I64, I64]:
+    """Join columns into fronts: the last column of each column's front, and the pivot scalars of that front."""
+    into, pivots, entries = np.empty(n, np.int64), dim.copy(), np.empty(n, np.int64)
+    for k in range(n):
+        into[k] = k
+        entries[k] = dim[k] * (dim[k] + 1) // 2 + dim[k] * border[k]
+    for relaxed in range(2):
+        for k in range(n):
+            if into[k] != k or parent[k] == NONE:
+                continue
+            q = _top(into, parent[k])
+            both = pivots[k] + pivots[q]
+            room, true = both * (both + 1) // 2 + both * border[q], entries[k] + entries[q]
+            zeros = room - true
+            if zeros == 0 or (
+                relaxed == 1 and (zeros <= ZEROS * room or (both <= SMALL_PIVOTS and zeros <= SMALL_ZEROS * room))
+            ):
+                into[k], pivots[q], entries[q] = q, both, true
+    for k in range(n - 1, -1, -1):
+        into[k] = into[into[k]]
+    return into, pivots
+
+
+@inline_kernel
+def _top(into: I64, k: int) -> int:
+    while into[k] != k:
+        into[k] = into[into[k]]
+        k = into[k]
+    return k
+
+
+@part
+def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I64, I64, I64]:
+    """Number the fronts in postorder, their columns one after another.
+
+    order (n,): the variables so   home (n,): the front of each   tops: the old last column of each front
+    front_of (n,): the front of each old last column
+    """
+    child, sibling, count = np.full(n, NONE), np.full(n, NONE), np.zeros(n, np.int64)
+    for k in range(n - 1, -1, -1):
+        count[top_of[k]] += 1
+        if top_of[k] == k and parent[k] != NONE:
+            above = top_of[parent[k]]
+            sibling[k], child[above] = child[above], k
+    front_of, tops, put, fronts, placed = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64), 0, 0
+    for root in range(n):
+        if top_of[root] != root or parent[root] != NONE:
+            continue
+        k = root
+        while k != NONE:
+            if child[k] != NONE:
+                below = child[k]
+                child[k] = sibling[below]
+                k = below
+            else:
+                front_of[k], tops[fronts], put[k] = fronts, k, placed
+                placed += count[k]
+                fronts += 1
+                k = top_of[parent[k]] if parent[k] != NONE else NONE
+    order, home = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        t = top_of[k]
+        order[put[t]], home[put[t]] = perm[k], front_of[t]
+        front_of[k] = front_of[t]
+        put[t] += 1
+    return order, home, tops[:fronts], front_of
+
+
+@part
+def _work(n: int, dim: I64, border: I64) -> F64:
+    """Nonzeros of R and the flops to make it (the sum of squared row lengths), zeros of joined fronts not counted."""
+    work = np.zeros(2)
+    for k in range(n):
+        for i in range(dim[k]):
+            row = float(border[k] + dim[k] - i)
+            work[0] += row
+            work[1] += row * row
+    return work
+
+
+@part
+def make_records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, border: I64, first_scalar: I64) -> I64:
+    """The front records without places and maps."""
+    records = np.zeros((tops.size, fr.FRONT), np.int64)
+    for k in range(home.size - 1, -1, -1):
+        records[home[k], fr.VARIABLE], records[home[k], fr.COLUMN] = k, first_scalar[k]
+    for f in range(tops.size - 1, -1, -1):
+        front, above = records[f], parent[tops[f]]
+        front[fr.PIVOTS], front[fr.BORDER] = pivots[tops[f]], border[tops[f]]
+        front[fr.PARENT] = front_of[above] if above != NONE else NONE
+        front[fr.CHILD] = front[fr.SIBLING] = NONE
+        if above != NONE:
+            above = front_of[above]
+            front[fr.SIBLING], records[above, fr.CHILD] = records[above, fr.CHILD], f
+    return records
+
+
+@part
+def _place(records: I64) -> I64:
+    """Give the rows of R and the update matrices their places; gives the doubles of R and of the whole arena.
+
+    Update matrices live on two stacks, those of even and of odd depth: when a front is made its children lie on top of
+    the one and it goes on top of the other, so nothing is ever moved.
+    """
+    fronts = records.shape[0]
+    depth = np.zeros(fronts, np.int64)
+    for f in range(fronts - 1, -1, -1):
+        if records[f, fr.PARENT] != NONE:
+            depth[f] = (depth[records[f, fr.PARENT]] + 1) % 2
+    top, peak, end = np.zeros(2, np.int64), np.zeros(2, np.int64), fr.SCRATCH
+    for f in range(fronts):
+        front = records[f]
+        p, m = front[fr.PIVOTS], front[fr.BORDER]
+        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded(p) + m), fr.padded(m)
+        front[fr.ROWS] = end + fr.padded(p) - p
+        end += p * front[fr.LD_ROWS]
+        if front[fr.CHILD] != NONE:
+            top[1 - depth[f]] = records[front[fr.CHILD], fr.UPDATE]
+        front[fr.UPDATE] = top[depth[f]]
+        top[depth[f]] += fr.update_size(m, front[fr.WIDTH_UPDATE])
+        peak[depth[f]] = max(peak[depth[f]], top[depth[f]])
+    for f in range(fronts):
+        records[f, fr.UPDATE] += end + (peak[0] if depth[f] == 1 else 0)
+    sizes = np.empty(2, np.int64)
+    sizes[0], sizes[1] = end, end + peak[0] + peak[1]
+    return sizes
+
+
+@part
+def list_borders(
+    n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: I64, records: I64
+) -> tuple[I64, I64]:
+    """The border variables of each front, ascending: walk the tree of fronts from every entry of every row."""
+    fronts = tops.size
+    at = np.zeros(fronts + 1, np.int64)
+    for f in range(fronts):
+        at[f + 1] = at[f] + variables[tops[f]]
+    of, put, seen = np.empty(at[fronts], np.int64), at[:fronts].copy(), np.full(fronts, NONE)
+    for i in range(n):
+        seen[home[i]] = i
+        for e in range(begin[i], begin[i + 1]):
+            f = home[earlier[e]]
+            while seen[f] != i:
+                of[put[f]] = i
+                put[f] += 1
+                seen[f] = i
+                f = records[f, fr.PARENT]
+    return at, of
+
+
+@part
+def _border_scalars(records: I64, border_at: I64, border_of: I64, dim: I64, first_scalar: I64) -> I64:
+    """The border scalars of each front, ascending."""
+    total = 0
+    for f in range(records.shape[0]):
+        records[f, fr.BORDER_AT] = total
+        total += records[f, fr.BORDER]
+    border, put = np.empty(total, np.int64), 0
+    for e in range(border_at[-1]):
+        for i in range(dim[border_of[e]]):
+            border[put] = first_scalar[border_of[e]] + i
+            put += 1
+    return border
+
+
+@part
+def _maps(
+    label: I64, rows: I64, cols: I64, dim: I64, first_scalar: I64, border_at: I64, border_of: I64, records: I64
+) -> tuple[I64, I64]:
+    """Where the blocks of Λ and the update matrices of the children go, front by front."""
+    n, fronts = dim.size, records.shape[0]
+    begin, block_of = _by_earlier(n, label, rows, cols)
+    column = np.empty(n, np.int64)  # of the variables of the present front
+    runs, blocks = np.empty((border_of.size, fr.RUN), np.int64), np.empty((rows.size, fr.BLOCK), np.int64)
+    run, block = 0, 0
+    for f in range(fronts):
+        front = records[f]
+        first, last = front[fr.VARIABLE], records[f + 1, fr.VARIABLE] if f + 1 < fronts else n
+        width = 0
+        for k in range(first, last):
+            column[k] = width
+            width += dim[k]
+        for e in range(border_at[f], border_at[f + 1]):
+            column[border_of[e]] = width
+            width += dim[border_of[e]]
+        front[fr.BLOCKS] = block
+        for e in range(begin[first], begin[last]):
+            b = block_of[e]
+            _block(blocks, block, b, label[rows[b]], label[cols[b]], dim, column, front[fr.ROWS], front[fr.LD_ROWS])
+            block += 1
+        front[fr.BLOCKS_END] = block
+        c = front[fr.CHILD]
+        while c != NONE:
+            records[c, fr.RUNS] = run
+            run = _runs(runs, run, border_of, border_at[c], border_at[c + 1], dim, column, front[fr.PIVOTS])
+            records[c, fr.RUNS_END] = run
+            c = records[c, fr.SIBLING]
+    return runs[:run].copy(), blocks
+
+
+@part
+def _by_earlier(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
+    """Blocks sorted by the end that is eliminated first."""
+    begin = np.zeros(n + 2, np.int64)
+    for b in range(rows.size):
+        begin[min(label[rows[b]], label[cols[b]]) + 2] += 1
+    for k in range(n):
+        begin[k + 2] += begin[k + 1]
+    block_of = np.empty(rows.size, np.int64)
+    for b in range(rows.size):
+        k = min(label[rows[b]], label[cols[b]])
+        block_of[begin[k + 1]] = b
+        begin[k + 1] += 1
+    return begin, block_of
+
+
+@inline_kernel
+def _block(out: I64, at: int, b: int, i: int, j: int, dim: I64, column: I64, r: int, ld: int) -> None:
+    """Block b of Λ, between the variables labelled i and j."""
+    upper, later = min(i, j), max(i, j)
+    out[at, 0] = b
+    out[at, 1] = r + column[upper] * ld + column[later]
+    out[at, 2], out[at, 3] = dim[upper], dim[later]
+    out[at, 4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
+
+
+@inline_kernel
+def _runs(runs: I64, run: int, border_of: I64, begin: int, end: int, dim: I64, column: I64, pivots: int) -> int:
+    """Join neighbours of a child's border that stay neighbours in the parent; gives the next free run."""
+    first, stop = 0, NONE
+    for e in range(begin, end):
+        v = border_of[e]
+        if column[v] == stop and stop != pivots:
+            runs[run - 1, 1] += dim[v]
+        else:
+            runs[run, 0], runs[run, 1], runs[run, 2] = first, dim[v], column[v]
+            run += 1
+        stop = column[v] + dim[v]
+        first += dim[v]
+    return run

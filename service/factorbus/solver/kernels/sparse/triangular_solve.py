@@ -1,0 +1,76 @@
+"""Solving with the fronts of R: RᵀR δ = η."""
+
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
+from factorbus.solver.kernels.jit.simd import at, put
+from factorbus.solver.kernels.sparse import fronts as fr
+
+
+@kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
+def solve_lower(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+    """x = R⁻ᵀx in place, from the leaves to the roots; scalars in elimination order.
+
+    room: at least as long as the longest border
+    """
+    for f in range(fronts.shape[0]):
+        front = fronts[f]
+        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.BORDER], front[fr.COLUMN]
+        forward_front(arena, r, ld, p, m, x, k, room)
+        b = front[fr.BORDER_AT]
+        for j in range(m):
+            x[border[b + j]] -= at(room, j)
+
+
+@kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
+def solve_upper(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+    """x = R⁻¹x in place, from the roots to the leaves; otherwise as `solve_lower`."""
+    for f in range(fronts.shape[0] - 1, -1, -1):
+        front = fronts[f]
+        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.BORDER], front[fr.COLUMN]
+        b = front[fr.BORDER_AT]
+        for j in range(m):
+            put(room, j, x[border[b + j]])
+        backward_front(arena, r, ld, p, m, x, k, room)
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1], float64[::1], float64[::1])")
+def into_elimination_order(place: I64, starts: I64, dims: I64, given: F64, x: F64) -> None:
+    """x[place] = given, variable by variable."""
+    for v in range(place.size):
+        for i in range(dims[v]):
+            put(x, place[v] + i, at(given, starts[v] + i))
+
+
+@kernel("void(int64[::1], int64[::1], int64[::1], float64[::1], float64[::1])")
+def into_insertion_order(place: I64, starts: I64, dims: I64, x: F64, out: F64) -> None:
+    """out = x[place], variable by variable."""
+    for v in range(place.size):
+        for i in range(dims[v]):
+            put(out, starts[v] + i, at(x, place[v] + i))
+
+
+@inline_kernel
+def forward_front(a: F64, r: int, ld: int, p: int, m: int, x: F64, k: int, room: F64) -> None:
+    """x[k : k+p] = R⁻ᵀ x[k : k+p];  room[: m] = Sᵀ x[k : k+p]"""
+    for j in range(m):
+        put(room, j, 0.0)
+    for i in range(p):
+        row = r + i * ld
+        y = at(x, k + i) / at(a, row + i)
+        put(x, k + i, y)
+        for j in range(i + 1, p):
+            put(x, k + j, at(x, k + j) - at(a, row + j) * y)
+        for j in range(m):
+            put(room, j, at(room, j) + at(a, row + p + j) * y)
+
+
+@inline_kernel
+def backward_front(a: F64, r: int, ld: int, p: int, m: int, x: F64, k: int, room: F64) -> None:
+    """x[k : k+p] = R⁻¹ (x[k : k+p] − S room[: m])"""
+    for i in range(p - 1, -1, -1):
+        row = r + i * ld
+        dot = 0.0
+        for j in range(m):
+            dot += at(a, row + p + j) * at(room, j)
+        for j in range(i + 1, p):
+            dot += at(a, row + j) * at(x, k + j)
+        put(x, k + i, (at(x, k + i) - dot) / at(a, row + i))

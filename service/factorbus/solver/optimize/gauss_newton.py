@@ -1,0 +1,240 @@
+"""Gauss-Newton, and Levenberg-Marquardt where a step would raise χ².  MATH §6.
+
+The problem is a protocol, so the rules that accept and stop can be read, and tested, apart from the graph.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from factorbus.solver.kernels.jit.compile import F64
+
+_FIRST_DAMPING = 1e-5
+_LEAST_DAMPING = 1e-7
+_MOST_DAMPING = 1e12
+# A predicted decrease below this share of χ², or below this, may be lost in the rounding of χ² itself.
+_ROUNDING = 1e-11
+_ROUNDING_FLOOR = 1e-12
+# Below these δ, too, is rounding: a settled map that is settled again does not move.
+_EXACT, _EXACT_FLOOR = 1e-21, 1e-24
+
+
+class Problem(Protocol):
+    """A sum of squares at a linearisation point."""
+
+    def factorize(self, damping: float) -> int:
+        """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed."""
+        ...
+
+    def decrease(self) -> float:
+        """dᵀd = δᵀη by the factor made last and the present gradient: what the model says a step takes off χ²."""
+        ...
+
+    def step(self) -> F64:
+        """The δ of the last `decrease`."""
+        ...
+
+    def linearise_at(self, step: F64) -> float:
+        """χ² at x ⊞ δ, where it is linearised too, aside."""
+        ...
+
+    def accept(self) -> None:
+        """Move to the point linearised last."""
+        ...
+
+    def keep(self) -> None:
+        """Remember the present point."""
+        ...
+
+    def go_back(self) -> None:
+        """Move to the point that was kept, and linearise there anew."""
+        ...
+
+
+class LinearProblem(Problem, Protocol):
+    """A problem that can stay linearised where it was."""
+
+    def accept_linear(self) -> None:
+        """Move to the point linearised last, but keep the linear model: its gradient is zero there."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """When to stop: the next step would lower χ² by less than `tolerance` χ² + `floor`; or after `limit` tries.
+
+    reuse: the old factor makes another step while each is to gain less than this share of the one before.
+    polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
+    nonmonotone: where the first undamped step would raise χ², at most this many in a row are made all the same, until
+    χ² is lower than before them; if it never is, they are taken back.
+    """
+
+    tolerance: float
+    floor: float
+    limit: int
+    reuse: float = 0.0
+    polish: int = 0
+    nonmonotone: int = 0
+
+    def is_negligible(self, decrease: float, chi2: float) -> bool:
+        """Whether a decrease of χ² is not worth a step.  False for NaN."""
+        return decrease <= self.tolerance * chi2 + self.floor
+
+
+@dataclass(slots=True)
+class Course:
+    """How a minimisation went.
+
+    failed: the block column whose pivot failed in the last factorisation, or −1.  left: what the next undamped step
+    would take off χ², as predicted last; infinite where that is not known.
+    """
+
+    chi2: float
+    damping: float
+    iterations: int = 0
+    factorisations: int = 0
+    converged: bool = False
+    failed: int = -1
+    left: float = math.inf
+
+
+def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
+    """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
+
+    Each try: 1. factorise and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
+    3. linearise at its end; 4. accept it if χ² does not rise there, else factorise with more damping, or go over the
+    hill where `rule` has non-monotone steps.  5. After an undamped step the old factor with the new gradient gives, for
+    the price of one solve, what another step would gain: nothing, and the loop ends; little, and that step is tried as
+    it is; else Λ has changed and is factorised anew.
+    With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
+    it begins without `damping`, which counts once they have been taken back.
+    """
+    hills = rule.nonmonotone
+    course = Course(chi2, 0.0 if hills else damping)
+    decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
+    for _ in range(rule.limit):
+        if not solved:
+            course.factorisations += 1
+            course.failed = problem.factorize(course.damping)
+            if course.failed >= 0:
+                if _damp_more(course):
+                    continue
+                break
+            decrease, fresh = problem.decrease(), True
+        undamped = course.damping == 0.0
+        course.left = decrease if undamped else math.inf
+        if undamped and rule.is_negligible(decrease, course.chi2):
+            course.converged = True
+            break
+        reached = problem.linearise_at(problem.step())
+        solved = False
+        if not reached <= course.chi2:
+            if not fresh:
+                continue
+            course.converged = undamped and _is_rounding(decrease, course.chi2)
+            if course.converged:
+                break
+            if undamped and hills:
+                over, hills = _go_over_hill(problem, course, reached, hills), 0
+                if over:
+                    continue
+                if damping > 0.0:
+                    course.damping = damping
+                    continue
+            if not _damp_more(course):
+                break
+            continue
+        problem.accept()
+        course.iterations += 1
+        gained, course.chi2 = course.chi2 - reached, reached
+        _damp_less(course, gained, expected=decrease)
+        if undamped:
+            decrease, fresh = problem.decrease(), False
+            course.left = decrease
+            if gained == 0.0:
+                course.converged = True
+                break
+            solved = decrease <= rule.reuse * gained or rule.is_negligible(decrease, reached)
+    else:
+        # The last try may have been all that was needed.
+        course.converged = course.damping == 0.0 and solved and rule.is_negligible(decrease, course.chi2)
+    if course.converged and course.damping == 0.0 and rule.polish:
+        _polish(problem, course, rule.polish)
+    return course
+
+
+def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
+    """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
+    course = Course(chi2, 0.0, factorisations=1, converged=True)
+    if problem.factorize(0.0) >= 0:
+        return None
+    if rule.is_negligible(problem.decrease(), chi2):
+        return course
+    reached = problem.linearise_at(problem.step())
+    if not reached <= chi2:
+        return None
+    problem.accept_linear()
+    course.chi2, course.iterations = reached, 1
+    return course
+
+
+def _go_over_hill(problem: Problem, course: Course, reached: float, most: int) -> bool:
+    """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
+    first, which led to χ² `reached`.
+
+    What turns by much in one step is far off in the model of the second order: χ² rises in the first step, as the
+    turned parts are stretched, and the next ones make them right.  Damped steps go around that hill in hundreds.
+    """
+    problem.keep()
+    for made in range(1, most + 1):
+        if not math.isfinite(reached):
+            break
+        problem.accept()
+        if reached < course.chi2:
+            course.chi2, course.iterations = reached, course.iterations + made
+            return True
+        course.factorisations += 1
+        if problem.factorize(0.0) >= 0 or _is_rounding(problem.decrease(), reached):
+            break
+        reached = problem.linearise_at(problem.step())
+    problem.go_back()
+    return False
+
+
+def _polish(problem: Problem, course: Course, most: int) -> None:
+    """Steps by the old factor, which is nearly that of the optimum: δ is exact to more digits than χ² has."""
+    last = math.inf
+    for _ in range(most):
+        decrease = problem.decrease()
+        if decrease <= _EXACT * course.chi2 + _EXACT_FLOOR or not decrease <= 0.9 * last:
+            return
+        reached = problem.linearise_at(problem.step())
+        if not _is_rounding(reached - course.chi2, course.chi2):
+            return
+        problem.accept()
+        course.iterations += 1
+        course.chi2, last = reached, decrease
+
+
+def _is_rounding(decrease: float, chi2: float) -> bool:
+    """Whether χ² cannot show a decrease of this size."""
+    return decrease <= _ROUNDING * chi2 + _ROUNDING_FLOOR
+
+
+def _damp_more(course: Course) -> bool:
+    """Ten times the damping; False: that has no use any more, and whoever tries again starts without any."""
+    course.damping = max(10.0 * course.damping, _FIRST_DAMPING)
+    if course.damping > _MOST_DAMPING:
+        course.damping = 0.0
+        return False
+    return True
+
+
+def _damp_less(course: Course, gained: float, expected: float) -> None:
+    """After a good step: less damping where the model was right, more where it was poor."""
+    if gained < 0.25 * expected:
+        course.damping *= 2.0
+    else:
+        course.damping *= 0.1
+    if course.damping < _LEAST_DAMPING:
+        course.damping = 0.0

@@ -1,0 +1,25 @@
+"""When the minimisation of a step stops, by the solver's options and what the step is for.  MATH §6."""
+
+from factorbus.solver.kernels.bayes_tree.step import FINISHED
+from factorbus.solver.optimize.gauss_newton import Rule
+from factorbus.solver.options import Options
+
+_POLISH = 100
+
+
+def ordinary_rule(options: Options, tolerance: float) -> Rule:
+    """Of a step with something new."""
+    return Rule(tolerance, options.negligible, options.max_iterations, nonmonotone=options.nonmonotone_steps)
+
+
+def further_rule(options: Options, tolerance: float) -> Rule:
+    """Of a step with nothing new: until another one would take no more off χ² than `FINISHED` of it."""
+    return ordinary_rule(options, min(FINISHED, tolerance))
+
+
+def settling_rule(options: Options) -> Rule:
+    """Of a step that was asked to settle: to more digits than χ² has."""
+    return Rule(
+        options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH,
+        nonmonotone=options.nonmonotone_steps,
+    )  # fmt: skip

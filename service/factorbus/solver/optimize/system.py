@@ -1,0 +1,163 @@
+"""The least-squares problem of a graph as Gauss-Newton sees it: a point, normal equations, a step, a trial."""
+
+import numpy as np
+
+from factorbus.solver import errors
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.inc_l.incremental import Incremental
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.retract import differing, move
+from factorbus.solver.report import Stopwatch
+from factorbus.solver.sparse.anchors import find_loose
+from factorbus.solver.sparse.blocks import Blocks
+
+_FREE_DIRECTION = (
+    "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
+)
+
+
+class System:
+    """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
+
+    NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
+
+    def __init__(self, graph: Graph, factor: Incremental) -> None:
+        self.graph = graph
+        self.blocks = Blocks()
+        self.factor = factor
+        self._before: F64 = np.zeros(0)
+        self._kept: F64 = np.zeros(0)
+        self._trial: F64 = np.zeros(0)
+        self._moved = False
+        self._have_lambda, self.drifted = True, False
+        self._spare_is_here = False
+        self.drifted = False  # η is that of the linear model, not of the present point
+        self._suspects: I64 = np.zeros(0, np.int64)
+        self._watch = Stopwatch(None)
+
+    def begin(self, suspects: I64, watch: Stopwatch) -> None:
+        """Remember the values as they are; `suspects` are variables whose place Λ has yet to prove."""
+        values = self.graph.values
+        if self._trial.size < values.size:
+            self._before, self._trial = np.zeros_like(values), np.zeros_like(values)
+        used = int(self.graph.counts[at.VALUES])
+        self._before[:used] = values[:used]
+        self._moved, self._suspects, self._watch = False, suspects, watch
+        self._spare_is_here = False
+
+    def factorize(self, damping: float) -> int:
+        """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed.  Raises Underconstrained."""
+        if not self.drifted:
+            self.have_lambda()
+        failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
+        if self._suspects.size and damping == 0.0:
+            if failed >= 0:
+                raise self.underconstrained(self.variable_of(failed))
+            loose = find_loose(self.graph, self.blocks, self._suspects, self._solve)
+            if loose >= 0:
+                raise self.underconstrained(loose)
+            self._suspects = self._suspects[:0]
+        return failed
+
+    def decrease(self) -> float:
+        """dᵀd = δᵀη by the factor made last and the present gradient."""
+        return self.factor.decrease(self.blocks.eta[: self.graph.counts[at.SCALARS]], self._watch)
+
+    def step(self) -> F64:
+        """The δ of the last `decrease`."""
+        return self.factor.step(self._watch)
+
+    def linearise_at(self, step: F64) -> float:
+        """χ² at x ⊞ δ, linearised there aside."""
+        move(int(self.graph.counts[at.VARIABLES]), self.graph.var, self.graph.values, step, self._trial)
+        self._watch.lap("move")
+        self._spare_is_here = False
+        chi2 = self.blocks.relinearise(self.graph, self._trial)
+        self._watch.lap("linearise")
+        return chi2
+
+    def accept(self) -> None:
+        """Move to the point linearised last: η is that of the new point, Λ stays until it is asked for."""
+        self.graph.values, self._trial = self._trial, self.graph.values
+        self.blocks.swap_eta()
+        self.factor.turned()
+        self._have_lambda, self._spare_is_here, self._moved = False, True, True
+
+    def keep(self) -> None:
+        """Remember the values as they are."""
+        self._kept = self.graph.values[: self.graph.counts[at.VALUES]].copy()
+
+    def go_back(self) -> None:
+        """The values that were kept; Λ and η are made there anew."""
+        self.graph.values[: self._kept.size] = self._kept
+        self.anew()
+
+    def accept_linear(self) -> None:
+        """Move to the point linearised last; Λ, R and the linear model stay, whose gradient is zero there."""
+        self.graph.values, self._trial = self._trial, self.graph.values
+        self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
+        self.factor.rest()
+        self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
+
+    def relinearise(self) -> None:
+        """Λ and η at the present point, if they are not."""
+        if self.drifted:
+            self.have_lambda()
+            self.blocks.swap_eta()
+            self.drifted = False
+
+    def have_lambda(self) -> None:
+        """Λ at the present point (haveΛ of the 2013 paper)."""
+        if self._have_lambda:
+            return
+        if not self._spare_is_here:
+            self.blocks.relinearise(self.graph, self.graph.values)
+            self._watch.lap("linearise")
+        self.blocks.swap_lambda()
+        self.factor.moved()
+        self._have_lambda, self._spare_is_here = True, False
+
+    def anew(self) -> None:
+        """Λ and η at the present point: what the factors measure, or weigh, is other than it was."""
+        self._have_lambda, self._spare_is_here = False, False
+        self.have_lambda()
+        self.blocks.swap_eta()
+
+    def end(self, old: int) -> I64:
+        """The variables whose values have other bits than at `begin`, and those from index `old` on."""
+        count = int(self.graph.counts[at.VARIABLES])
+        changed = np.empty(count, np.int64)
+        before, values = self._before.view(np.int64), self.graph.values.view(np.int64)
+        changed = changed[: differing(old, count, self.graph.var, before, values, changed)]
+        self._moved = False
+        self._watch.lap("compare")
+        return changed
+
+    def take_back(self, fill: tuple[int, int]) -> None:
+        """Values as at `begin`, Λ and η as when the pattern had `fill`; the graph is back at that moment already."""
+        if self._moved:
+            used = int(self.graph.counts[at.VALUES])
+            self.graph.values[:used] = self._before[:used]
+            self._moved = False
+        self.blocks.forget(self.graph, fill)
+        self._have_lambda, self.drifted = True, False
+        self.factor.forget()
+
+    def memory_bytes(self) -> int:
+        """Bytes in use for Λ, η (both twice) and R."""
+        blocks, numbers = self.blocks.fill.tolist()
+        scalars = int(self.graph.counts[at.SCALARS])
+        return 8 * (3 * blocks + 2 * (numbers + scalars)) + self.factor.memory_bytes()
+
+    def underconstrained(self, variable: int, missing: str = _FREE_DIRECTION) -> errors.Underconstrained:
+        """The error that names `variable`, its factors, and what is missing."""
+        return errors.Underconstrained(int(self.graph.keys[variable]), self.graph.factors_of(variable), missing)
+
+    def variable_of(self, column: int) -> int:
+        """The variable that has this block column."""
+        return int(np.flatnonzero(self.graph.var[: self.graph.counts[at.VARIABLES], at.V_COLUMN] == column)[0])
+
+    def _solve(self, eta: F64) -> F64:
+        self.factor.decrease(eta, self._watch)
+        return self.factor.step(self._watch)

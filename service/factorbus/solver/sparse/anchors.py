@@ -1,0 +1,70 @@
+"""Is every variable held by something?  Checked before a factorisation would fail, or survive by luck.  MATH §7.
+
+Variables that earlier steps took in are held.  A new one is when it is fixed, has a prior, is joined to a held pose by
+a between factor, seen from a held pose, or fixed by several factors on what is held.  Those that this finds are held;
+the others ("suspects") may still be, which only the numbers can tell: `find_loose` asks the factor of Λ.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.kernels.graph.initialize import join, reach
+from factorbus.solver.kernels.graph.observability import hold
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.sparse.blocks import Blocks
+
+# A variance this many times what the variable's own factors alone would leave is no longer a number.
+_LOOSE = 1e12
+_NONE = np.empty(0, np.int64)
+
+
+def find_unheld(graph: Graph, since: Mark) -> I64:
+    """The free variables after `since` that neither a chain of factors holds, nor several on what is held."""
+    first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
+    if first == last:
+        return _NONE
+    held = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
+    factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
+    arenas = graph.var, graph.fac, graph.values, graph.payload
+    while reach(False, first, *factors, *arenas, held) >= 0:
+        if not hold(first, *factors, *arenas, held):
+            break
+    else:
+        return _NONE
+    return first + np.flatnonzero(held == 0)
+
+
+def find_unanchored(graph: Graph, since: Mark) -> int:
+    """A variable after `since` that no factors join, however indirectly, to one that is fixed or has a prior; or −1."""
+    first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
+    factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
+    anchored = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
+    fac = graph.fac[factors[0] : factors[1]]
+    priors = fac[fac[:, at.F_J] < 0, at.F_I]
+    anchored[priors[priors >= first] - first] = 1
+    return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
+
+
+def find_loose(graph: Graph, blocks: Blocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
+    """The suspect that Λ leaves free to move, or −1.
+
+    `solve` gives Λ⁻¹ b.  With D = diag Λ and signs s on the suspects, y = D½ Λ⁻¹ D½ s is of the size of the inverse of
+    the smallest eigenvalue of the normalised matrix, along the direction that is free.
+    """
+    scalars = int(graph.counts[at.SCALARS])
+    rows = graph.var[suspects]
+    probe, scale = np.zeros(scalars), np.zeros(scalars)
+    signs = np.random.default_rng(1).choice((-1.0, 1.0), scalars)
+    for row in rows:
+        dim = int(graph.dims[row[at.V_COLUMN]])
+        start, diagonal = int(row[at.V_SCALAR]), int(row[at.V_DIAGONAL])
+        scale[start : start + dim] = np.sqrt(blocks.data[diagonal : diagonal + dim * dim : dim + 1])
+    np.multiply(scale, signs, out=probe)
+    answer = np.abs(scale * solve(probe))
+    loosest = int(np.argmax(np.where(np.isfinite(answer), answer, np.inf)))
+    if answer[loosest] <= _LOOSE:
+        return -1
+    return int(suspects[np.searchsorted(rows[:, at.V_SCALAR], loosest, side="right") - 1])

@@ -1,0 +1,99 @@
+"""Λ and η in blocks, kept incrementally.  MATH §4.
+
+Λ's pattern grows with variables and factors; its numbers are in one arena, each block row-major where the pattern says.
+There are two copies of the numbers: the present ones, and a spare where a trial step is linearised, so that a step that
+is not accepted costs nothing to undo.
+"""
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import Graph, Mark, grown, table_size
+from factorbus.solver.kernels.graph.block_pattern import connect, enter_blocks, remove_blocks
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import linearise
+
+
+class Blocks:
+    """The normal equations Λ δ = η of a graph's free variables, linearised at given values."""
+
+    NOT_KEPT = ("_spare_data", "_spare_eta")
+
+    def __init__(self) -> None:
+        self.pattern: I64 = np.empty((3, 32), np.int64)
+        self.table: I64 = np.zeros(64, np.int64)
+        self.fill: I64 = np.zeros(2, np.int64)  # blocks and numbers in use
+        self.data: F64 = np.zeros(256)
+        self.eta: F64 = np.zeros(64)
+        self._spare_data: F64 = np.zeros(0)
+        self._spare_eta: F64 = np.zeros(0)
+
+    @property
+    def rows(self) -> I64:
+        """Block row of each block (a free variable in insertion order)."""
+        return self.pattern[0, : self.fill[0]]
+
+    @property
+    def cols(self) -> I64:
+        """Block column of each block, not before its row."""
+        return self.pattern[1, : self.fill[0]]
+
+    @property
+    def offsets(self) -> I64:
+        """Where each block starts in `data`."""
+        return self.pattern[2, : self.fill[0]]
+
+    def extend(self, graph: Graph, since: Mark) -> float:
+        """Add the variables and factors after `since`, linearised at the present values; gives the factors' χ²."""
+        v0, v1 = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
+        f0, f1 = since[at.FACTORS], int(graph.counts[at.FACTORS])
+        self._reserve(v1 - v0 + f1 - f0, int(graph.counts[at.SCALARS]))
+        numbers = int(self.fill[1])
+        connect(v0, v1, f0, f1, graph.var, graph.fac, graph.dims, self.table, self.pattern, self.fill)
+        if (need := int(self.fill[1])) > self.data.size:
+            self.data = grown(self.data, need)
+        self.data[numbers:need] = 0.0
+        self.eta[since[at.SCALARS] : int(graph.counts[at.SCALARS])] = 0.0
+        return float(linearise(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
+
+    def relinearise(self, graph: Graph, values: F64) -> float:
+        """Build all anew at `values` in the spare copy; gives χ² there."""
+        if self._spare_data.size != self.data.size or self._spare_eta.size != self.eta.size:
+            self._spare_data, self._spare_eta = np.empty_like(self.data), np.empty_like(self.eta)
+        self._spare_data[: self.fill[1]] = 0.0
+        self._spare_eta[: graph.counts[at.SCALARS]] = 0.0
+        factors = int(graph.counts[at.FACTORS])
+        return float(
+            linearise(0, factors, graph.var, graph.fac, values, graph.payload, self._spare_data, self._spare_eta)
+        )
+
+    def swap_lambda(self) -> None:
+        """Exchange the present and the spare Λ."""
+        self.data, self._spare_data = self._spare_data, self.data
+
+    def swap_eta(self) -> None:
+        """Exchange the present and the spare η."""
+        self.eta, self._spare_eta = self._spare_eta, self.eta
+
+    def forget(self, graph: Graph, fill: tuple[int, int]) -> None:
+        """Go back to the pattern that had `fill`; `graph` is back at that moment already.
+
+        The numbers are summed anew.  They get the bits they had: factors are always added in the order of their ids.
+        """
+        remove_blocks(fill[0], int(self.fill[0]), self.table, self.pattern)
+        self.fill[:] = fill
+        self.relinearise(graph, graph.values)
+        self.swap_lambda()
+        self.swap_eta()
+
+    def _reserve(self, blocks: int, scalars: int) -> None:
+        need = int(self.fill[0]) + blocks
+        if need > self.pattern.shape[1]:
+            larger = np.empty((3, max(need, 2 * self.pattern.shape[1])), np.int64)
+            larger[:, : self.fill[0]] = self.pattern[:, : self.fill[0]]
+            self.pattern = larger
+        if 2 * need > self.table.size:
+            self.table = np.zeros(table_size(need), np.int64)
+            enter_blocks(int(self.fill[0]), self.table, self.pattern)
+        if scalars > self.eta.size:
+            self.eta = grown(self.eta, scalars)

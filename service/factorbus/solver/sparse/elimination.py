@@ -1,0 +1,99 @@
+"""Order, analysis and factorisation of Λ.  What depends on its pattern only is kept while that stays.  MATH §5."""
+
+import numpy as np
+
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.options import Options
+from factorbus.solver.report import Stopwatch
+from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.cholmod import factorize_by_cholmod, require_cholmod
+from factorbus.solver.sparse.ordering import order
+from factorbus.solver.sparse.symbolic import Symbolic, analyze
+
+# Groups of the constrained ordering.
+_ANYWHERE, _RECENT_LANDMARK, _LAST_POSE = 0, 1, 2
+
+
+class Elimination:
+    """The factor R of Λ = Rᵀ R, with its arena, order and analysis."""
+
+    NOT_KEPT = ("_options",)
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        if options.backend == "cholmod":
+            require_cholmod()
+        self._cholesky = Cholesky()
+        self._pattern = (0, 0)
+        self.symbolic: Symbolic | None = None
+
+    def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
+        """Factorise Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
+        symbolic = self._analysis(graph, blocks, watch)
+        if self._options.backend == "cholmod":
+            failed = self._cholesky.take(
+                symbolic,
+                lambda arena: factorize_by_cholmod(
+                    symbolic, blocks.rows, blocks.cols, blocks.data, blocks.offsets, damping, arena
+                ),
+            )
+        else:
+            failed = self._cholesky.factorize(symbolic, blocks.data, blocks.offsets, damping)
+        watch.lap("numeric")
+        return int(failed)
+
+    def forward(self, eta: F64) -> F64:
+        """d = R⁻ᵀPη by the factor made last, in elimination order."""
+        return self._cholesky.forward(eta)
+
+    def back(self, d: F64) -> F64:
+        """δ = PᵀR⁻¹d, in insertion order."""
+        return self._cholesky.back(d)
+
+    def memory_bytes(self) -> int:
+        """Bytes of the fronts that were made last."""
+        return 8 * self.symbolic.arena if self.symbolic else 0
+
+    def fronts(self) -> tuple[Symbolic, F64]:
+        """The factor made last: its analysis, and the arena with the numbers."""
+        symbolic = self.symbolic
+        if symbolic is None:
+            raise ValueError("there is no factor: the pattern has changed since")
+        return symbolic, self._cholesky.arena
+
+    def _analysis(self, graph: Graph, blocks: Blocks, watch: Stopwatch) -> Symbolic:
+        pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
+        if self.symbolic is None or pattern != self._pattern:
+            dims = graph.dims[: pattern[0]]
+            group = constraint(graph, self._options.recent_poses) if self._options.last_pose_last else None
+            perm = order(dims, blocks.rows, blocks.cols, group)
+            watch.lap("order")
+            self.symbolic, self._pattern = analyze(dims, blocks.rows, blocks.cols, perm), pattern
+            watch.lap("symbolic")
+        return self.symbolic
+
+    def forget(self) -> None:
+        """The pattern was changed in a way that its size does not show."""
+        self.symbolic = None
+
+
+def constraint(graph: Graph, recent_poses: int = 1) -> I64:
+    """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it, or from
+    the `recent_poses` last ones, right before it.
+
+    The next factors will most likely touch these, and changes near the end of the order are cheap (2013 paper, §5.2).
+    """
+    group = np.zeros(int(graph.counts[at.COLUMNS]), np.int64)
+    var = graph.var[: graph.counts[at.VARIABLES]]
+    poses = np.flatnonzero((var[:, at.V_KIND] <= at.SE3) & (var[:, at.V_COLUMN] >= 0))
+    if poses.size:
+        fac = graph.fac[: graph.counts[at.FACTORS]]
+        fac = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & (fac[:, at.F_J] >= 0)]
+        seen = fac[np.isin(fac[:, at.F_I], poses[-recent_poses:]), at.F_J]
+        columns = var[seen, at.V_COLUMN]
+        group[columns[columns >= 0]] = _RECENT_LANDMARK
+        group[var[poses[-1], at.V_COLUMN]] = _LAST_POSE
+    return group
