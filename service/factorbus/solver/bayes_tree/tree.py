@@ -12,6 +12,7 @@ from factorbus.solver.graph import pages
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.graph.factor_graph import Graph, grown, roomy
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
 from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_moved
 from factorbus.solver.kernels.bayes_tree.reset_estimate import hold_at_linearization
@@ -29,7 +30,7 @@ _FEW = 8  # new variables for which good first values are looked for
 class Tree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
-    ARENAS = tl.ARENAS
+    ARENAS = records.Tree._fields
     NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
 
     def __init__(self, graph: Graph, options: Options) -> None:

@@ -22,6 +22,7 @@ from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.admit import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model import records
 from factorbus.solver.kernels.model.retract import gather, label_of
 
 Mark: TypeAlias = tuple[int, ...]
@@ -33,7 +34,7 @@ _NO_KEYS: I64 = np.empty(0, np.int64)
 class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
-    ARENAS = at.ARENAS
+    ARENAS = records.Graph._fields
     NOT_KEPT = ("_rows", "places")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:

@@ -2,15 +2,15 @@
 
 import math
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, make_scratch, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
 
@@ -46,10 +46,7 @@ def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
 
 
 @part
-def take_in_factors(
-    f1: int, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
-    stiff: F64, turns: F64, moved: I64, saved: F64, state: I64, account: F64,
-) -> bool:  # fmt: skip
+def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
     """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
 
     A_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
@@ -57,8 +54,12 @@ def take_in_factors(
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
+    var, fac, values = graph.var, graph.fac, graph.values
+    node, link, hessian, scalars = tree.node, tree.link, tree.hessian, tree.scalars
+    stiff, turns, moved, saved, state = tree.stiff, tree.turns, tree.moved, tree.saved, tree.state
+    account = tree.account
     f0, finite = state[tl.S_FACTORS], True
-    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    scratch = make_scratch()
     for f in range(f0, f1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
@@ -68,16 +69,16 @@ def take_in_factors(
             state[tl.S_EXACT] += 1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-        linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
+        linearise_factor(graph, tree, f, scratch)
         _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
-        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
+        weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
         account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
         if j >= 0:
             account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
-        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(graph, tree, f, link[f, tl.L_KIND], c, s)
         stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
         account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
@@ -102,10 +103,11 @@ def stiffest_of(v: int, var: I64, scalars: F64) -> float:
 
 
 @part
-def take_out(
-    v0: int, f0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, saved: F64, state: I64
-) -> None:
+def take_out(graph: Graph, tree: Tree, v0: int, f0: int) -> None:
     """Forget the variables from v0 and the factors from f0 on, which came last; the others are as they were."""
+    var, fac = graph.var, graph.fac
+    node, link, scalars, turns, saved = tree.node, tree.link, tree.scalars, tree.turns, tree.saved
+    state = tree.state
     for f in range(state[tl.S_FACTORS] - 1, f0 - 1, -1):
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         if link[f, tl.L_KIND] >= tl.EXACT:

@@ -7,8 +7,10 @@ Of a clique only the frontals from the first touched one on are affected: the ro
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of
 
 
@@ -30,14 +32,14 @@ def touch(v: int, node: I64, clique: I64, state: I64, marked: I64, count: int) -
 
 
 @part
-def detach(
-    marked: I64, settings: F64, var: I64, node: I64, clique: I64, lists: I64, state: I64, affected: I64, orphans: I64
-) -> tuple[int, int]:
+def detach(graph: Graph, tree: Tree, marked: I64, settings: F64, affected: I64, orphans: I64) -> tuple[int, int]:
     """List the affected variables and the cliques that hang from them; gives how many there are of each.
 
     A marked clique is taken whole (C_FIRST becomes 0) or split (C_FIRST stays, and it is an orphan itself).  Nothing is
     changed but marks, so a step that fails has nothing to undo here.
     """
+    var = graph.var
+    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
     stamp, n, hanging = state[tl.S_STAMP], 0, 0
     for k in range(marked.size):
         c = marked[k]

@@ -7,10 +7,12 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
 from factorbus.solver.kernels.bayes_tree.fronts import update_layout
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import TILE_ROWS, add_run, put, zero
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.panels import take_off
 from factorbus.solver.kernels.sparse.partial_cholesky import LEAST_PIVOT
@@ -54,10 +56,10 @@ def row_of(c: int, row: I64) -> int:
 
 
 @part
-def add_hessian(
-    f: int, row: I64, column: I64, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
-) -> None:
+def add_hessian(graph: Graph, tree: Tree, f: int, row: I64, column: I64) -> None:
     """Add the Hessian of factor f, its gradient and its χ² to a front."""
+    var, fac = graph.var, graph.fac
+    node, link, numbers, hessian = tree.node, tree.link, tree.numbers, tree.hessian
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     di = dim_of_variable(var, i)
     dj = dim_of_variable(var, j) if j >= 0 else 0
@@ -109,11 +111,13 @@ def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: 
 
 
 @part
-def list_runs(start: int, end: int, column: I64, p: int, m: int, var: I64, node: I64, lists: I64, runs: I64) -> int:
+def list_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
     """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
 
     A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.
     """
+    var = graph.var
+    node, lists = tree.node, tree.lists
     count, first, stop = 0, 0, -1
     for s in range(start, end):
         v = lists[s]
@@ -161,14 +165,13 @@ def add_few(a: F64, i: int, j: int, count: int) -> None:
 
 
 @part
-def update_orphans(
-    orphans: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
-    state: I64, update: I64,
-) -> bool:  # fmt: skip
+def update_orphans(graph: Graph, tree: Tree, orphans: I64, update: I64) -> bool:
     """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
 
     update (orphans, 3): its place, its width, and the size of its block where it was made here (else 0)
     """
+    var = graph.var
+    clique, lists, numbers, state = tree.clique, tree.lists, tree.numbers, tree.state
     stamp, need = state[tl.S_STAMP], state[tl.S_NUMBERS]
     for e in range(orphans.size):
         c = orphans[e]
@@ -185,7 +188,7 @@ def update_orphans(
             width, size = update_layout(m)
             u, size = take_numbers(size, numbers, state)
             update[e, 0], update[e, 1], update[e, 2] = u, width, size
-            split_update(c, p, m, u, width, var, fac, node, link, clique, lists, numbers, hessian)
+            split_update(graph, tree, c, p, m, u, width)
     return True
 
 
@@ -207,14 +210,13 @@ def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
 
 
 @part
-def split_update(
-    c: int, p: int, m: int, u: int, wide: int,
-    var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64,
-) -> None:  # fmt: skip
+def split_update(graph: Graph, tree: Tree, c: int, p: int, m: int, u: int, wide: int) -> None:
     """U of the first p pivots of clique c alone: what their factors and children brought, less R_Sᵀ R_S.  (9.3)
 
     u, wide: where it goes, and the width of its first rows
     """
+    var = graph.var
+    node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
     row = clique[c]
     start, kept = row[tl.C_LIST], row[tl.C_FIRST]
     width = 0
@@ -225,12 +227,12 @@ def split_update(
     for s in range(start, start + kept):
         f = node[lists[s], tl.N_OWN]
         while f >= 0:
-            _add_far_end(f, lists[s], m, u, wide, var, fac, node, link, hessian, numbers)
+            _add_far_end(graph, tree, f, lists[s], m, u, wide)
             f = link[f, tl.L_OWN]
     child = row[tl.C_CHILD]
     while child >= 0:
         if clique[child, tl.C_ABOVE] < kept:
-            _add_child(child, m, u, wide, var, node, clique, lists, numbers)
+            _add_child(graph, tree, child, m, u, wide)
         child = clique[child, tl.C_NEXT]
     for i in range(0, m + 1, TILE_ROWS):
         rows = min(TILE_ROWS, m + 1 - i)
@@ -239,10 +241,10 @@ def split_update(
 
 
 @inline_kernel
-def _add_far_end(
-    f: int, v: int, m: int, u: int, wide: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, numbers: F64
-) -> None:
+def _add_far_end(graph: Graph, tree: Tree, f: int, v: int, m: int, u: int, wide: int) -> None:
     """What a factor owned by v adds to its other end, if that is not kept, and to the corner."""
+    var, fac = graph.var, graph.fac
+    node, link, numbers, hessian = tree.node, tree.link, tree.numbers, tree.hessian
     i, j, h = fac[f, at.F_I], fac[f, at.F_J], link[f, tl.L_AT]
     di = dim_of_variable(var, i)
     dj = dim_of_variable(var, j) if j >= 0 else 0
@@ -264,10 +266,10 @@ def _add_far_end(
 
 
 @inline_kernel
-def _add_child(
-    child: int, m: int, u: int, wide: int, var: I64, node: I64, clique: I64, lists: I64, numbers: F64
-) -> None:
+def _add_child(graph: Graph, tree: Tree, child: int, m: int, u: int, wide: int) -> None:
     """Add what a child's update matrix has in the columns of the separator and the right-hand side."""
+    var = graph.var
+    node, clique, lists, numbers = tree.node, tree.clique, tree.lists, tree.numbers
     start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
     end, last = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_BORDER]
     source, width = clique[child, tl.C_UPDATE], clique[child, tl.C_WIDTH_UPDATE]

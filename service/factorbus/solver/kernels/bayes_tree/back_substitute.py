@@ -11,20 +11,18 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import rigid_subtrees as rg
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved, move_variable
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 
 NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be further off
 
 
 @part
-def substitute(
-    ids: I64, ripple: float, quiet: float, var: I64, node: I64, clique: I64, lists: I64, numbers: F64, lin: F64,
-    scalars: F64, turns: F64, values: F64, changed: I64, moved: I64, listed: I64, motions: F64, state: I64,
-    account: F64,
-) -> None:  # fmt: skip
+def substitute(graph: Graph, tree: Tree, ids: I64, ripple: float, quiet: float, listed: I64) -> None:
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
@@ -32,6 +30,10 @@ def substitute(
     the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone, nor what was
     so below a clique that does not move now
     """
+    var = graph.var
+    clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
+    scalars, motions = tree.scalars, tree.motions
+    state, account = tree.state, tree.account
     far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
     if ripple == 0.0 and account[tl.A_LEFT] > 0.0:
         far = -1.0
@@ -50,59 +52,45 @@ def substitute(
             solve_rows(row, numbers, shares)
             row[tl.C_FIRST] = row[tl.C_MOVES] = 0
             state[tl.S_SOLVED] += 1
-            move_frontals(row, var, node, lists, numbers, delta, lin[0], lin[2], turns, values, changed, moved, state)
+            move_frontals(graph, tree, row, delta, lin[0], lin[2])
             child, above = row[tl.C_CHILD], c
             while True:
-                c = next_clique(
-                    child, above, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
-                )
-                if c < 0 or not moves_along(
-                    c, far, var, clique, lists, numbers, delta, weight, lin[0], turns, motions, motion
-                ):
+                c = next_clique(graph, tree, child, above, far, delta, weight, motion)
+                if c < 0 or not moves_along(graph, tree, c, far, delta, weight, motion):
                     break
                 # What is in it nobody outside looks at, so it can move later.
                 if body == rg.BODIES:
-                    rg.move_bodies(
-                        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed,
-                        moved, motions, motion, state,
-                    )  # fmt: skip
+                    rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
                     body = count = 0
                 count = rg.list_subtree(c, body, clique, motions, motion, listed, count)
                 body += 1
                 child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
-    rg.move_bodies(
-        listed[:count], quiet, var, node, clique, lists, delta, lin[0], lin[2], turns, values, changed, moved, motions,
-        motion, state,
-    )  # fmt: skip
+    rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
     account[tl.A_LEFT] = max(account[tl.A_LEFT] if ripple > 0.0 else 0.0, motion[rg.LEFT])
 
 
 @inline_kernel
-def moves_along(
-    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
-    motions: F64, motion: F64,
-) -> bool:  # fmt: skip
+def moves_along(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: F64, motion: F64) -> bool:
     """Whether a clique and all below it only move as a whole; motion gets by how much."""
+    clique = tree.clique
     row = clique[c]
     far = far_of(row, far)
     return (
         row[tl.C_FIRST] != -1
         and row[tl.C_ANCHORED] == 0
-        and rg.fit_motion(row, c * tl.M_WIDTH, far, var, lists, numbers, delta, weight, lin, turns, motions, motion)
+        and rg.fit_motion(graph, tree, row, c * tl.M_WIDTH, far, delta, weight, motion)
     )
 
 
 @inline_kernel
 def next_clique(
-    child: int, above: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64,
-    lin: F64, turns: F64, motions: F64, motion: F64,
-) -> int:  # fmt: skip
+    graph: Graph, tree: Tree, child: int, above: int, far: float, delta: F64, weight: F64, motion: F64
+) -> int:
     """The next clique that has moved, from `child` of clique `above` on, depth first; −1: none is left."""
+    clique = tree.clique
     while True:
         while child >= 0:
-            if clique[child, tl.C_FIRST] == -1 or has_moved(
-                child, far, var, clique, lists, numbers, delta, weight, lin, turns, motions, motion
-            ):
+            if clique[child, tl.C_FIRST] == -1 or has_moved(graph, tree, child, far, delta, weight, motion):
                 return child
             child = clique[child, tl.C_NEXT]
         if clique[above, tl.C_PARENT] < 0:
@@ -111,13 +99,12 @@ def next_clique(
 
 
 @inline_kernel
-def has_moved(
-    c: int, far: float, var: I64, clique: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, turns: F64,
-    motions: F64, motion: F64,
-) -> bool:  # fmt: skip
+def has_moved(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: F64, motion: F64) -> bool:
     """Whether a scalar of the separator is further than (9.17) from where the frontals have it, who were solved with
     it and may have moved since.  motion: gets the largest square of what is left
     """
+    var = graph.var
+    clique, lists, numbers, turns, motions = tree.clique, tree.lists, tree.numbers, tree.turns, tree.motions
     row = clique[c]
     far = far_of(row, far)
     start = row[tl.C_LIST] + row[tl.C_FRONTALS]
@@ -126,7 +113,7 @@ def has_moved(
         v = lists[s]
         d = var[v, at.V_SCALAR]
         if moves:
-            rg.displace(v, var, lin, turns, motions, c * tl.M_WIDTH, motion)
+            rg.displace(v, var, tree.lin[0], turns, motions, c * tl.M_WIDTH, motion)
         for a in range(dim_of_variable(var, v)):
             gap = load(delta, d + a) - load(numbers, used)
             if moves:
@@ -213,11 +200,10 @@ def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
 
 
 @inline_kernel
-def move_frontals(
-    row: I64, var: I64, node: I64, lists: I64, numbers: F64, delta: F64, lin: F64, before: F64, turns: F64,
-    values: F64, changed: I64, moved: I64, state: I64,
-) -> None:  # fmt: skip
+def move_frontals(graph: Graph, tree: Tree, row: I64, delta: F64, lin: F64, before: F64) -> None:
     """The estimate of the frontals whose δ is another one."""
+    var = graph.var
+    node, lists, numbers, moved, state = tree.node, tree.lists, tree.numbers, tree.moved, tree.state
     start, solved = row[tl.C_LIST], row[tl.C_USED]
     for s in range(start, start + row[tl.C_FRONTALS]):
         v = lists[s]
@@ -227,5 +213,5 @@ def move_frontals(
             put(delta, d + a, load(numbers, solved))
             solved += 1
         if differs:
-            move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
+            move_variable(graph, tree, v, delta, lin, before)
             list_moved(MODEL, v, node, moved, state)

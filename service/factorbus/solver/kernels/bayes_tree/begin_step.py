@@ -3,21 +3,23 @@
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.graph.initialize import follow, reach
 from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 
 # Doubles of the largest Hessian record.
 HESSIAN = 6 * 6 * 3 + 13
 
 
 @part
-def begin(
-    counts: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64,
-    lin: F64, scalars: F64, saved: F64, state: I64,
-) -> int:  # fmt: skip
+def begin(graph: Graph, tree: Tree) -> int:
     """Gives DONE: the step can begin; NO_ROOM: the arenas by variable and factor are short; UNSURE: see `step`."""
+    var, fac, values, payload, counts = graph.var, graph.fac, graph.values, graph.payload, graph.counts
+    settings, node, link, hessian, lin = tree.settings, tree.node, tree.link, tree.hessian, tree.lin
+    scalars, saved, state = tree.scalars, tree.saved, tree.state
     v0, v1, f0, f1 = state[tl.S_VARIABLES], counts[at.VARIABLES], state[tl.S_FACTORS], counts[at.FACTORS]
     if (
         v1 > len(node)

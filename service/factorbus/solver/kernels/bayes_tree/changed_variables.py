@@ -3,21 +3,23 @@
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
+from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.sorting import put_in_order, sort
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import size_of
 
 
 @kernel("int64(int64, int64[::1], int64[::1], int64[::1])")
-def list_moved(first: int, graph: I64, tree: I64, out: I64) -> int:
+def list_moved(first: int, graph_table: I64, tree_table: I64, out: I64) -> int:
     """List in `out`, ascending, the variables that have other bits than before the last step, and all from `first` on.
 
-    graph, tree: tables of their arenas (`places`).  Gives how many.
+    graph_table, tree_table: of their arrays (`records`).  Gives how many.
     """
-    counts, var, values = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), floats(graph, at.T_VALUES)
-    changed, lin, state = ints(tree, tl.T_CHANGED), float_rows(tree, tl.T_LIN), ints(tree, tl.T_STATE)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    counts, var, values = graph.counts, graph.var, graph.values
+    changed, lin, state = tree.changed, tree.lin, tree.state
     before, now = lin.view(np.int64), values.view(np.int64)  # bits: −0.0 is not 0.0
     n = 0
     for k in range(state[tl.S_CHANGED]):

@@ -10,18 +10,21 @@ from factorbus.solver.kernels.bayes_tree.assemble import split_sizes
 from factorbus.solver.kernels.bayes_tree.eliminate import first_end
 from factorbus.solver.kernels.bayes_tree.fronts import free_clique
 from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
+from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse import fronts as fr
 
 
 @part
-def commit(
-    marked: I64, orphans: I64, update: I64, lowest: I64, ids: I64, records: I64, order: I64, place: I64, home: I64,
-    border_at: I64, border_of: I64, affected: I64, factors: I64,
-    var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64, numbers: F64, state: I64, account: F64,
-) -> None:  # fmt: skip
+def commit(graph: Graph, tree: Tree, affected: Affected, fronts: Fronts, ids: I64, lowest: I64, update: I64) -> None:
     """Split or free the marked cliques, hang the new ones and the orphans up, and give the factors their owners."""
+    var, fac = graph.var, graph.fac
+    marked, orphans, factors = affected.cliques, affected.orphans, affected.factors
+    records, place, home = fronts.records, fronts.place, fronts.home
+    node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
+    state, account = tree.state, tree.account
     for k in range(marked.size):
         state[tl.S_NONZEROS] -= nonzeros(clique[marked[k]])
         if clique[marked[k], tl.C_PARENT] < 0:
@@ -40,8 +43,7 @@ def commit(
             state[tl.S_NONZEROS] += nonzeros(clique[c])
     for k in range(marked.size):
         clique[marked[k], tl.C_FIRST] = 0
-    n, count = order.size, ids.size
-    for f in range(count):
+    for f in range(ids.size):
         c, row = ids[f], clique[ids[f]]
         row[tl.C_FIRST] = -1
         state[tl.S_NONZEROS] += nonzeros(row)
@@ -53,14 +55,14 @@ def commit(
             state[tl.S_ROOTS] += 1
             account[tl.A_MODEL] += numbers[row[tl.C_UPDATE]]
         else:
-            hang(c, ids[above], border_of[border_at[f]] - records[above, fr.VARIABLE], clique)
+            hang(c, ids[above], fronts.border_of[fronts.border_at[f]] - records[above, fr.VARIABLE], clique)
     for e in range(orphans.size):
         k = place[lowest[e]]
         hang(orphans[e], ids[home[k]], k - records[home[k], fr.VARIABLE], clique)
     for q in range(factors.size - 1, -1, -1):
-        v = affected[order[first_end(factors[q], place, var, fac, node)]]
+        v = affected.variables[fronts.order[first_end(factors[q], place, var, fac, node)]]
         link[factors[q], tl.L_OWN], node[v, tl.N_OWN] = node[v, tl.N_OWN], factors[q]
-    state[tl.S_ELIMINATED] += n
+    state[tl.S_ELIMINATED] += fronts.order.size
 
 
 @inline_kernel

@@ -11,17 +11,16 @@ these factors, as if the factors were new there, and eliminates their cliques fr
 
 import math
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, make_scratch, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
-from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
-from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph, graph_at
 
 # Columns of the log of links that were changed: which one, of what, and the factor or incidence that it was.
 LOG_WHAT, LOG_OF, LOG_WAS, LOG_WIDTH = 0, 1, 2, 3
@@ -30,16 +29,17 @@ MOST_LINKS = 3  # that a factor is taken out of
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[:,::1])")
-def edit_factors(gone: I64, renewed: I64, graph: I64, tree: I64, log: I64) -> int:
+def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log: I64) -> int:
     """Take the factors `gone` out of the tree, and linearise those `renewed` as the graph has them now (rows).
 
     graph, tree: tables of their arenas (`places`)   log (3 per factor gone, 3): links as they were, for `relink`
     Gives how many rows of the log were written; −1 less that where any χ² is not a number.
     """
-    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    node, link, hessian = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), floats(tree, tl.T_HESSIAN)
-    scalars, stiff, turns = float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF), float_rows(tree, tl.T_TURNS)
-    moved, state, account = ints(tree, tl.T_MOVED), ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    var, fac = graph.var, graph.fac
+    node = tree.node
+    scalars = tree.scalars
+    moved, state, account = tree.moved, tree.state, tree.account
     stiffest = 0.0
     for k in range(gone.size + renewed.size):
         f = gone[k] if k < gone.size else renewed[k - gone.size]
@@ -50,7 +50,7 @@ def edit_factors(gone: I64, renewed: I64, graph: I64, tree: I64, log: I64) -> in
     # 1
     count = 0
     for k in range(gone.size):
-        count = detach_factor(gone[k], var, fac, node, link, hessian, stiff, log, count, state, account)
+        count = detach_factor(graph, tree, gone[k], log, count)
     # 2
     finite = renew_factors(renewed, graph, tree)
     # 3, 4
@@ -59,7 +59,7 @@ def edit_factors(gone: I64, renewed: I64, graph: I64, tree: I64, log: I64) -> in
         for end in range(2):
             v = fac[f, at.F_I + end]
             if v >= 0:
-                sum_factors(v, var, fac, node, link, hessian, scalars, stiff, turns)
+                sum_factors(graph, tree, v)
                 account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
                 list_moved(MODEL, v, node, moved, state)
     if gone.size + renewed.size > 0 and stiffest >= account[tl.A_STIFFEST]:
@@ -72,11 +72,11 @@ def edit_factors(gone: I64, renewed: I64, graph: I64, tree: I64, log: I64) -> in
 
 
 @part
-def detach_factor(
-    f: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, stiff: F64, log: I64, count: int, state: I64,
-    account: F64,
-) -> int:  # fmt: skip
+def detach_factor(graph: Graph, tree: Tree, f: int, log: I64, count: int) -> int:
     """Factor f counts no more; gives how many rows of the log are written then."""
+    var, fac = graph.var, graph.fac
+    node, link, hessian, stiff, state = tree.node, tree.link, tree.hessian, tree.stiff, tree.state
+    account = tree.account
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     size = hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
     state[tl.S_HOLES] += size
@@ -138,9 +138,10 @@ def note(what: int, of: int, was: int, log: I64, count: int) -> None:
 
 
 @kernel("void(int64, int64[:,::1], int64[::1])")
-def relink(count: int, log: I64, tree: I64) -> None:
+def relink(count: int, log: I64, tree_table: I64) -> None:
     """All links as they were: the log read backwards."""
-    node, link = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK)
+    tree = tree_at(tree_table)
+    node, link = tree.node, tree.link
     for k in range(count - 1, -1, -1):
         what, of, was = log[k, LOG_WHAT], log[k, LOG_OF], log[k, LOG_WAS]
         if what == FIRST_INCIDENCE:
@@ -154,14 +155,14 @@ def relink(count: int, log: I64, tree: I64) -> None:
 
 
 @part
-def renew_factors(renewed: I64, graph: I64, tree: I64) -> bool:
+def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
     """Linearise factors with the weight and loss that they have now; gives whether all χ² are numbers."""
-    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    values, payload = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD)
-    link, hessian, lin = int_rows(tree, tl.T_LINK), floats(tree, tl.T_HESSIAN), float_rows(tree, tl.T_LIN)
-    scalars, stiff, turns = float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF), float_rows(tree, tl.T_TURNS)
-    state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
-    r, H, W, finite = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6)), True
+    var, fac = graph.var, graph.fac
+    values = graph.values
+    link, hessian = tree.link, tree.hessian
+    scalars, stiff, turns = tree.scalars, tree.stiff, tree.turns
+    state, account = tree.state, tree.account
+    scratch, finite = make_scratch(), True
     for k in range(renewed.size):
         f = renewed[k]
         i, j = fac[f, at.F_I], fac[f, at.F_J]
@@ -170,10 +171,10 @@ def renew_factors(renewed: I64, graph: I64, tree: I64) -> bool:
         was, linear_was = stiff[f, tl.B_CHI2], hessian[last]
         if fac[f, at.F_KIND] < at.IDP_FIRST:
             note_loss(f, fac, link, state)
-        linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
-        weigh_factor(f, var, fac, payload, link, hessian, scalars, stiff, turns, W)
+        linearise_factor(graph, tree, f, scratch)
+        weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        stiff[f, tl.B_CHI2], _, _ = factor_chi2(f, link[f, tl.L_KIND], c, s, var, fac, values, payload, stiff)
+        stiff[f, tl.B_CHI2], _, _ = factor_chi2(graph, tree, f, link[f, tl.L_KIND], c, s)
         account[tl.A_CHI2] += stiff[f, tl.B_CHI2] - was
         account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + was
         if not has_free(f, var, fac):
@@ -193,10 +194,11 @@ def note_loss(f: int, fac: I64, link: I64, state: I64) -> None:
 
 
 @part
-def sum_factors(
-    v: int, var: I64, fac: I64, node: I64, link: I64, hessian: F64, scalars: F64, stiff: F64, turns: F64
-) -> None:
+def sum_factors(graph: Graph, tree: Tree, v: int) -> None:
     """What variable v has of its factors: the sum of the diagonals of their Hessians, and the largest lever."""
+    var, fac = graph.var, graph.fac
+    node, link, hessian, scalars, stiff = tree.node, tree.link, tree.hessian, tree.scalars, tree.stiff
+    turns = tree.turns
     d, dim, lever = var[v, at.V_SCALAR], dim_of_variable(var, v), 0.0
     if d >= 0:
         for a in range(dim):

@@ -8,15 +8,20 @@ A front takes in the factors that its pivots own and the update matrices of its 
 step or orphans of earlier ones, whose separators may now be eliminated in another order than their columns have.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import separators_of
 from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
+from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_relative
-from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, float_rows, floats, int_rows, ints, put_place
+from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, int_rows, ints, put_place
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.multifrontal import clear_front
 from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, factor_front
@@ -55,23 +60,31 @@ ASSEMBLY, BOOKKEEPING = 150, 80_000
 LONG = 30_000_000  # an elimination that is worth sharing, half a millisecond
 
 
+class SortedIn(NamedTuple):
+    """Factors and orphans by the front that takes them in, see FIRST_FACTOR and so on."""
+
+    first_factor: I64
+    factors: I64
+    first_orphan: I64
+    next_orphan: I64
+
+
 @part
 def eliminate_fronts(
-    ids: I64, records: I64, n: int, home: I64, place: I64, factors: I64, orphans: I64, lowest: I64, update: I64,
-    graph: I64, tree: I64, board: I64,
-) -> int:  # fmt: skip
+    graph: Graph, tree: Tree, ids: I64, fronts: Fronts, affected: Affected, lowest: I64, update: I64, board: I64
+) -> int:
     """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
 
-    update (orphans, 3): where the update matrix of each orphan is, and its width   graph, tree: tables of their arenas
-    board: see `task_queue`
+    ids: the clique of each front   lowest: of each orphan the local number of its first separator to be eliminated
+    update (orphans, 3): where the update matrix of each orphan is, and its width   board: see `task_queue`
     """
     # 1
-    count = ids.size
-    clique, state = int_rows(tree, tl.T_CLIQUE), ints(tree, tl.T_STATE)
-    first_factor, factor_of = _by_front(count, factors, home, place, graph, tree)
+    clique, state = tree.clique, tree.state
+    orphans, records, count = affected.orphans, fronts.records, ids.size
+    first_factor, factor_of = _by_front(graph, tree, count, affected.factors, fronts)
     first_orphan, next_orphan = np.full(count, -1), np.empty(orphans.size, np.int64)
     for e in range(orphans.size - 1, -1, -1):
-        f = home[place[lowest[e]]]
+        f = fronts.home[fronts.place[lowest[e]]]
         next_orphan[e], first_orphan[f] = first_orphan[f], e
     pivots, separators = 0, 0
     for f in range(count):
@@ -81,11 +94,14 @@ def eliminate_fronts(
         first, end = separators_of(orphans[e], state[tl.S_STAMP], clique)
         separators = max(separators, end - first)
     plan = np.empty(PLAN, np.int64)
-    plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = n, pivots, separators
+    plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = fronts.order.size, pivots, separators
+    put_place(plan, GRAPH, address_of(table_of(graph)), table_of(graph).size, 1)
+    put_place(plan, TREE, address_of(table_of(tree)), table_of(tree).size, 1)
+    put_place(plan, ORPHANS, address_of(orphans), orphans.size, 1)
+    put_place(plan, UPDATE, address_of(update), len(update), update.shape[1])
     # 2, 3.  What a plan tells of has to be there for as long: these are, while the next one runs.
-    failed, flops = _eliminate_sorted(
-        plan, ids, records, first_factor, factor_of, first_orphan, next_orphan, orphans, update, graph, tree, board
-    )
+    sorted_in = SortedIn(first_factor, factor_of, first_orphan, next_orphan)
+    failed, flops = _eliminate_sorted(plan, ids, records, sorted_in, orphans, update, board)
     if failed < 0:
         state[tl.S_FLOPS] += flops
     return failed
@@ -93,20 +109,15 @@ def eliminate_fronts(
 
 @part
 def _eliminate_sorted(
-    plan: I64, ids: I64, records: I64, first_factor: I64, factor_of: I64, first_orphan: I64, next_orphan: I64,
-    orphans: I64, update: I64, graph: I64, tree: I64, board: I64,
-) -> tuple[int, int]:  # fmt: skip
-    """Write the plan, and go by it; gives the variable whose pivot failed, or −1, and flops."""
-    put_place(plan, GRAPH, address_of(graph), graph.size, 1)
-    put_place(plan, TREE, address_of(tree), tree.size, 1)
+    plan: I64, ids: I64, records: I64, sorted_in: SortedIn, _orphans: I64, _update: I64, board: I64
+) -> tuple[int, int]:
+    """Complete the plan, and go by it; gives the variable whose pivot failed, or −1, and flops."""
     put_place(plan, IDS, address_of(ids), ids.size, 1)
     put_place(plan, RECORDS, address_of(records), len(records), fr.FRONT)
-    put_place(plan, FIRST_FACTOR, address_of(first_factor), first_factor.size, 1)
-    put_place(plan, FACTORS, address_of(factor_of), factor_of.size, 1)
-    put_place(plan, FIRST_ORPHAN, address_of(first_orphan), first_orphan.size, 1)
-    put_place(plan, NEXT_ORPHAN, address_of(next_orphan), next_orphan.size, 1)
-    put_place(plan, ORPHANS, address_of(orphans), orphans.size, 1)
-    put_place(plan, UPDATE, address_of(update), len(update), update.shape[1])
+    put_place(plan, FIRST_FACTOR, address_of(sorted_in.first_factor), sorted_in.first_factor.size, 1)
+    put_place(plan, FACTORS, address_of(sorted_in.factors), sorted_in.factors.size, 1)
+    put_place(plan, FIRST_ORPHAN, address_of(sorted_in.first_orphan), sorted_in.first_orphan.size, 1)
+    put_place(plan, NEXT_ORPHAN, address_of(sorted_in.next_orphan), sorted_in.next_orphan.size, 1)
     lenders = count_lenders(board)
     if lenders > 0:
         return _eliminate_in_pieces(plan, records, lenders, board)
@@ -199,12 +210,11 @@ def make_subtree(board: I64, chunk: int, t: int) -> None:
 @part
 def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tuple[int, int]:
     """Eliminate fronts begin .. end, whose children are; gives the variable whose pivot failed, or −1, and flops."""
-    graph, tree = ints(plan, GRAPH), ints(plan, TREE)
-    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
-    lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
-    scalars, stamp = float_rows(tree, tl.T_SCALARS), ints(tree, tl.T_STATE)[tl.S_STAMP]
-    noise = ROUNDING * floats(tree, tl.T_ACCOUNT)[tl.A_STIFFEST]
+    graph, tree = graph_at(ints(plan, GRAPH)), tree_at(ints(plan, TREE))
+    var, fac = graph.var, graph.fac
+    node, clique, lists, numbers = tree.node, tree.clique, tree.lists, tree.numbers
+    scalars, stamp = tree.scalars, tree.state[tl.S_STAMP]
+    noise = ROUNDING * tree.account[tl.A_STIFFEST]
     ids, records = ints(plan, IDS), int_rows(plan, RECORDS)
     orphans, update = ints(plan, ORPHANS), int_rows(plan, UPDATE)
     first_factor, factor_of = ints(plan, FIRST_FACTOR), ints(plan, FACTORS)
@@ -220,12 +230,12 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
             anchored |= int(not is_relative(factor_of[q], var, fac))
-            add_hessian(factor_of[q], row, column, var, fac, node, link, hessian, numbers)
+            add_hessian(graph, tree, factor_of[q], row, column)
         child = records[f, fr.CHILD]
         while child >= 0:
             other = clique[ids[child]]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            k = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
+            k = list_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, k, row)
             anchored |= other[tl.C_ANCHORED]
             child = records[child, fr.SIBLING]
@@ -233,7 +243,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
         while e >= 0:
             start = clique[orphans[e], tl.C_LIST]
             low, high = separators_of(orphans[e], stamp, clique)
-            k = list_runs(start + low, start + high, column, p, m, var, node, lists, runs)
+            k = list_runs(graph, tree, start + low, start + high, column, p, m, runs)
             extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
             anchored |= clique[orphans[e], tl.C_ANCHORED]
             e = next_orphan[e]
@@ -245,15 +255,15 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
         if failed >= 0:
             return variable_at(failed, row, var, lists), flops
         if failed == RAISED:
-            ints(tree, tl.T_STATE)[tl.S_RAISED] = 1
+            tree.state[tl.S_RAISED] = 1
         flops += p * (p + m + 1) * (p + m + 1)
     return -1, flops
 
 
 @part
-def _by_front(count: int, factors: I64, home: I64, place: I64, graph: I64, tree: I64) -> tuple[I64, I64]:
+def _by_front(graph: Graph, tree: Tree, count: int, factors: I64, fronts: Fronts) -> tuple[I64, I64]:
     """The factors sorted by the front that takes them in."""
-    var, fac, node = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC), int_rows(tree, tl.T_NODE)
+    var, fac, node, home, place = graph.var, graph.fac, tree.node, fronts.home, fronts.place
     begin, front = np.zeros(count + 2, np.int64), np.empty(factors.size, np.int64)
     for q in range(factors.size):
         front[q] = home[first_end(factors[q], place, var, fac, node)]

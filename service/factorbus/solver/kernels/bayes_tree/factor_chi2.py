@@ -9,10 +9,12 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import wrap
 from factorbus.solver.kernels.model.se3 import quat_product, rotation
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
@@ -21,12 +23,12 @@ SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact t
 
 
 @inline_kernel
-def factor_chi2(
-    f: int, kind: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, stiff: F64
-) -> tuple[float, float, float]:
+def factor_chi2(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: float) -> tuple[float, float, float]:
     """rᵀΩr, or ρ of it, of factor f at `values`; between poses the square of the translation in r; and between those in
     space the rotation's share of χ².  kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose.
     """
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    stiff = tree.stiff
     if kind == at.BETWEEN_SE2:
         return between_se2_chi2(f, c, s, var, fac, values, payload, stiff)
     if kind == at.LANDMARK_SE2:

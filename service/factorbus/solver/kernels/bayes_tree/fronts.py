@@ -13,6 +13,7 @@ from factorbus.solver.kernels.bayes_tree.allocator import (
     take_list,
     take_numbers,
 )
+from factorbus.solver.kernels.bayes_tree.records import Fronts, Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.symbolic import (
@@ -27,12 +28,8 @@ from factorbus.solver.kernels.sparse.symbolic import (
 
 
 @part
-def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols: I64) -> tuple:
-    """The fronts of n affected variables eliminated in the order perm, or in one with the same fill.
-
-    out  order (n,): local indices as eliminated   place (n,): the inverse   home (n,): the front of each place
-         records: see `fronts`   border_at, border_of: places of each front's border, ascending
-    """
+def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols: I64) -> Fronts:
+    """The fronts of n affected variables eliminated in the order perm, or in one with the same fill."""
     label, dim = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         label[perm[k]], dim[k] = k, dim_of_variable(var, affected[perm[k]])
@@ -42,7 +39,7 @@ def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols
     order, home, tops, records = join_fronts(n, perm, parent, dim, scalars, affected, var, label)
     begin, earlier = by_later(n, label, rows, cols)
     border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
-    return order, label, home, records, border_at, border_of
+    return Fronts(order, label, home, records, border_at, border_of)
 
 
 @part
@@ -73,7 +70,7 @@ def is_root_alone(marked: I64, n: int, new: int, affected: I64, settings: F64, v
 
 
 @part
-def keep_root(n: int, affected: I64, var: I64) -> tuple:
+def keep_root(n: int, affected: I64, var: I64) -> Fronts:
     """As `analyze_affected`: one front of all affected variables, in the order they have."""
     records = np.zeros((1, fr.FRONT), np.int64)
     order, home = np.empty(n, np.int64), np.zeros(n, np.int64)
@@ -81,7 +78,7 @@ def keep_root(n: int, affected: I64, var: I64) -> tuple:
         order[k] = k
         records[0, fr.PIVOTS] += dim_of_variable(var, affected[k])
     records[0, fr.PARENT] = records[0, fr.CHILD] = records[0, fr.SIBLING] = -1
-    return order, order, home, records, np.zeros(2, np.int64), np.empty(0, np.int64)
+    return Fronts(order, order, home, records, np.zeros(2, np.int64), np.empty(0, np.int64))
 
 
 @inline_kernel
@@ -100,11 +97,10 @@ def update_layout(m: int) -> tuple:
 
 
 @part
-def place_fronts(
-    records: I64, order: I64, affected: I64, border_at: I64, border_of: I64,
-    clique: I64, lists: I64, numbers: F64, state: I64,
-) -> tuple:  # fmt: skip
+def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
     """A record, a list and blocks for every front; gives (ids, whether there was room).  Without it none is taken."""
+    clique, lists, numbers, state = tree.clique, tree.lists, tree.numbers, tree.state
+    records, order, border_at, border_of = fronts.records, fronts.order, fronts.border_at, fronts.border_of
     count = len(records)
     ids, n = np.empty(count, np.int64), order.size
     if not has_room(records, border_at, n, clique, lists, numbers, state):

@@ -1,17 +1,36 @@
 """The Hessian of a factor at its variables' linearisation points, kept until one of them moves.  MATH §9.2."""
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, slip_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_round
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, six
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart, multiply
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
+
+
+class Scratch(NamedTuple):
+    """Room to linearize a factor in: r (7,); H (4, 6, 6), its Jacobians A and B, Ω A and Ω B; W (6, 6), Ω."""
+
+    r: F64
+    H: F64
+    W: F64
+
+
+@inline_kernel
+def make_scratch() -> Scratch:
+    """Room to linearize factors in, one after the other."""
+    return Scratch(np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6)))
 
 
 @inline_kernel
@@ -21,34 +40,27 @@ def hessian_size(di: int, dj: int) -> int:
 
 
 @part
-def linearise_factor(
-    f: int, var: I64, fac: I64, lin: F64, payload: F64, link: I64, hessian: F64, stiff: F64, r: F64, H: F64, W: F64,
-    state: I64,
-) -> None:  # fmt: skip
-    """Write the Hessian of factor f at the linearisation points, and what its slip depends on there.
-
-    r (7,), H (4, 6, 6), W (6, 6) are scratch
-    """
-    kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
-    p = fac[f, at.F_AT] + information_at(kind)
-    more = evaluate_apart(f, var, fac, lin, payload, r, H[0], H[1])
+def linearise_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+    """Write the Hessian of factor f at the linearization points, and what its slip depends on there."""
+    kind, hessian, stiff, h = graph.fac[f, at.F_KIND], tree.hessian, tree.stiff, tree.link[f, tl.L_AT]
+    more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
-        _write(3, 3, 3, p, more, payload, r, H, W, h, hessian)
+        _write(graph, tree, f, 3, 3, 3, more, scratch)
         stiff[f, tl.B_TURN] = hessian[h + 9 + 9 + 8]
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
-        _write(2, 3, 2, p, more, payload, r, H, W, h, hessian)
+        _write(graph, tree, f, 2, 3, 2, more, scratch)
         stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
-        _write_between_se3(p, more, payload, r, H, W, h, hessian)
+        _write_between_se3(graph, tree, f, more, scratch)
         stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
-        _write(3, 6, 3, p, more, payload, r, H, W, h, hessian)
+        _write(graph, tree, f, 3, 6, 3, more, scratch)
         stiff[f, tl.B_PULL] = gradient_norm(3, h + 36 + 18 + 9, hessian)
     else:
-        _write_other(kind, p, more, payload, r, H, W, h, hessian)
+        _write_other(graph, tree, f, more, scratch)
         if kind >= at.IDP_FIRST:
-            note_sleep(f, r[at.R_STATUS] != GOOD, link, state)
+            note_sleep(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
 
 
 @inline_kernel
@@ -69,19 +81,22 @@ def note_sleep(f: int, asleep: bool, link: I64, state: I64) -> None:
 
 
 @part
-def _write_other(kind: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+def _write_other(graph: Graph, tree: Tree, f: int, more: float, scratch: Scratch) -> None:
     """Of the kinds that are not worth straight code."""
+    kind = graph.fac[f, at.F_KIND]
     di, dj = end_dims(kind)
-    _write(residual_dim(kind), di, dj, p, more, payload, r, H, W, h, out)
+    _write(graph, tree, f, residual_dim(kind), di, dj, more, scratch)
 
 
 @part
-def _write_between_se3(p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64) -> None:
+def _write_between_se3(graph: Graph, tree: Tree, f: int, more: float, scratch: Scratch) -> None:
     """`_write`, in half its products: the lower left quarter of both Jacobians and the upper right one of B are zero.
 
     Of A, B, Ω A and Ω B side by side in J, six a row, all places are constants: so rows become vectors.
     """
-    J, M = H.reshape(144), W.reshape(36)
+    payload, out, r, h = graph.payload, tree.hessian, scratch.r, tree.link[f, tl.L_AT]
+    J, M = scratch.H.reshape(144), scratch.W.reshape(36)
+    p = graph.fac[f, at.F_AT] + information_at(at.BETWEEN_SE3)
     for a in range(6):
         for b in range(a, 6):
             M[6 * a + b] = M[6 * b + a] = payload[p]
@@ -111,10 +126,10 @@ def _write_between_se3(p: int, more: float, payload: F64, r: F64, H: F64, W: F64
 
 
 @inline_kernel
-def _write(
-    dr: int, di: int, dj: int, p: int, more: float, payload: F64, r: F64, H: F64, W: F64, h: int, out: F64
-) -> None:
-    A, B, WA, WB = H[0], H[1], H[2], H[3]
+def _write(graph: Graph, tree: Tree, f: int, dr: int, di: int, dj: int, more: float, scratch: Scratch) -> None:
+    payload, out, r, W, h = graph.payload, tree.hessian, scratch.r, scratch.W, tree.link[f, tl.L_AT]
+    A, B, WA, WB = scratch.H[0], scratch.H[1], scratch.H[2], scratch.H[3]
+    p = graph.fac[f, at.F_AT] + information_at(graph.fac[f, at.F_KIND])
     for a in range(dr):
         for b in range(a, dr):
             W[a, b] = W[b, a] = payload[p]
@@ -161,13 +176,13 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
 
 
 @part
-def weigh_factor(
-    f: int, var: I64, fac: I64, payload: F64, link: I64, hessian: F64, scalars: F64, stiff: F64, turns: F64, W: F64
-) -> None:
+def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """Add a factor that was just linearised to what measures δ: the diagonal sums, and how it bends.
 
-    W holds its information, as `linearise_factor` left it.
+    scratch.W holds its information, as `linearise_factor` left it.
     """
+    var, fac, payload = graph.var, graph.fac, graph.payload
+    link, hessian, scalars, stiff, turns = tree.link, tree.hessian, tree.scalars, tree.stiff, tree.turns
     kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     di = dim_of(var[i, at.V_KIND])
@@ -177,7 +192,7 @@ def weigh_factor(
         for a in range(di):
             scalars[1, s + a] += hessian[h + a * di + a]
     distance = lever_of(kind, payload, fac[f, at.F_AT])
-    root = root_weight(kind, W, distance)
+    root = root_weight(kind, scratch.W, distance)
     turns[i, tl.U_LEVER] = max(turns[i, tl.U_LEVER], distance * root)
     if j >= 0:
         s = var[j, at.V_SCALAR]

@@ -8,43 +8,8 @@ S, with a last column for the right-hand side and a corner for χ²,
 
 p and m count scalars.  Its variables, frontals first, are `lists[LIST :]`; columns follow that order.
 
-The arenas of a tree are, each from the start of a cache line on:
-    node    (n, 16) int64    one row per variable, by its index in the graph
-    link    (m, 8) int64     one row per factor, by its id
-    clique  (c, 24) int64    records of cliques
-    lists   int64            variables of cliques
-    numbers float64          rows and update matrices; the first `fronts.SCRATCH` doubles are scratch
-    hessian float64          of each factor: HᵢᵀΩHᵢ, HᵢᵀΩHⱼ, HⱼᵀΩHⱼ, −HᵢᵀΩr, −HⱼᵀΩr, rᵀΩr where it was linearised
-    stiff   (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearised, (9.12);
-                             between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is that of a
-                             disc and an angle; at the estimate χ², error² in full, and as it counts
-    lin     (3, x) float64   laid out as the graph's values: linearisation points; those to go back to; the estimate
-                             before the step, of what it changes
-    scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
-                             back to while variables are relinearised
-    turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; cosine and sine where a plane pose is
-                             linearised
-    pending, changed, moved  (n,) int64   variables: that wait to be relinearised; that the step changed; that moved
-                             since their factors were evaluated last
-    marked  (c,) int64       scratch: cliques that an elimination touches, later those that move as a whole
-    motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
-    saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
-    settings (24,) float64   see P_RIPPLE and so on
-    state   int64            counters and the heads of free lists
-    account (13,) float64     what a step found
+Its arrays are those of `records.Tree`; what their columns hold stands here.
 """
-
-# The arenas of a tree in its table (`places`).
-ARENAS = (
-    "settings", "node", "link", "clique", "lists", "numbers", "hessian", "lin", "scalars", "stiff", "turns",
-    "pending",
-    "changed", "moved", "marked", "motions", "saved", "state", "account",
-)  # fmt: skip
-(
-    T_SETTINGS, T_NODE, T_LINK, T_CLIQUE, T_LISTS, T_NUMBERS, T_HESSIAN, T_LIN, T_SCALARS, T_STIFF, T_TURNS,
-    T_PENDING,
-    T_CHANGED, T_MOVED, T_MARKED, T_MOTIONS, T_SAVED, T_STATE, T_ACCOUNT,
-) = range(len(ARENAS))  # fmt: skip
 
 # Columns of `node`, a cache line each: what most steps look at,
 N_CLIQUE = 0  # where it is a frontal; -1: nowhere yet, or fixed

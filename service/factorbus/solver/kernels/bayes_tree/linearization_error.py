@@ -23,10 +23,12 @@ from factorbus.solver.kernels.bayes_tree.error_terms import (
 from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, factor_chi2, heading_of
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, STAYED
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 
 LEAST_BURDEN = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
@@ -40,22 +42,18 @@ MOST_ERROR = 1e100  # of a factor: its square is still a number
 
 
 @part
-def measure(
-    settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
-    values: F64, turns: F64, pending: I64, moved: I64, state: I64, account: F64,
-) -> float:  # fmt: skip
+def measure(graph: Graph, tree: Tree, settings: F64) -> float:
     """Evaluate the factors of what `moved`, which empties that, and see whether what waits is due.
 
     Gives Σ error² of what waits, as a multiple of (9.22).
     """
+    var = graph.var
+    stiff, pending, state, account = tree.stiff, tree.pending, tree.state, tree.account
     if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
     most = 0.0
     if state[tl.S_MOVED] > 0:
-        most = evaluate_moved(
-            settings[tl.P_BENT], var, fac, payload, node, link, stiff, lin, scalars, values, turns, pending, moved,
-            state, account,
-        )  # fmt: skip
+        most = evaluate_moved(graph, tree, settings[tl.P_BENT])  # fmt: skip
         if not account[tl.A_ADDED_UP] <= CANCELLED * (account[tl.A_CHI2] + NOTHING):
             sum_anew(stiff, state, account)
     scaled = weighed(account[tl.A_COUNTED], settings, var, pending, state)
@@ -66,14 +64,14 @@ def measure(
 
 
 @part
-def evaluate_moved(
-    bent: float, var: I64, fac: I64, payload: F64, node: I64, link: I64, stiff: F64, lin: F64, scalars: F64,
-    values: F64, turns: F64, pending: I64, moved: I64, state: I64, account: F64,
-) -> float:  # fmt: skip
+def evaluate_moved(graph: Graph, tree: Tree, bent: float) -> float:
     """χ² and linearization error of every factor of what `moved`, which is empty then; gives the largest error.
 
     Factors are gone through in the order of their ids where many variables moved, else variable by variable.
     """
+    var, fac, values = graph.var, graph.fac, graph.values
+    node, link, scalars, turns, moved = tree.node, tree.link, tree.scalars, tree.turns, tree.moved
+    state, account = tree.state, tree.account
     delta, most = scalars[0], 0.0
     chi2, sizes, full, counted = account[tl.A_CHI2], account[tl.A_ADDED_UP], account[tl.A_ERROR], account[tl.A_COUNTED]
     if state[tl.S_MOVED] * MUCH > state[tl.S_VARIABLES]:
@@ -85,9 +83,7 @@ def evaluate_moved(
                 if v != last:
                     c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
                     last = v
-                error, more, size, more_full, more_counted = evaluate_factor(
-                    f, v, c, s, how, bent, var, fac, payload, node, stiff, lin, delta, values, pending, state
-                )
+                error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, bent)
                 most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                 full, counted = full + more_full, counted + more_counted
     else:
@@ -103,9 +99,7 @@ def evaluate_moved(
                     if v != u:
                         c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
                     how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
-                    error, more, size, more_full, more_counted = evaluate_factor(
-                        f, v, c, s, how, bent, var, fac, payload, node, stiff, lin, delta, values, pending, state
-                    )
+                    error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, bent)
                     most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                     full, counted = full + more_full, counted + more_counted
                 slot = next_incidence(slot, link)
@@ -128,15 +122,16 @@ def moved_ends(first: int, second: int, node: I64) -> int:
 
 @inline_kernel
 def evaluate_factor(
-    f: int, v: int, c: float, s: float, how: int, bent: float, var: I64, fac: I64, payload: F64, node: I64, stiff: F64,
-    lin: F64, delta: F64, values: F64, pending: I64, state: I64,
-) -> tuple[float, float, float, float, float]:  # fmt: skip
+    graph: Graph, tree: Tree, f: int, v: int, c: float, s: float, how: int, bent: float
+) -> tuple[float, float, float, float, float]:
     """χ² of factor f, whose first variable is v, and its linearization error, where more of it than its place moved.
 
     Gives the error; by what χ² is more than before; the sum of both, and of error² now and before; by what error² in
     full and as it counts is more.
     """
-    error = full = 0.0
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
+    lin, delta, error, full = tree.lin[0], tree.scalars[0], 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
     if kind >= at.IDP_FIRST or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
         if how < MODEL:
@@ -149,11 +144,9 @@ def evaluate_factor(
             if error > bent:
                 await_ends(f, fac, var, node, pending, state)
     else:
-        chi2, gap, turned = factor_chi2(f, kind, c, s, var, fac, values, payload, stiff)
+        chi2, gap, turned = factor_chi2(graph, tree, f, kind, c, s)
         if second >= 0 and how == MODEL:
-            error, full = error_of(
-                f, v, kind, second, bent, gap, chi2, turned, var, node, stiff, lin, delta, values, pending, state
-            )
+            error, full = error_of(graph, tree, f, v, bent, gap, chi2, turned)
     was = stiff[f, tl.B_CHI2]
     stiff[f, tl.B_CHI2] = chi2
     if how < MODEL:
@@ -167,12 +160,14 @@ def evaluate_factor(
 
 @inline_kernel
 def error_of(
-    f: int, v: int, kind: int, second: int, bent: float, gap: float, chi2: float, turned: float, var: I64, node: I64,
-    stiff: F64, lin: F64, delta: F64, values: F64, pending: I64, state: I64,
-) -> tuple[float, float]:  # fmt: skip
-    """How far factor f from v to `second` is from its linear model, as it counts and in full.  Where that is more than
-    `bent`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
+    graph: Graph, tree: Tree, f: int, v: int, bent: float, gap: float, chi2: float, turned: float
+) -> tuple[float, float]:
+    """How far factor f, whose first variable is v, is from its linear model, as it counts and in full.  Where
+    that is more than `bent`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
     """
+    var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
+    node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
+    lin, delta = tree.lin[0], tree.scalars[0]
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
     phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
     d, root, shift = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], shift_between(planar, x, y, values, lin)

@@ -1,12 +1,14 @@
 """The estimate of variables of which δ is another one."""
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import turn_se2
 from factorbus.solver.kernels.model.se3 import move_se3
 from factorbus.solver.kernels.model.sizes import size_of
@@ -16,10 +18,10 @@ STAYED, PLACE, MODEL = 0, 1, 2
 
 
 @inline_kernel
-def move_variable(
-    v: int, var: I64, node: I64, delta: F64, lin: F64, before: F64, turns: F64, values: F64, changed: I64, state: I64
-) -> None:
+def move_variable(graph: Graph, tree: Tree, v: int, delta: F64, lin: F64, before: F64) -> None:
     """The estimate of variable v, of which δ is another one."""
+    var, values = graph.var, graph.values
+    node, turns, changed, state = tree.node, tree.turns, tree.changed, tree.state
     kind, x = var[v, at.V_KIND], var[v, at.V_AT]
     if node[v, tl.N_MOVED] != state[tl.S_STEP]:
         node[v, tl.N_MOVED] = state[tl.S_STEP]

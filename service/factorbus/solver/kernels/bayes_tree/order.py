@@ -8,9 +8,11 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, separators_of
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse.amd import ELEMENT, eliminate
 
 NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of what is recent
@@ -18,14 +20,15 @@ NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of
 
 @part
 def order_affected(
-    n: int, affected: I64, factors: I64, orphans: I64, recent: int, last: int,
-    var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64,
-) -> I64:  # fmt: skip
+    graph: Graph, tree: Tree, n: int, affected: I64, factors: I64, orphans: I64, recent: int, last: int
+) -> I64:
     """perm (n,): affected[perm[k]] is eliminated k-th.
 
     Last go those that are near, ring by ring, then variables with a factor in the last `recent` steps, then the
     variable `last`; −1: none does.
     """
+    var, fac = graph.var, graph.fac
+    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
     dims, group = np.empty(n, np.int64), np.empty(n, np.int64)
     stamp, m = state[tl.S_STAMP], orphans.size
     for k in range(n):
@@ -109,13 +112,13 @@ def find_lowest(label: I64, orphans: I64, node: I64, clique: I64, lists: I64, st
 
 
 @part
-def list_pairs(
-    lowest: I64, factors: I64, orphans: I64, var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64
-) -> tuple[I64, I64]:
+def list_pairs(graph: Graph, tree: Tree, lowest: I64, factors: I64, orphans: I64) -> tuple[I64, I64]:
     """Pairs (rows, cols) that have the same fill as factors and orphans.
 
     An orphan joins the first variable of its separator to go, `lowest`, to the others.
     """
+    var, fac = graph.var, graph.fac
+    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
     stamp, count = state[tl.S_STAMP], 0
     for e in range(orphans.size):
         first, end = separators_of(orphans[e], stamp, clique)

@@ -15,18 +15,20 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, separators_of
 from factorbus.solver.kernels.bayes_tree.fronts import join_fronts
 from factorbus.solver.kernels.bayes_tree.order import ends_of, group_of
+from factorbus.solver.kernels.bayes_tree.records import Fronts, Tree
 from factorbus.solver.kernels.jit.bit_sets import count_bits, highest_bit, lowest_bit
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
+from factorbus.solver.kernels.model.records import Graph
 
 NONE = -1
 PLANES = 3  # binary digits of how many scalars a variable has
 
 
 @part
-def join_few(
-    n: int, factors: I64, orphans: I64, var: I64, fac: I64, node: I64, clique: I64, lists: I64, state: I64
-) -> tuple[I64, I64]:
+def join_few(graph: Graph, tree: Tree, n: int, factors: I64, orphans: I64) -> tuple[I64, I64]:
     """near (n,): who is next to each variable; hung: each orphan's separator."""
+    var, fac = graph.var, graph.fac
+    node, clique, lists, state = tree.node, tree.clique, tree.lists, tree.state
     near, hung = np.empty(n, np.int64), np.empty(orphans.size, np.int64)
     for k in range(n):
         near[k] = 1 << k
@@ -119,7 +121,7 @@ def scalars_in(word: int, planes: I64) -> int:
 
 
 @part
-def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I64, var: I64) -> tuple:
+def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I64, var: I64) -> tuple[Fronts, I64]:
     """As `analyze_affected`, and lowest: each orphan's first variable to go."""
     label, dim, parent = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     border = np.empty(n, np.int64)
@@ -133,7 +135,7 @@ def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I
     lowest = np.empty(hung.size, np.int64)
     for e in range(hung.size):
         lowest[e] = first_to_go(hung[e], label)
-    return order, label, home, records, border_at, border_of, lowest
+    return Fronts(order, label, home, records, border_at, border_of), lowest
 
 
 @inline_kernel

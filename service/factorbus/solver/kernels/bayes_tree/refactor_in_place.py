@@ -12,9 +12,11 @@ from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
 from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
 from factorbus.solver.kernels.bayes_tree.fronts import row_layout, update_layout
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.reroot import flops_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.multifrontal import clear_front
 from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, factor_front
@@ -88,15 +90,15 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 
 
 @part
-def renew(
-    renewed: I64, n: int, stiffest: float, old: I64, var: I64, fac: I64, node: I64, link: I64, clique: I64, lists: I64,
-    numbers: F64, hessian: F64, scalars: F64, state: I64, board: I64,
-) -> int:  # fmt: skip
+def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, board: I64) -> int:
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
     old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  board: see
     `task_queue`.
     """
+    var = graph.var
+    node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
+    scalars, state = tree.scalars, tree.state
     if not take_blocks(renewed, old, clique, numbers, state):
         return tl.NO_ROOM
     widest, most, total = 0, 0, n
@@ -119,13 +121,13 @@ def renew(
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
             while f >= 0:
-                add_hessian(f, row, column, var, fac, node, link, hessian, numbers)
+                add_hessian(graph, tree, f, row, column)
                 f = link[f, tl.L_OWN]
         child = row[tl.C_CHILD]
         while child >= 0:
             other = clique[child]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            count = list_runs(start, start + other[tl.C_SEPARATORS], column, p, m, var, node, lists, runs)
+            count = list_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, count, row)
             child = other[tl.C_NEXT]
         failed = factor_front(

@@ -1,14 +1,14 @@
 """Moving linearisation points of single variables to the estimate, and back.  MATH §9.6."""
 
-import numpy as np
-
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, note_turn
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.hessian import linearise_factor
+from factorbus.solver.kernels.bayes_tree.hessian import linearise_factor, make_scratch
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
-from factorbus.solver.kernels.jit.compile import F64, I64, part
+from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.jit.compile import I64, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
 WAITS, MOVES = 1, 2
@@ -16,11 +16,11 @@ SPARSE = 16  # where no more than one factor in so many is to be linearised, the
 
 
 @part
-def relinearise(
-    pending: I64, var: I64, fac: I64, values: F64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64,
-    scalars: F64, stiff: F64, turns: F64, moved: I64, state: I64,
-) -> None:  # fmt: skip
+def relinearise(graph: Graph, tree: Tree, pending: I64) -> None:
     """Move the pending variables to the estimate, and linearise their factors there."""
+    var, values = graph.var, graph.values
+    node, lin, scalars, turns, moved = tree.node, tree.lin, tree.scalars, tree.turns, tree.moved
+    state = tree.state
     for k in range(pending.size):
         v = pending[k]
         if node[v, tl.N_FLAGS] != WAITS:
@@ -34,15 +34,14 @@ def relinearise(
         node[v, tl.N_FLAGS] = MOVES
         list_moved(MODEL, v, node, moved, state)
         state[tl.S_RELINEARISED] += 1
-    linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
+    linearise_around(graph, tree, pending)
 
 
 @part
-def go_back(
-    pending: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, scalars: F64,
-    stiff: F64, turns: F64, state: I64,
-) -> None:  # fmt: skip
+def go_back(graph: Graph, tree: Tree, pending: I64) -> None:
     """Undo `relinearise`: its variables wait again."""
+    var = graph.var
+    node, lin, scalars, turns, state = tree.node, tree.lin, tree.scalars, tree.turns, tree.state
     for k in range(pending.size):
         v = pending[k]
         x, d = var[v, at.V_AT], var[v, at.V_SCALAR]
@@ -53,19 +52,17 @@ def go_back(
         note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = WAITS
         state[tl.S_RELINEARISED] -= 1
-    linearise_around(pending, var, fac, payload, node, link, hessian, lin, stiff, state)
+    linearise_around(graph, tree, pending)
 
 
 @part
-def linearise_around(
-    variables: I64, var: I64, fac: I64, payload: F64, node: I64, link: I64, hessian: F64, lin: F64, stiff: F64,
-    state: I64,
-) -> None:  # fmt: skip
+def linearise_around(graph: Graph, tree: Tree, variables: I64) -> None:
     """Linearise the factors of some variables, each once, in the order of their ids: so they lie in memory.
 
     In that of the variables, which is the tree's, it takes twice as long.
     """
-    r, H, W = np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6))
+    node, link, state = tree.node, tree.link, tree.state
+    scratch = make_scratch()
     state[tl.S_SWEEP] += 1
     sweep, count, first, last = state[tl.S_SWEEP], 0, state[tl.S_FACTORS], -1
     for k in range(variables.size):
@@ -79,7 +76,7 @@ def linearise_around(
     if last - first < SPARSE * count:
         for f in range(first, last + 1):
             if link[f, tl.L_STAMP] == sweep:
-                linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
+                linearise_factor(graph, tree, f, scratch)
         return
     for k in range(variables.size):
         slot = node[variables[k], tl.N_ADJ]
@@ -87,5 +84,5 @@ def linearise_around(
             f = slot // 2
             if link[f, tl.L_STAMP] == sweep:
                 link[f, tl.L_STAMP] = -1
-                linearise_factor(f, var, fac, lin[0], payload, link, hessian, stiff, r, H, W, state)
+                linearise_factor(graph, tree, f, scratch)
             slot = next_incidence(slot, link)

@@ -7,19 +7,21 @@ behind a row that goes moves up by one, in the graph and in the tree, and what t
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.jit.array_table import float_rows, int_rows, ints
+from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1])")
-def close_gaps(gone: I64, graph: I64, tree: I64) -> None:
+def close_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
     """The rows behind `gone`, ascending, which are in no list any more, move up.
 
-    graph, tree: tables of their arenas (`places`).
+    graph_table, tree_table: of their arrays (`records`).
     """
-    fac, counts = int_rows(graph, at.T_FAC), ints(graph, at.T_COUNTS)
-    link, stiff, state = int_rows(tree, tl.T_LINK), float_rows(tree, tl.T_STIFF), ints(tree, tl.T_STATE)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    fac, counts = graph.fac, graph.counts
+    link, stiff, state = tree.link, tree.stiff, tree.state
     first, count, taken = gone[0], counts[at.FACTORS], state[tl.S_FACTORS]
     rows = np.empty(count - first, np.int64)
     k = 0
@@ -46,10 +48,11 @@ def close_gaps(gone: I64, graph: I64, tree: I64) -> None:
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1])")
-def open_gaps(gone: I64, graph: I64, tree: I64) -> None:
+def open_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
     """Undo `close_gaps`: the rows `gone` are there again, to be filled and linked by the caller."""
-    fac, counts = int_rows(graph, at.T_FAC), ints(graph, at.T_COUNTS)
-    link, stiff, state = int_rows(tree, tl.T_LINK), float_rows(tree, tl.T_STIFF), ints(tree, tl.T_STATE)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    fac, counts = graph.fac, graph.counts
+    link, stiff, state = tree.link, tree.stiff, tree.state
     first, count, taken = gone[0], counts[at.FACTORS], state[tl.S_FACTORS]
     rows = np.empty(count - first, np.int64)
     k = 0
@@ -73,9 +76,9 @@ def open_gaps(gone: I64, graph: I64, tree: I64) -> None:
 
 
 @part
-def renumber(first: int, rows: I64, fac: I64, tree: I64) -> None:
+def renumber(first: int, rows: I64, fac: I64, tree: Tree) -> None:
     """Lists that name factor f ≥ first name rows[f − first] instead; fac: rows as they were."""
-    node, link, state = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), ints(tree, tl.T_STATE)
+    node, link, state = tree.node, tree.link, tree.state
     for v in range(state[tl.S_VARIABLES]):
         node[v, tl.N_OWN] = renumbered(node[v, tl.N_OWN], first, rows)
         node[v, tl.N_ADJ] = renumbered_slot(node[v, tl.N_ADJ], first, rows)

@@ -9,8 +9,10 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, touch
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 
 INNERMOST = 30.0  # scalars of the smallest ring, at least
 MOST_RINGS = 60  # each has a group of its own in the order
@@ -46,16 +48,15 @@ def count_near(marked: I64, relinearises: bool, settings: F64, clique: I64, stat
 
 
 @part
-def touch_near(
-    room: int, f1: int, settings: F64, var: I64, fac: I64, node: I64, link: I64, clique: I64, state: I64, marked: I64,
-    count: int,
-) -> int:  # fmt: skip
+def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, marked: I64, count: int) -> int:
     """Touch up to `room` scalars of the variables nearest to those of the newest factors, but for those that would take
     too much; gives the count of marked cliques.
 
     Near is what few factors lie between.  N_NEAR of what was looked at becomes the present elimination, N_RING its
     ring: 0 for the outermost, or NO_RING.
     """
+    var, fac = graph.var, graph.fac
+    node, link, clique, state = tree.node, tree.link, tree.clique, tree.state
     stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
     detour, wider = settings[tl.P_DETOUR] * flops_of(marked[:count], clique), settings[tl.P_RINGS]
     ring, within, scalars = 0, float(room), 0

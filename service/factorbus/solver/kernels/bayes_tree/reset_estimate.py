@@ -6,26 +6,28 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
-from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
+from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.jit.compile import I64, kernel
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import size_of
 
 
 @kernel("void(int64[::1], int64[::1])")
-def hold_at_linearization(graph: I64, tree: I64) -> None:
+def hold_at_linearization(graph_table: I64, tree_table: I64) -> None:
     """δ = 0 everywhere, as if every clique had been solved so; the next back-substitution from a root moves on.
 
-    graph, tree: tables of their arenas (`places`).  χ² and linearization errors are measured anew.
+    graph_table, tree_table: of their arrays (`records`).  χ² and linearization errors are measured anew.
     """
-    var, fac = int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    values, payload, settings = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD), floats(tree, tl.T_SETTINGS)
-    node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
-    numbers, motions = floats(tree, tl.T_NUMBERS), floats(tree, tl.T_MOTIONS)
-    lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
-    turns, pending, moved = float_rows(tree, tl.T_TURNS), ints(tree, tl.T_PENDING), ints(tree, tl.T_MOVED)
-    state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    var = graph.var
+    values, settings = graph.values, tree.settings
+    node, clique = tree.node, tree.clique
+    numbers, motions = tree.numbers, tree.motions
+    lin, scalars = tree.lin, tree.scalars
+    moved = tree.moved
+    state, account = tree.state, tree.account
     for v in range(state[tl.S_VARIABLES]):
         x, d, c = var[v, at.V_AT], var[v, at.V_SCALAR], node[v, tl.N_CLIQUE]
         list_moved(MODEL, v, node, moved, state)
@@ -41,7 +43,5 @@ def hold_at_linearization(graph: I64, tree: I64) -> None:
             for k in range(tl.M_WIDTH):
                 motions[c * tl.M_WIDTH + k] = 0.0
             clique[c, tl.C_MOVES] = 0
-    measure(
-        settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved, state, account
-    )
+    measure(graph, tree, settings)
     account[tl.A_LEFT] = np.inf

@@ -17,11 +17,13 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.error_terms import turn_of
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, PLACE, list_moved, move_variable
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import rotation
 
 MOTION = tl.MOTION
@@ -48,18 +50,19 @@ def is_relative(f: int, var: I64, fac: I64) -> bool:
 
 @part
 def fit_motion(
-    row: I64, since: int, far: float, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64,
-    turns: F64, motions: F64, motion: F64,
-) -> bool:  # fmt: skip
+    graph: Graph, tree: Tree, row: I64, since: int, far: float, delta: F64, weight: F64, motion: F64
+) -> bool:
     """Whether the separator moved as a rigid body since the frontals were solved with it, no scalar being off by more
     than √far σ; motion gets ξ.  since: where `motions` has what is known of it already
     """
+    var = graph.var
+    lists, numbers, lin, turns, motions = tree.lists, tree.numbers, tree.lin[0], tree.turns, tree.motions
     first = row[tl.C_LIST] + row[tl.C_FRONTALS]
     last, used = first + row[tl.C_SEPARATORS], row[tl.C_USED] + row[tl.C_PIVOTS]
     kind = var[lists[first], at.V_KIND]
     if kind == at.SE2 or kind == at.POINT2:
-        fit_plane(first, last, used, var, lists, numbers, delta, weight, lin, turns, motion)
-    elif not fit_space(first, last, used, var, lists, numbers, delta, weight, lin, motion):
+        fit_plane(graph, tree, first, last, used, delta, weight, motion)
+    elif not fit_space(graph, tree, first, last, used, delta, weight, motion):
         return False
     for s in range(first, last):
         v = lists[s]
@@ -76,11 +79,10 @@ def fit_motion(
 
 
 @inline_kernel
-def fit_plane(
-    first: int, last: int, used: int, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64,
-    turns: F64, motion: F64,
-) -> None:  # fmt: skip
+def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta: F64, weight: F64, motion: F64) -> None:
     """ξ nearest to how the variables moved, by the weights of their first scalars."""
+    var = graph.var
+    lists, numbers, lin, turns = tree.lists, tree.numbers, tree.lin[0], tree.turns
     x0, y0 = load(lin, var[lists[first], at.V_AT]), load(lin, var[lists[first], at.V_AT] + 1)
     mass = px = py = ux = uy = inertia = pull = 0.0
     for s in range(first, last):
@@ -131,10 +133,10 @@ def moved_in_space(d: int, place: int, x: int, kind: int, numbers: F64, delta: F
 
 
 @inline_kernel
-def fit_space(
-    first: int, last: int, used: int, var: I64, lists: I64, numbers: F64, delta: F64, weight: F64, lin: F64, motion: F64
-) -> bool:
+def fit_space(graph: Graph, tree: Tree, first: int, last: int, used: int, delta: F64, weight: F64, motion: F64) -> bool:
     """The same of poses and points in space; False: any turn about some axis would do."""
+    var = graph.var
+    lists, numbers, lin = tree.lists, tree.numbers, tree.lin[0]
     origin = var[lists[first], at.V_AT]
     x0, y0, z0 = load(lin, origin), load(lin, origin + 1), load(lin, origin + 2)
     mass = px = py = pz = ux = uy = uz = 0.0
@@ -239,14 +241,14 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
 
 
 @part
-def move_bodies(
-    listed: I64, quiet: float, var: I64, node: I64, clique: I64, lists: I64, delta: F64, lin: F64, before: F64,
-    turns: F64, values: F64, changed: I64, moved: I64, motions: F64, motion: F64, state: I64,
-) -> None:  # fmt: skip
+def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64, before: F64, motion: F64) -> None:
     """The variables of the listed cliques move with their bodies, in the order in which they lie in memory.
 
     Where turns since it was solved bend, (9.21), by no more than `quiet`, linearization errors stay what they were.
     """
+    var = graph.var
+    node, clique, lists, lin, turns = tree.node, tree.clique, tree.lists, tree.lin[0], tree.turns
+    moved, motions, state = tree.moved, tree.motions, tree.state
     n = 0
     for k in range(listed.size):
         n += clique[listed[k], tl.C_FRONTALS]
@@ -264,6 +266,6 @@ def move_bodies(
         displace(v, var, lin, turns, motion, TABLE + int(load(motions, since + tl.M_BODY)) * MOTION, motion)
         for a in range(dim_of_variable(var, v)):
             put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
-        move_variable(v, var, node, delta, lin, before, turns, values, changed, state)
+        move_variable(graph, tree, v, delta, lin, before)
         bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
         list_moved(MODEL if bend > quiet else PLACE, v, node, moved, state)

@@ -39,6 +39,7 @@ from factorbus.solver.kernels.bayes_tree.fronts import (
 from factorbus.solver.kernels.bayes_tree.linearization_error import await_all, measure
 from factorbus.solver.kernels.bayes_tree.order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.bayes_tree.order_small import analyze_few, join_few, order_few
+from factorbus.solver.kernels.bayes_tree.records import Affected, Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.refactor_in_place import (
     OLD,
     commit_renewed,
@@ -51,11 +52,11 @@ from factorbus.solver.kernels.bayes_tree.refactor_in_place import (
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearise
 from factorbus.solver.kernels.bayes_tree.reroot import account_for, count_near, touch_near
 from factorbus.solver.kernels.bayes_tree.worker_thread import lend
-from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
 from factorbus.solver.kernels.jit.bit_sets import MOST
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
 
 FREE = 0
@@ -70,9 +71,9 @@ PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to fact
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
-def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
-    """Take in what is new in the graph, and solve.  graph, tree: tables of their arenas (`places`); board: where cores
-    are lent (`task_queue`); lender: NOBODY, or this is no step, but a thread that lends its core (`lend`).
+def tree_step(graph_table: I64, tree_table: I64, board: I64, lender: int) -> int:
+    """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); board: where
+    cores are lent (`task_queue`); lender: NOBODY, or this is no step, but a thread that lends its core (`lend`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
@@ -83,20 +84,16 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
         lend(board, lender)
         return tl.DONE
     began = cycles()
-    counts, var, fac = ints(graph, at.T_COUNTS), int_rows(graph, at.T_VAR), int_rows(graph, at.T_FAC)
-    values, payload, settings = floats(graph, at.T_VALUES), floats(graph, at.T_PAYLOAD), floats(tree, tl.T_SETTINGS)
-    node, link, clique = int_rows(tree, tl.T_NODE), int_rows(tree, tl.T_LINK), int_rows(tree, tl.T_CLIQUE)
-    lists, numbers, hessian = ints(tree, tl.T_LISTS), floats(tree, tl.T_NUMBERS), floats(tree, tl.T_HESSIAN)
-    lin, scalars, stiff = float_rows(tree, tl.T_LIN), float_rows(tree, tl.T_SCALARS), float_rows(tree, tl.T_STIFF)
-    turns, pending, changed = float_rows(tree, tl.T_TURNS), ints(tree, tl.T_PENDING), ints(tree, tl.T_CHANGED)
-    moved, marked, saved = ints(tree, tl.T_MOVED), ints(tree, tl.T_MARKED), float_rows(tree, tl.T_SAVED)
-    motions = floats(tree, tl.T_MOTIONS)
-    state, account = ints(tree, tl.T_STATE), floats(tree, tl.T_ACCOUNT)
+    graph, tree = graph_at(graph_table), tree_at(tree_table)
+    counts, var, fac, values, settings = graph.counts, graph.var, graph.fac, graph.values, tree.settings
+    node, clique, numbers, lin, stiff = tree.node, tree.clique, tree.numbers, tree.lin, tree.stiff
+    scalars, turns, pending, changed, marked = tree.scalars, tree.turns, tree.pending, tree.changed, tree.marked
+    state, account = tree.state, tree.account
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
     if state[tl.S_BEGUN] == 0:
         if len(clique) > marked.size:
             return tl.NO_ROOM
-        status = begin(counts, settings, var, fac, values, payload, node, link, hessian, lin, scalars, saved, state)
+        status = begin(graph, tree)
         if status != tl.DONE:
             return status
         account[tl.A_STIFFEST_BEFORE] = account[tl.A_STIFFEST]
@@ -120,35 +117,28 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
     scaled[tl.P_PATIENCE] *= scaled[tl.P_DEAR]
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
-    if not take_in_factors(
-        f1, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, moved, saved, state, account
-    ):
-        undo(v0, var, fac, node, link, scalars, turns, moved, saved, state, account)
+    if not take_in_factors(graph, tree, f1):
+        undo(graph, tree, v0)
         return tl.INFINITE
     while True:
         moving = pending[: count_due(state)]
         if moving.size > 0:
-            relinearise(
-                moving, var, fac, values, payload, node, link, hessian, lin, scalars, stiff, turns, moved, state
-            )
+            relinearise(graph, tree, moving)
         lap(began, tl.LINEARISE, state)
         before = account[tl.A_CHI2]
-        pull, status = eliminate_again(
-            v0, v1, f1, moving, scaled, var, fac, values, payload, node, link, clique, lists, numbers, hessian, lin,
-            scalars, stiff, turns, pending, changed, moved, marked, motions, state, account, graph, tree, board,
-        )  # fmt: skip
+        pull, status = eliminate_again(graph, tree, v0, v1, f1, moving, scaled, board)
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
         began = cycles()
         if status == tl.FAILED:
             if moving.size > 0:
-                go_back(moving, var, fac, payload, node, link, hessian, lin, scalars, stiff, turns, state)
+                go_back(graph, tree, moving)
             if state[tl.S_ROUNDS] > 0:
                 break
             if moving.size > 0:
                 state[tl.S_WAIT] = 1
                 continue
-            undo(v0, var, fac, node, link, scalars, turns, moved, saved, state, account)
+            undo(graph, tree, v0)
             return tl.FAILED
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
@@ -172,16 +162,14 @@ def tree_step(graph: I64, tree: I64, board: I64, lender: int) -> int:
 
 
 @part
-def undo(
-    v0: int, var: I64, fac: I64, node: I64, link: I64, scalars: F64, turns: F64, moved: I64, saved: F64, state: I64,
-    account: F64,
-) -> None:  # fmt: skip
+def undo(graph: Graph, tree: Tree, v0: int) -> None:
     """The tree is as it was before the step."""
+    node, moved, state, account = tree.node, tree.moved, tree.state, tree.account
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
     state[tl.S_MOVED], account[tl.A_ADDED] = 0, 0.0
     account[tl.A_STIFFEST] = account[tl.A_STIFFEST_BEFORE]
-    take_out(v0, state[tl.S_TAKEN], var, fac, node, link, scalars, turns, saved, state)
+    take_out(graph, tree, v0, state[tl.S_TAKEN])
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = 0
@@ -286,30 +274,30 @@ def count_due(state: I64) -> int:
 
 @part
 def eliminate_again(
-    v0: int, v1: int, f1: int, moving: I64, settings: F64, var: I64, fac: I64, values: F64, payload: F64, node: I64,
-    link: I64, clique: I64, lists: I64, numbers: F64, hessian: F64, lin: F64, scalars: F64, stiff: F64, turns: F64,
-    pending: I64, changed: I64, moved: I64, marked: I64, motions: F64, state: I64, account: F64, graph: I64,
-    tree: I64, board: I64,
-) -> tuple[float, int]:  # fmt: skip
+    graph: Graph, tree: Tree, v0: int, v1: int, f1: int, moving: I64, settings: F64, board: I64
+) -> tuple[float, int]:
     """Steps 3 to 9; gives Σ error² as `measure` does, and the status."""
+    var, fac = graph.var, graph.fac
+    node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
+    hessian, moved, listed, state, account = tree.hessian, tree.moved, tree.marked, tree.state, tree.account
     # 3
     now = cycles()
     state[tl.S_STAMP] += 1
     count = 0
     for k in range(state[tl.S_EDITED]):
-        count = touch(moved[k], node, clique, state, marked, count)
+        count = touch(moved[k], node, clique, state, listed, count)
     for f in range(state[tl.S_TAKEN], f1):
-        count = touch_ends(f, fac, node, clique, state, marked, count)
-    renewed = mark_renewed(moving, fac, node, link, clique, state, marked)
+        count = touch_ends(f, fac, node, clique, state, listed, count)
+    renewed = mark_renewed(moving, fac, node, link, clique, state, listed)
     reorders = is_worth_ordering(renewed, clique)
     if reorders:
         renewed = renewed[:0]
-        count = touch_around(moving, fac, node, link, clique, state, marked, count)
-    around = count_near(marked[:count], reorders, settings, clique, state)
+        count = touch_around(moving, fac, node, link, clique, state, listed, count)
+    around = count_near(listed[:count], reorders, settings, clique, state)
     if around > 0:
-        count = touch_near(around, f1, settings, var, fac, node, link, clique, state, marked, count)
+        count = touch_near(graph, tree, around, f1, settings, listed, count)
         renewed = still_renewed(renewed, clique, state)
-    listed, marked = marked, marked[:count]
+    marked = listed[:count]
     room = v1 - v0
     hanging = 0
     for k in range(count):
@@ -320,7 +308,7 @@ def eliminate_again(
             hanging += 1
             child = clique[child, tl.C_NEXT]
     affected, orphans = np.empty(room, np.int64), np.empty(hanging, np.int64)
-    n, hanging = detach(marked, settings, var, node, clique, lists, state, affected, orphans)
+    n, hanging = detach(graph, tree, marked, settings, affected, orphans)
     for v in range(v0, v1):
         if var[v, at.V_COLUMN] >= 0:
             node[v, tl.N_STAMP], node[v, tl.N_LOCAL] = state[tl.S_STAMP], n
@@ -329,31 +317,12 @@ def eliminate_again(
     orphans = orphans[:hanging]
     if n == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
-        return substitute_and_measure(
-            renewed[:0], renewed[:0], settings, var, fac, payload, node, link, clique, lists, numbers, lin, scalars,
-            stiff, turns, values, pending, changed, moved, listed, motions, state, account,
-        )  # fmt: skip
+        return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings, listed)  # fmt: skip
     now = lap(now, tl.MARK, state)
     old = np.empty((renewed.size, OLD), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
-        status = renew(
-            renewed,
-            n,
-            account[tl.A_STIFFEST],
-            old,
-            var,
-            fac,
-            node,
-            link,
-            clique,
-            lists,
-            numbers,
-            hessian,
-            scalars,
-            state,
-            board,
-        )
+        status = renew(graph, tree, renewed, n, account[tl.A_STIFFEST], old, board)
         if status != tl.DONE:
             return 0.0, status
     now = lap(now, tl.ELIMINATE, state)
@@ -361,34 +330,32 @@ def eliminate_again(
     now = lap(now, tl.MARK, state)
     # 4, 5
     if is_root_alone(marked, n, v1 - v0, affected, settings, var, clique):
-        order, place, home, records, border_at, border_of = keep_root(n, affected, var)
-        lowest = find_lowest(place, orphans, node, clique, lists, state)
+        fronts = keep_root(n, affected, var)
+        lowest = find_lowest(fronts.place, orphans, node, clique, lists, state)
     else:
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
         drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0 and state[tl.S_EDITED] == 0
         last = find_newest(v1, var) if drives_on else -1
         recent = int(settings[tl.P_RECENT])
         if n <= MOST:
-            near, hung = join_few(n, factors, orphans, var, fac, node, clique, lists, state)
+            near, hung = join_few(graph, tree, n, factors, orphans)
             perm, row, planes = order_few(n, near, affected, recent, last, var, node, state)
             now = lap(now, tl.ORDER, state)
-            order, place, home, records, border_at, border_of, lowest = analyze_few(
-                n, perm, row, planes, hung, affected, var
-            )
+            fronts, lowest = analyze_few(n, perm, row, planes, hung, affected, var)
         else:
-            perm = order_affected(n, affected, factors, orphans, recent, last, var, fac, node, clique, lists, state)
+            perm = order_affected(graph, tree, n, affected, factors, orphans, recent, last)
             label = np.empty(n, np.int64)
             for k in range(n):
                 label[perm[k]] = k
             now = lap(now, tl.ORDER, state)
             lowest = find_lowest(label, orphans, node, clique, lists, state)
-            rows, cols = list_pairs(lowest, factors, orphans, var, fac, node, clique, lists, state)
-            order, place, home, records, border_at, border_of = analyze_affected(n, perm, affected, var, rows, cols)
+            rows, cols = list_pairs(graph, tree, lowest, factors, orphans)
+            fronts = analyze_affected(n, perm, affected, var, rows, cols)
     update = np.empty((orphans.size, 3), np.int64)
-    if not update_orphans(orphans, var, fac, node, link, clique, lists, numbers, hessian, state, update):
+    if not update_orphans(graph, tree, orphans, update):
         give_back_renewed(renewed, old, clique, numbers, state)
         return 0.0, tl.NO_ROOM
-    ids, placed = place_fronts(records, order, affected, border_at, border_of, clique, lists, numbers, state)
+    ids, placed = place_fronts(tree, fronts, affected)
     if not placed:
         give_back_renewed(renewed, old, clique, numbers, state)
         give_back_updates(update, numbers, state)
@@ -396,9 +363,8 @@ def eliminate_again(
     now = lap(now, tl.SYMBOLIC, state)
     # 6
     flops = state[tl.S_FLOPS]
-    failed = eliminate_fronts(
-        ids, records, order.size, home, place, factors, orphans, lowest, update, graph, tree, board
-    )
+    taken_apart = Affected(marked, orphans, affected, factors)
+    failed = eliminate_fronts(graph, tree, ids, fronts, taken_apart, lowest, update, board)
     if failed < 0 and state[tl.S_EDITED] != 0 and state[tl.S_RAISED] != 0:
         failed = find_loose_end(var, moved, state)
     if failed >= 0:
@@ -410,10 +376,7 @@ def eliminate_again(
     account_for(state[tl.S_FLOPS] - flops, around > 0, state)
     now = lap(now, tl.ELIMINATE, state)
     # 7
-    commit(
-        marked, orphans, update, lowest, ids, records, order, place, home, border_at, border_of, affected, factors,
-        var, fac, node, link, clique, lists, numbers, state, account,
-    )  # fmt: skip
+    commit(graph, tree, taken_apart, fronts, ids, lowest, update)
     tops = commit_renewed(renewed, old, clique, numbers, state, account)
     add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
     if state[tl.S_EDITED] != 0:
@@ -426,19 +389,15 @@ def eliminate_again(
         state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
         state[tl.S_RELINEARISING] = state[tl.S_FLOPS] - flops
     lap(now, tl.COMMIT, state)
-    return substitute_and_measure(
-        tops, ids, settings, var, fac, payload, node, link, clique, lists, numbers, lin, scalars, stiff, turns, values,
-        pending, changed, moved, listed, motions, state, account,
-    )  # fmt: skip
+    return substitute_and_measure(graph, tree, tops, ids, settings, listed)  # fmt: skip
 
 
 @inline_kernel
 def substitute_and_measure(
-    tops: I64, ids: I64, settings: F64, var: I64, fac: I64, payload: F64, node: I64, link: I64, clique: I64,
-    lists: I64, numbers: F64, lin: F64, scalars: F64, stiff: F64, turns: F64, values: F64, pending: I64, changed: I64,
-    moved: I64, listed: I64, motions: F64, state: I64, account: F64,
-) -> tuple[float, int]:  # fmt: skip
+    graph: Graph, tree: Tree, tops: I64, ids: I64, settings: F64, listed: I64
+) -> tuple[float, int]:
     """Steps 8 and 9, from the renewed cliques `tops` and the new ones `ids`, or from all roots."""
+    node, clique, state, account = tree.node, tree.clique, tree.state, tree.account
     now = cycles()
     if state[tl.S_CONTINUES] != 0:
         begins = list_roots(node, clique, state)
@@ -446,17 +405,12 @@ def substitute_and_measure(
         begins = np.empty(tops.size + ids.size, np.int64)
         for k in range(begins.size):
             begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
-    substitute(
-        begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], var, node, clique, lists, numbers,
-        lin, scalars, turns, values, changed, moved, listed, motions, state, account,
-    )  # fmt: skip
+    substitute(graph, tree, begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], listed)  # fmt: skip
     account[tl.A_CHI2] += account[tl.A_ADDED]
     account[tl.A_BEFORE] += account[tl.A_ADDED]
     account[tl.A_ADDED_UP] += account[tl.A_ADDED]
     account[tl.A_ADDED] = 0.0
-    pull = measure(
-        settings, var, fac, payload, node, link, stiff, lin[0], scalars, values, turns, pending, moved, state, account,
-    )  # fmt: skip
+    pull = measure(graph, tree, settings)  # fmt: skip
     lap(now, tl.SUBSTITUTE, state)
     return pull, tl.DONE
 

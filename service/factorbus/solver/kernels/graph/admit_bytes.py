@@ -16,22 +16,23 @@ from factorbus.solver.kernels.graph.admit import (
     slot_of,
 )
 from factorbus.solver.kernels.graph.initialize import reach
-from factorbus.solver.kernels.jit.array_table import floats, int_rows, ints
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import find_outside
+from factorbus.solver.kernels.model.records import graph_at
 
 
 @kernel("int64(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], int64[::1])")
-def admit_bytes(raw: bytes, groups: I64, graph: I64) -> int:
+def admit_bytes(raw: bytes, groups: I64, graph_table: I64) -> int:
     """Append the groups of variables and factors in `raw`, and give values to the variables that come without.
 
-    graph: the table of its arenas (`places`).  Gives the number of the first factor; or NO_ROOM or NOT_IN_ORDER, and
+    graph_table: of its arrays (`records`).  Gives the number of the first factor; or NO_ROOM or NOT_IN_ORDER, and
     nothing changed.
     """
-    table, keys, var = ints(graph, at.T_TABLE), ints(graph, at.T_KEYS), int_rows(graph, at.T_VAR)
-    values, dims, fac = floats(graph, at.T_VALUES), ints(graph, at.T_DIMS), int_rows(graph, at.T_FAC)
-    payload, counts, stamps = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS), ints(graph, at.T_STAMPS)
+    graph = graph_at(graph_table)
+    table, keys, var = graph.table, graph.keys, graph.var
+    values, dims, fac = graph.values, graph.dims, graph.fac
+    payload, counts, stamps = graph.payload, graph.counts, graph.stamps
     if not has_room(groups, table, keys, values, fac, payload, counts):
         return at.NO_ROOM
     before = counts.copy()

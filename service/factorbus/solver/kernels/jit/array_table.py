@@ -51,6 +51,18 @@ else:
 
         return types.int64(array), emit
 
+    def array_entry(context: Any, builder: Any, made: Any, words: Any, entry: Any) -> Any:
+        """The array of type `made` at this entry of the table that begins at the pointer `words`.
+
+        A table does not change while a kernel runs, so the compiler may look an array up once for a whole loop.
+        """
+        first, row = builder.mul(entry, ir.IntType(64)(WIDTH)), []
+        for k in range(1 + made.ndim):
+            word = builder.load(builder.gep(words, [builder.add(first, ir.IntType(64)(k))]))
+            word.set_metadata("invariant.load", builder.module.add_metadata([]))
+            row.append(word)
+        return make_array(context, builder, made, row[0], row[1:])
+
     def _compiled(kind: Any, dimensions: int) -> Any:
         made = types.Array(kind, dimensions, "C")
 
@@ -60,18 +72,13 @@ else:
 
             def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
                 words = context.make_array(signature.args[0])(context, builder, args[0]).data
-                first = builder.mul(args[1], ir.IntType(64)(WIDTH))
-                row = [
-                    builder.load(builder.gep(words, [builder.add(first, ir.IntType(64)(k))]))
-                    for k in range(1 + dimensions)
-                ]
-                return _array(context, builder, made, row[0], row[1:])
+                return array_entry(context, builder, made, words, args[1])
 
             return made(table, types.int64), emit
 
         return found
 
-    def _array(context: Any, builder: Any, made: Any, address: Any, shape: list[Any]) -> Any:
+    def make_array(context: Any, builder: Any, made: Any, address: Any, shape: list[Any]) -> Any:
         """An array that nobody counts the references of."""
         array = context.make_array(made)(context, builder)
         size = context.get_constant(types.intp, _WORD)

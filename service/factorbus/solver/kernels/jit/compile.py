@@ -50,6 +50,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import caching, cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.typing.templates import AttributeTemplate
 from numpy.typing import NDArray
 
 from factorbus.ownership import check_file, make_private
@@ -63,10 +64,12 @@ __all__ = [
     "DISABLED",
     "F64",
     "I64",
+    "AttributeTemplate",
     "KernelFolder",
     "cache_folder",
     "cgutils",
     "compiled_seconds",
+    "extending",
     "inline_kernel",
     "intrinsic",
     "ir",
@@ -79,6 +82,7 @@ __all__ = [
     "vector_lanes",
 ]
 
+extending: Any = numba.extending
 intrinsic: Any = numba.extending.intrinsic
 
 F64 = NDArray[np.float64]

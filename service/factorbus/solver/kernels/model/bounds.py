@@ -3,9 +3,9 @@
 docs/decisions/0001-number-bounds.md says why these.
 """
 
-from factorbus.solver.kernels.jit.array_table import floats, int_rows, ints
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim, size_of
 
 # Of every number of a value or a measurement: metres, radians, pixels, 1/metre.
@@ -45,9 +45,10 @@ def find_first_outside(v0: int, v1: int, var: I64, values: F64) -> int:
 
 
 @kernel("int64(int64[::1], int64[::1])")
-def find_escaped(picked: I64, graph: I64) -> int:
-    """The first of the variables `picked` whose value is not within its bounds, or −1; graph: table of its arenas."""
-    var, values = int_rows(graph, at.T_VAR), floats(graph, at.T_VALUES)
+def find_escaped(picked: I64, graph_table: I64) -> int:
+    """The first of the variables `picked` whose value is not within its bounds, or −1; graph_table: of its arrays."""
+    graph = graph_at(graph_table)
+    var, values = graph.var, graph.values
     for k in range(picked.size):
         v = picked[k]
         if not are_within(MOST_NUMBER, var[v, at.V_AT], size_of(var[v, at.V_KIND]), values):
@@ -56,10 +57,11 @@ def find_escaped(picked: I64, graph: I64) -> int:
 
 
 @kernel("boolean(int64, int64, int64[::1])")
-def are_usual(v0: int, f0: int, graph: I64) -> bool:
+def are_usual(v0: int, f0: int, graph_table: I64) -> bool:
     """Whether the values of the variables from v0 on, and the numbers of the factors from f0 on, are of usual sizes."""
-    var, values, fac = int_rows(graph, at.T_VAR), floats(graph, at.T_VALUES), int_rows(graph, at.T_FAC)
-    payload, counts = floats(graph, at.T_PAYLOAD), ints(graph, at.T_COUNTS)
+    graph = graph_at(graph_table)
+    var, values, fac = graph.var, graph.values, graph.fac
+    payload, counts = graph.payload, graph.counts
     for v in range(v0, counts[at.VARIABLES]):
         if not are_within(USUAL_NUMBER, var[v, at.V_AT], size_of(var[v, at.V_KIND]), values):
             return False

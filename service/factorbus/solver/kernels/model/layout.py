@@ -1,20 +1,7 @@
 """How the arenas are laid out that every kernel of the nonlinear side reads: column numbers, kind codes, sizes.
 
-The arenas are:
-    var      (n, 5) int64    one row per variable, in insertion order
-    fac      (m, 8) int64    one row per factor, in insertion order
-    values   float64         the variables' values, packed one after the other
-    payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
-    counts   (7,)   int64    how much of each arena is in use
-    keys     (n,)   int64    the variables' keys
-    table    int64           where a key is found (`admit`)
-    dims     (c,)   int64    scalars of each block column of Λ
-    stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
+The arrays are those of `records.Graph`.
 """
-
-# These in a graph's table (`places`).
-ARENAS = ("var", "fac", "values", "payload", "counts", "keys", "table", "dims", "stamps")
-T_VAR, T_FAC, T_VALUES, T_PAYLOAD, T_COUNTS, T_KEYS, T_TABLE, T_DIMS, T_STAMPS = range(len(ARENAS))
 
 # Columns of `var`.
 V_KIND = 0

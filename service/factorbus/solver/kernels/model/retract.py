@@ -1,10 +1,10 @@
 """x ⊞ δ for all variables, which of them changed, and their values gathered per kind.  MATH §2."""
 
-from factorbus.solver.kernels.jit.array_table import floats, int_rows, ints
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
 from factorbus.solver.kernels.model.se3 import move_se3
 from factorbus.solver.kernels.model.sizes import size_of
@@ -55,9 +55,10 @@ def differs(x: int, size: int, a: I64, b: I64) -> bool:
 
 
 @kernel("int64(int64[::1], int64[::1])")
-def label_of(picked: I64, graph: I64) -> int:
+def label_of(picked: I64, graph_table: I64) -> int:
     """2 · kind of the picked variables, and 1 more where they are fixed; −1: they differ, or there are none."""
-    var, label = int_rows(graph, at.T_VAR), -1
+    graph = graph_at(graph_table)
+    var, label = graph.var, -1
     for n in range(picked.size):
         own = 2 * var[picked[n], at.V_KIND] + int(var[picked[n], at.V_COLUMN] < 0)
         if n > 0 and own != label:
@@ -67,12 +68,13 @@ def label_of(picked: I64, graph: I64) -> int:
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1], float64[:,::1])")
-def gather(picked: I64, graph: I64, out_keys: I64, out_values: F64) -> None:
+def gather(picked: I64, graph_table: I64, out_keys: I64, out_values: F64) -> None:
     """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
 
-    graph: the table of its arenas (`places`).  Without room in out_keys only the values.
+    graph_table: of its arrays (`records`).  Without room in out_keys only the values.
     """
-    var, keys, values = int_rows(graph, at.T_VAR), ints(graph, at.T_KEYS), floats(graph, at.T_VALUES)
+    graph = graph_at(graph_table)
+    var, keys, values = graph.var, graph.keys, graph.values
     size, out = out_values.shape[1], out_values.reshape(-1)
     n = 0
     while n < picked.size:

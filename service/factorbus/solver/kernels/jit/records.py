@@ -1,0 +1,125 @@
+"""Records of arrays by name: one argument of a kernel instead of twenty.
+
+A record is a named tuple whose fields are `Ints`, `Floats`, `IntRows` or `FloatRows`.  `opener` returns the function
+that makes one of a table of addresses (`array_table`), whose rows are in the order of the fields:
+
+    class Lists(NamedTuple):
+        starts: Ints
+        values: FloatRows
+
+    lists_at = opener(Lists)
+
+    @part
+    def total(lists: Lists) -> float:
+        starts, values = lists.starts, lists.values
+        ...
+
+In compiled code a record is the address of its table: it costs one word to pass, and an array is looked up where its
+name is used.  So a table must stay as it is while a kernel runs.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar, get_type_hints
+
+from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
+from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, intrinsic, ir, types
+
+Ints = Annotated[I64, ints]
+Floats = Annotated[F64, floats]
+IntRows = Annotated[I64, int_rows]
+FloatRows = Annotated[F64, float_rows]
+
+Record = TypeVar("Record", bound=tuple[Any, ...])
+
+
+def fields_of(record: type) -> dict[str, Any]:
+    """The names of a record in the order of its table, each with the function that looks it up there."""
+    return {name: hint.__metadata__[0] for name, hint in get_type_hints(record, include_extras=True).items()}
+
+
+table_of: Any
+
+if DISABLED:
+
+    def opener(record: type[Record]) -> Callable[[I64], Record]:
+        """The function that makes a record of its table."""
+        found = tuple(fields_of(record).values())
+        with_table: Any = type(record.__name__, (record,), {})
+
+        def record_at(table: I64) -> Record:
+            made = with_table(*(look_up(table, entry) for entry, look_up in enumerate(found)))
+            made.table_ = table
+            return made
+
+        return record_at
+
+    def _table_of(record: Any) -> I64:
+        """The table that the record was made of."""
+        return record.table_
+
+    table_of = _table_of
+
+else:
+    from factorbus.solver.kernels.jit.array_table import WIDTH, array_entry, make_array
+    from factorbus.solver.kernels.jit.compile import AttributeTemplate, extending
+
+    _ARRAYS = {
+        kind: types.Array(entry, dimensions, "C")
+        for entry, kinds in ((types.int64, (ints, int_rows)), (types.float64, (floats, float_rows)))
+        for dimensions, kind in enumerate(kinds, start=1)
+    }
+
+    class RecordType(types.Type):
+        """The type of a record: the names and the types of its arrays."""
+
+        def __init__(self, record: type) -> None:
+            self.entries = {name: (k, _ARRAYS[kind]) for k, (name, kind) in enumerate(fields_of(record).items())}
+            super().__init__(name=f"{record.__module__}.{record.__qualname__}")
+
+    @extending.register_model(RecordType)
+    class _Address(extending.models.PrimitiveModel):
+        """A pointer to the table."""
+
+        def __init__(self, manager: Any, type_: Any) -> None:
+            super().__init__(manager, type_, ir.IntType(64).as_pointer())
+
+    @extending.infer_getattr
+    class _Fields(AttributeTemplate):
+        key = RecordType
+
+        def generic_resolve(self, typ: Any, attr: str) -> Any:
+            """The type of an array by its name; None: there is no such name."""
+            return typ.entries[attr][1] if attr in typ.entries else None
+
+    @extending.lower_getattr_generic(RecordType)
+    def _look_up(context: Any, builder: Any, typ: Any, table: Any, attr: str) -> Any:
+        entry, made = typ.entries[attr]
+        return array_entry(context, builder, made, table, ir.IntType(64)(entry))
+
+    @intrinsic
+    def _table(_typing: Any, record: Any) -> Any:
+        """The table that the record was made of."""
+        made = types.Array(types.int64, 1, "C")
+
+        def emit(context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+            size = ir.IntType(64)(WIDTH * len(record.entries))
+            return make_array(context, builder, made, builder.ptrtoint(args[0], ir.IntType(64)), [size])
+
+        return made(record), emit
+
+    table_of = _table
+
+    def opener(record: type[Record]) -> Callable[[I64], Record]:
+        """The function that makes a record of its table, in kernels."""
+        made = RecordType(record)
+
+        @intrinsic
+        def record_at(_typing: Any, table: Any) -> Any:
+            """The record that this table tells of."""
+
+            def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+                return context.make_array(signature.args[0])(context, builder, args[0]).data
+
+            return made(table), emit
+
+        return record_at

@@ -1,0 +1,33 @@
+"""The factor graph as kernels see it: its arrays by name."""
+
+from typing import NamedTuple
+
+from factorbus.solver.kernels.jit.records import Floats, IntRows, Ints, opener
+
+
+class Graph(NamedTuple):
+    """The arrays of a graph; `layout` has the columns of `var` and `fac` and the entries of `counts`.
+
+    var      (n, 5) int64    one row per variable, in insertion order
+    fac      (m, 8) int64    one row per factor, in insertion order
+    values   float64         the variables' values, packed one after the other
+    payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
+    counts   (7,)   int64    how much of each array is in use
+    keys     (n,)   int64    the variables' keys
+    table    int64           where a key is found (`graph.admit`)
+    dims     (c,)   int64    scalars of each block column of Λ
+    stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
+    """
+
+    var: IntRows
+    fac: IntRows
+    values: Floats
+    payload: Floats
+    counts: Ints
+    keys: Ints
+    table: Ints
+    dims: Ints
+    stamps: Ints
+
+
+graph_at = opener(Graph)
