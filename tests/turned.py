@@ -71,7 +71,7 @@ def closing(poses: int) -> Batch:
 def prepare(journals: Path, name: str, mode: str) -> None:
     """An empty map in a folder of journals, whose solver may only go downhill: there it takes hundreds of steps."""
     journals.mkdir(parents=True, exist_ok=True)
-    options = Options(mode=mode, nonmonotone_steps=0).as_dict()
+    options = Options.of(mode=mode, max_nonmonotone_steps=0).as_dict()
     create(journals / name, name, mode, options, epoch=7, durability="none").close()
 
 

@@ -66,7 +66,7 @@ def main() -> None:
     try:
         worlds = chosen([word for word in asked.only.split(",") if word])
         settings = {"mode": asked.mode, **dict(_setting(text) for text in asked.option)}
-        Options(**settings)
+        Options.of(**settings)
     except (ValueError, TypeError, SolverError) as problem:
         sys.exit(f"bench every-step: {problem}")
     absent = [world.name for world in worlds if not is_here(world)]
@@ -101,7 +101,7 @@ def measure(drive: Drive) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     warm()
     world = WORLDS[drive.world]
     steps = list(world.make(drive.poses or world.poses, drive.seed))
-    found = follow(steps, Options(**drive.options), drive.every, drive.check)
+    found = follow(steps, Options.of(**drive.options), drive.every, drive.check)
     isam2 = None
     if drive.isam2:
         from bench.every.peer import follow_isam2  # here, so that without it GTSAM need not be installed

@@ -35,13 +35,13 @@ from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 EPOCH, PATIENCE_S = 7, 120.0
 POSES, DEGREES = 100, 120.0
 # Few tries in each step, so that there are many steps.
-FEW = {"max_iterations": 2, "nonmonotone_steps": 0}
+FEW = {"max_iterations": 2, "max_nonmonotone_steps": 0}
 MODES = ["inc-l", "all-batch"]
 ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
 
 
 def folder_in(mode: str, **options: Any) -> Folder:
-    settings = Options(**{"mode": mode, **FEW, **options})
+    settings = Options.of(**{"mode": mode, **FEW, **options})
     return Folder(lambda: Solver(settings), EPOCH, Limits(), settings.as_dict())
 
 
@@ -325,7 +325,7 @@ class Waiting(Solver):
     """A solver whose further steps say when they begin, and wait for leave."""
 
     def __init__(self) -> None:
-        super().__init__(Options(mode="all-batch", **FEW))
+        super().__init__(Options.of(mode="all-batch", **FEW))
         self.begun, self.leave = threading.Semaphore(0), threading.Semaphore(0)
 
     def step(self, settle: bool = False) -> Any:

@@ -20,7 +20,7 @@ from factorbus.service.journal.library import open_library
 
 PAGE, FRAME = 4096, 4096 + 24
 LOG, INDEX = f"{NAME}-wal", f"{NAME}-shm"
-OPTIONS = {"mode": "bayes-tree", "tol": 5e-5}
+OPTIONS = {"mode": "bayes-tree", "incremental_tolerance": 5e-5}
 
 
 def entry(client: str, sequence: int, message: bytes) -> Entry:

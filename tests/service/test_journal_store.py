@@ -34,7 +34,7 @@ def fold(number: int, *entries: Entry) -> Fold:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    made = create(tmp_path / "m", "m", "inc-l", {"mode": "inc-l", "tol": 1e-3}, 77, "commit")
+    made = create(tmp_path / "m", "m", "inc-l", {"mode": "inc-l", "incremental_tolerance": 1e-3}, 77, "commit")
     made.append([fold(1, entry("a", 1), entry("b", 1)), fold(2, entry("a", 2, b"more"))])
     made.append([fold(3, sealed(entry("a", 3)._replace(outcome=REFUSED, answer=b"why")), entry("b", 2))])
     return made

@@ -40,7 +40,7 @@ class Driven:
     """A folder, what goes on beside it, and the steps by which another solver took the place."""
 
     def __init__(self, grown: float, room: int = PLENTY, **options: Any) -> None:
-        self.folder = Folder(lambda: Solver(Options(**options)), EPOCH, Limits())
+        self.folder = Folder(lambda: Solver(Options.of(**options)), EPOCH, Limits())
         self.beside = Reordering(self.folder, grown, lambda: room, "m")
         self.replaced: list[Stepped] = []
         self.outcomes: list[Outcome] = []

@@ -124,7 +124,7 @@ def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change
 @pytest.mark.parametrize("world", sorted(WORLDS))
 @pytest.mark.parametrize("seed", range(2))
 def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: int, world: str) -> None:
-    rng, solver, weighed = np.random.default_rng(seed), Solver(Options(ripple=0.0)), list[Change]()
+    rng, solver, weighed = np.random.default_rng(seed), Solver(Options(wildfire_threshold=0.0)), list[Change]()
     for batch in WORLDS[world](seed % 1000):
         solver.stage(batch)
         solver.step()

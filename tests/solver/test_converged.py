@@ -24,7 +24,7 @@ from factorbus.solver.starts.batch import solve_batch
 X = symbol("x", 0), symbol("x", 10**6)
 FLOOR = 1e-3  # χ² of which a share means nothing
 MODES = ["bayes-tree", "inc-l", "inc-l-b10", "all-batch"]
-BATCH = Options(mode="all-batch", tolerance=1e-10, max_iterations=50)
+BATCH = Options(mode="all-batch", batch_tolerance=1e-10, max_iterations=50)
 
 
 @pytest.mark.parametrize("world", ["manhattan", "city_trees", "sphere"])
@@ -45,7 +45,7 @@ def test_at_every_step_the_estimate_is_the_batch_answer_or_says_that_it_is_not(w
 @pytest.mark.parametrize("world", ["manhattan", "city_trees", "sphere"])
 def test_chi2_before_and_after_are_those_of_the_values(world: str, mode: str) -> None:
     """Before: at the values before the step, the new factors at the first values of the new variables."""
-    options = Options(mode=mode, place_new=False)
+    options = Options(mode=mode, initialize_locally=False)
     solver, before = Solver(options), DenseGraph()
     for step in WORLDS[world](80, 5):
         solver.stage(step.batch)
@@ -103,7 +103,7 @@ def test_cameras_that_lose_pixels_have_converged_where_they_say_so(seed: int) ->
 @pytest.mark.parametrize("angle_deg", [10, 20, 40, 60, 90])
 def test_a_turn_seen_from_a_fixed_pose_in_space_counts(angle_deg: float) -> None:
     """Nothing turns at the first end: what the linear model misses is all of the second one, MATH (9.26)."""
-    solver, turn = Solver(Options(rounds=1)), math.radians(angle_deg) / 2
+    solver, turn = Solver(Options(max_rounds=1)), math.radians(angle_deg) / 2
     sigmas = (0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
     put(solver, Draft().se3("y0", (0, 0, 0, 0, 0, 0, 1), fixed=True))
     put(solver, Draft().se3("y1").between_se3("y0", "y1", (1, 0, 0, 0, 0, 0, 1), sigmas=sigmas))
@@ -150,7 +150,7 @@ def ring_optimum(drift_deg: float, poses: int) -> float:
 
 def ring(drift_deg: float, mode: str = "auto", poses: int = 1000, **options: int) -> tuple[Solver, StepReport]:
     """Odometry that turns by so much too far on its way round, and the loop that closes it."""
-    solver, turn = Solver(Options(mode=mode, **options)), (2 * math.pi + math.radians(drift_deg)) / (poses - 1)
+    solver, turn = Solver(Options.of(mode=mode, **options)), (2 * math.pi + math.radians(drift_deg)) / (poses - 1)
     put(solver, Draft().se2("x0", (0, 0, 0), fixed=True))
     for i in range(1, poses):
         edge = Draft().se2(f"x{i}")

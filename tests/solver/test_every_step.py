@@ -32,8 +32,18 @@ PROBES = 4
 ENTRYWISE = 50  # every so many steps
 # "omega" and "lambda" update R the one way for as long as it lives, and never move the linearisation point.
 WAYS = {
-    "omega": {"small_loop": 10**6, "big_loop": 10**6, "loop_share": 1e6, "tol": 1e6},
-    "lambda": {"small_loop": 0, "big_loop": 10**6, "loop_share": 1e6, "tol": 1e6},
+    "omega": {
+        "small_loop_threshold": 10**6,
+        "big_loop_threshold": 10**6,
+        "loop_threshold_share": 1e6,
+        "incremental_tolerance": 1e6,
+    },
+    "lambda": {
+        "small_loop_threshold": 0,
+        "big_loop_threshold": 10**6,
+        "loop_threshold_share": 1e6,
+        "incremental_tolerance": 1e6,
+    },
     "default": {},
 }
 # The whole of Intel, and the first thousand poses of the other data sets of the 2013 paper.
@@ -58,7 +68,7 @@ def test_r_and_delta_after_every_step_of_simulated_maps(world: str, way: str) ->
 
 
 def test_sparse_and_dense_twins_agree() -> None:
-    solver = Solver(Options(mode="inc-l", tol=1e6))
+    solver = Solver(Options(mode="inc-l", incremental_tolerance=1e6))
     for batch in random_steps(1, steps=12):
         solver.stage(batch)
         solver.step()
@@ -71,7 +81,7 @@ def test_sparse_and_dense_twins_agree() -> None:
 
 
 def test_a_wrong_entry_is_seen() -> None:
-    solver = Solver(Options(mode="inc-l", tol=1e6))
+    solver = Solver(Options(mode="inc-l", incremental_tolerance=1e6))
     for batch in random_steps(2, steps=12):
         solver.stage(batch)
         solver.step()
@@ -86,7 +96,7 @@ def test_a_wrong_entry_is_seen() -> None:
 
 def assert_follows(name: str, steps: Iterable[Batch], way: str) -> None:
     """Replay, and look after every step that has left an R."""
-    solver, taken, rng = Solver(Options(mode="inc-l", **WAYS[way])), Counter(), np.random.default_rng(7)
+    solver, taken, rng = Solver(Options.of(mode="inc-l", **WAYS[way])), Counter(), np.random.default_rng(7)
     without = []  # steps that left no R
     n = 0
     for n, batch in enumerate(steps):

@@ -16,7 +16,13 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
-FAR = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, converged_share=1e9)
+FAR = Options.of(
+    relinearize_next_step_share=1e9,
+    relinearize_same_step_share=1e9,
+    relinearize_max_error=1e9,
+    relinearize_max_wait=10**9,
+    converged_share=1e9,
+)
 
 
 @pytest.mark.parametrize("world", ["camera", "robust camera", "others"])

@@ -26,10 +26,10 @@ from factorbus.solver.sparse.fill_in import fill_in
 
 # What makes steps take one way of updating R as long as they can.
 WAYS = {
-    "omega": {"small_loop": 10**6, "big_loop": 10**6, "loop_share": 1e6},
-    "lambda": {"small_loop": 0, "big_loop": 10**6, "loop_share": 1e6},
-    "all": {"small_loop": 6, "big_loop": 14},
-    "full": {"small_loop": 0, "big_loop": 0},
+    "omega": {"small_loop_threshold": 10**6, "big_loop_threshold": 10**6, "loop_threshold_share": 1e6},
+    "lambda": {"small_loop_threshold": 0, "big_loop_threshold": 10**6, "loop_threshold_share": 1e6},
+    "all": {"small_loop_threshold": 6, "big_loop_threshold": 14},
+    "full": {"small_loop_threshold": 0, "big_loop_threshold": 0},
 }
 
 
@@ -66,7 +66,7 @@ def assert_solves(information: np.ndarray, delta: np.ndarray, eta: np.ndarray, r
 
 def follow(steps: Iterable[Batch], **options) -> tuple[Solver, Counter]:
     """Replay; after every step R is checked.  Gives how often it was there after each strategy."""
-    solver, checked = Solver(Options(mode="inc-l", **options)), Counter()
+    solver, checked = Solver(Options.of(mode="inc-l", **options)), Counter()
     for batch in steps:
         solver.stage(batch)
         report = solver.step()
@@ -135,7 +135,7 @@ def test_r_follows_loops_of_any_length(steps: list[Batch], way: str, tol: float)
 @pytest.mark.parametrize("keep", [True, False])
 def test_the_old_factor_is_given_up_at_a_new_point_where_the_paper_has_it_so(keep: bool) -> None:
     counts = Counter()
-    solver = Solver(Options(mode="inc-l", tol=0.0, max_iterations=1, keep_factor=keep))
+    solver = Solver(Options.of(mode="inc-l", incremental_tolerance=0.0, max_iterations=1, reuse_factor=keep))
     for batch in random_steps(5, steps=12, noise=0.02):
         solver.stage(batch)
         report = solver.step()
@@ -172,10 +172,12 @@ def test_modes_by_the_papers_names() -> None:
     assert CLI_MODES == MODES
 
 
-@pytest.mark.parametrize("wrong", [{"small_loop": 9, "big_loop": 8}, {"recent_poses": 0}, {"backend": "petsc"}])
+@pytest.mark.parametrize(
+    "wrong", [{"small_loop_threshold": 9, "big_loop_threshold": 8}, {"constrain_recent_poses": 0}, {"backend": "petsc"}]
+)
 def test_settings_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(errors.BadOption) as caught:
-        Options(**wrong)
+        Options.of(**wrong)
     assert caught.value.code == "bad_option"
 
 
@@ -200,8 +202,8 @@ def test_a_refused_step_leaves_values_and_graph_and_the_map_goes_on() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cholmod_gives_the_same_r(seed: int) -> None:
-    ours, theirs = Solver(Options(tol=0.0, keep_factor=False)), Solver(
-        Options(tol=0.0, keep_factor=False, backend="cholmod")
+    ours, theirs = Solver(Options.of(incremental_tolerance=0.0, reuse_factor=False)), Solver(
+        Options.of(incremental_tolerance=0.0, reuse_factor=False, backend="cholmod")
     )  # fmt: skip
     for batch in random_steps(seed, steps=12):
         for one in (ours, theirs):

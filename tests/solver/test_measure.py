@@ -12,7 +12,13 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL
 from factorbus.solver.kernels.model import layout as at
 
 # Nothing is relinearised, so a lot is bent.
-NEVER = Options(bent_soon=1e9, bent_now=1e9, bent_most=1e9, patience=10**9, converged_share=1e9)
+NEVER = Options.of(
+    relinearize_next_step_share=1e9,
+    relinearize_same_step_share=1e9,
+    relinearize_max_error=1e9,
+    relinearize_max_wait=10**9,
+    converged_share=1e9,
+)
 
 
 @pytest.mark.parametrize(("world", "poses"), [("manhattan", 300), ("city_trees", 120), ("sphere", 150)])

@@ -16,12 +16,18 @@ from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
 from factorbus.solver.kernels.model import layout as at
 
 NEAR = 60
-ALWAYS = {"heavy": 0.0, "worth": 0.0, "near": NEAR / 3, "around": 0.0, "detour": math.inf}  # of more than 27 flops
-NEVER = {"heavy": math.inf}
+ALWAYS = {
+    "reroot_min_flops": 0.0,
+    "reroot_period": 0.0,
+    "reroot_size_linear": NEAR / 3,
+    "reroot_size_area": 0.0,
+    "reroot_max_extra": math.inf,
+}  # of more than 27 flops
+NEVER = {"reroot_min_flops": math.inf}
 LINEAR = {
-    "bent_soon": math.inf,
-    "bent_now": math.inf,
-    "bent_most": math.inf,
+    "relinearize_next_step_share": math.inf,
+    "relinearize_same_step_share": math.inf,
+    "relinearize_max_error": math.inf,
     "converged_share": math.inf,
 }  # little is relinearised
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
@@ -80,14 +86,18 @@ def rings(solver: Solver) -> dict[int, int]:
 
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> None:
-    options = Options(**ALWAYS, **LINEAR)
+    options = Options.of(**ALWAYS, **LINEAR)
     solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
     for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](250, 7)))):
         tree = tree_of(solver)
         if n >= 100 and solver.factor_count - first > 1 and tree.state[tl.S_RELINEARISED] == 0:
             cliques = assert_is_a_tree(solver)
             close = nearest(solver, first, NEAR // dim)
-            recent = {v for v in range(solver.variable_count) if tree.node[v, tl.N_SEEN] > n - options.recent_steps}
+            recent = {
+                v
+                for v in range(solver.variable_count)
+                if tree.node[v, tl.N_SEEN] > n - options.tuning.constrain_recent_steps
+            }
             brought = set(rings(solver))
             assert close <= brought
             # Small fronts are joined, so that a few others may come along.
@@ -102,7 +112,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
 
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
-    options = Options(**{**ALWAYS, "near": 25.0}, **LINEAR)
+    options = Options.of(**{**ALWAYS, "near": 25.0}, **LINEAR)
     solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
     for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](400, 7)))):
         found = rings(solver)
@@ -110,7 +120,9 @@ def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
             # Each with all inside it has a quarter of the next.
             sizes = np.cumsum(np.bincount(list(found.values()))[::-1])[::-1]
             if sizes[0] < n:
-                assert (sizes[1:] * options.rings <= sizes[:-1] + options.rings).all()
+                assert (
+                    sizes[1:] * options.tuning.reroot_ring_ratio <= sizes[:-1] + options.tuning.reroot_ring_ratio
+                ).all()
             assert sizes[-1] * dim >= 30 - dim
             # What is further inside is nearer.
             far, shell, hops = {}, {v for v in ends(solver, first) if v in found}, 0
@@ -121,7 +133,11 @@ def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
                 inside, outside = ([far[v] for v in found if found[v] == r] for r in (ring, ring - 1))
                 assert max(inside) <= min(outside)
             tree, cliques = tree_of(solver), assert_is_a_tree(solver)
-            recent = {v for v in range(solver.variable_count) if tree.node[v, tl.N_SEEN] > n - options.recent_steps}
+            recent = {
+                v
+                for v in range(solver.variable_count)
+                if tree.node[v, tl.N_SEEN] > n - options.tuning.constrain_recent_steps
+            }
             more = [
                 len([w for w in above(v, solver, cliques) - recent if found.get(w, -1) < ring])
                 for v, ring in found.items()
@@ -137,11 +153,11 @@ def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
 @pytest.mark.parametrize("rings", [1.0, 0.0, math.nan])
 def test_a_ring_is_larger_than_what_is_inside_it(rings: float) -> None:
     with pytest.raises(BadOption, match="rings"):
-        Options(rings=rings)
+        Options.of(reroot_ring_ratio=rings)
 
 
 def test_no_more_rings_than_there_are_groups_for() -> None:
-    solver = Solver(Options(**{**ALWAYS, "near": 60.0}, rings=1.001, **LINEAR))
+    solver = Solver(Options.of(**{**ALWAYS, "near": 60.0}, reroot_ring_ratio=1.001, **LINEAR))
     for _ in drive(solver, steps("manhattan", 200)):
         assert max(rings(solver).values(), default=0) <= MOST_RINGS
     assert_is_a_tree(solver)
@@ -149,7 +165,7 @@ def test_no_more_rings_than_there_are_groups_for() -> None:
 
 @pytest.mark.parametrize("detour", [0.0, 0.5])
 def test_what_is_out_of_the_way_stays_where_it_is(detour: float) -> None:
-    solver = Solver(Options(**{**ALWAYS, "near": 60.0, "detour": detour}, **LINEAR))
+    solver = Solver(Options.of(**{**ALWAYS, "near": 60.0, "detour": detour}, **LINEAR))
     first, stayed, came = 0, 0, 0
     node, clique = (array.copy() for array in (tree_of(solver).node, tree_of(solver).clique))
     for n, _ in enumerate(drive(solver, steps("manhattan", 500))):
@@ -186,8 +202,14 @@ def flops_of(cliques: set[int], clique: np.ndarray) -> float:
 
 def test_the_more_an_elimination_takes_the_more_comes_with_it() -> None:
     near, around = 2.0, 0.05
-    options = {"heavy": 0.0, "worth": 0.0, "near": near, "around": around, "detour": math.inf}
-    solver, seen = Solver(Options(**options, **LINEAR)), set()
+    options = {
+        "reroot_min_flops": 0.0,
+        "reroot_period": 0.0,
+        "reroot_size_linear": near,
+        "reroot_size_area": around,
+        "reroot_max_extra": math.inf,
+    }
+    solver, seen = Solver(Options.of(**options, **LINEAR)), set()
     node, clique, first = tree_of(solver).node.copy(), tree_of(solver).clique.copy(), 0
     for n, _ in enumerate(drive(solver, steps("manhattan", 900))):
         tree = tree_of(solver)
@@ -204,7 +226,7 @@ def test_the_more_an_elimination_takes_the_more_comes_with_it() -> None:
 def test_it_saves_eliminations_where_they_are_heavy(world: str, poses: int, most: float) -> None:
     flops = {}
     for name, how in {"as it is": {}, "never": NEVER}.items():
-        solver = Solver(Options(**how, **LINEAR))
+        solver = Solver(Options.of(**how, **LINEAR))
         flops[name] = sum(tree_of(solver).state[tl.S_FLOPS] for _ in drive(solver, steps(world, poses)))
     assert flops["as it is"] < most * flops["never"]
 
@@ -217,7 +239,7 @@ def steps(world: str, poses: int) -> Iterator[Batch]:
 def test_the_root_is_moved_less_often_the_more_must_be_spent_before() -> None:
     moves = {}
     for worth in (0.0, 0.5, 8.0):
-        solver = Solver(Options(worth=worth))
+        solver = Solver(Options.of(reroot_period=worth))
         states = (tree_of(solver).state for _ in drive(solver, steps("sphere", 700)))
         moves[worth] = sum(s[tl.S_FLOPS] > 0 and s[tl.S_SPENT] == 0 and s[tl.S_RELINEARISED] == 0 for s in states)
     assert moves[0.0] > moves[0.5] > moves[8.0] > 0

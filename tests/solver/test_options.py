@@ -46,24 +46,33 @@ def test_a_number_out_of_its_range_is_refused_by_name(name: str) -> None:
         2.5 if allowed.whole else "1",
     ):
         with pytest.raises(BadOption, match=f"option {name}: seen") as refused:
-            Options(**{name: wrong})
+            Options.of(**{name: wrong})
         assert refused.value.detail["where"] == name
         assert refused.value.detail["wanted"] == str(allowed)
 
 
 @pytest.mark.parametrize(
-    "name", ["tolerance", "tol", "settle_tolerance", "loop_share", "negligible", "ripple", "reluctance"]
+    "name",
+    [
+        "batch_tolerance",
+        "incremental_tolerance",
+        "converge_tolerance",
+        "loop_threshold_share",
+        "chi2_epsilon",
+        "wildfire_threshold",
+        "relinearize_cooldown_factor",
+    ],
 )
 def test_infinity_is_refused_where_nothing_would_be_solved_and_called_converged(name: str) -> None:
     with pytest.raises(BadOption, match=f"option {name}: seen inf"):
-        Options(**{name: math.inf})
+        Options.of(**{name: math.inf})
 
 
 @pytest.mark.parametrize("name", [*SWITCHES, "clock", "mode", "backend"])
 def test_what_is_no_switch_no_clock_and_no_name_is_refused(name: str) -> None:
     for wrong in (1, 0.0, "yes", math.nan, []):
         with pytest.raises(SolverError, match=r"seen|no mode"):
-            Options(**{name: wrong})
+            Options.of(**{name: wrong})
 
 
 @settings(max_examples=300, deadline=None)
@@ -74,10 +83,14 @@ def test_any_value_is_taken_as_it_is_or_refused(name: str, value: Any) -> None:
     right = number and not math.isnan(value) and allowed.least <= value <= allowed.most
     right = right and (isinstance(value, float) or abs(value) <= sys.float_info.max)
     right = right and not (allowed.above and value == allowed.least)
-    if name in ("small_loop", "big_loop") and right:
-        right = value <= Options().big_loop if name == "small_loop" else value >= Options().small_loop
+    if name in ("small_loop_threshold", "big_loop_threshold") and right:
+        right = (
+            value <= Options().tuning.big_loop_threshold
+            if name == "small_loop_threshold"
+            else value >= Options().tuning.small_loop_threshold
+        )
     if right:
-        assert getattr(Options(**{name: value}), name) == value
+        assert getattr(Options.of(**{name: value}), name) == value
     else:
         with pytest.raises(BadOption):
-            Options(**{name: value})
+            Options.of(**{name: value})

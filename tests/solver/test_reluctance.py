@@ -8,10 +8,10 @@ from factorbus.solver.kernels.bayes_tree.step import reluctance
 
 def test_so_soon_after_a_relinearisation_more_has_to_be_bent() -> None:
     settings, state = np.zeros(tl.P_SIZE), np.zeros(tl.S_SIZE, np.int64)
-    settings[tl.P_REST], settings[tl.P_RELUCTANCE], state[tl.S_RELINEARISED_AT] = 100, 8.0, 1000
+    settings[tl.P_COOLDOWN_STEPS], settings[tl.P_COOLDOWN_FACTOR], state[tl.S_RELINEARISED_AT] = 100, 8.0, 1000
     after = {}
     for dear in (1.0, 4.0):  # times what is dear
-        settings[tl.P_DEAR] = dear
+        settings[tl.P_COOLDOWN_FLOPS] = dear
         for step in (1001, 1035, 1050, 1100, 5000):
             state[tl.S_STEP] = step
             after[dear, step - 1000] = reluctance(settings, state)

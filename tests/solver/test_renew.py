@@ -13,7 +13,13 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 
-OFTEN = {"bent_soon": 1e-9, "bent_now": np.inf, "bent": 1e-6, "reluctance": 1.0, "converged_share": np.inf}
+OFTEN = {
+    "relinearize_next_step_share": 1e-9,
+    "relinearize_same_step_share": np.inf,
+    "relinearize_threshold": 1e-6,
+    "relinearize_cooldown_factor": 1.0,
+    "converged_share": np.inf,
+}
 WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}
 
 
@@ -35,9 +41,9 @@ def kept(before: dict[int, Clique], solver: Solver) -> list[int]:
 
 
 @pytest.mark.parametrize("world", sorted(WORLDS))
-@pytest.mark.parametrize("rounds", [{}, {"bent_now": 1e-9}])
+@pytest.mark.parametrize("rounds", [{}, {"relinearize_same_step_share": 1e-9}])
 def test_renewed_cliques_have_the_numbers_of_the_new_points(world: str, rounds: dict[str, float]) -> None:
-    solver, renewed = Solver(Options(**{**OFTEN, **rounds}, ripple=0.0, split_pivots=6)), 0
+    solver, renewed = Solver(Options.of(**{**OFTEN, **rounds}, wildfire_threshold=0.0, clique_split_min_pivots=6)), 0
     for batch in steps(world, 130):
         before = cliques(solver)
         solver.stage(batch)
@@ -51,7 +57,7 @@ def test_renewed_cliques_have_the_numbers_of_the_new_points(world: str, rounds: 
 
 @pytest.mark.parametrize("world", ["manhattan", "city_trees"])
 def test_most_of_what_is_relinearised_is_not_ordered_again(world: str) -> None:
-    solver, renewed, relinearised = Solver(Options(**OFTEN)), 0, 0
+    solver, renewed, relinearised = Solver(Options.of(**OFTEN)), 0, 0
     for batch in steps(world, 400):
         before = cliques(solver)
         solver.stage(batch)
@@ -64,7 +70,7 @@ def test_most_of_what_is_relinearised_is_not_ordered_again(world: str) -> None:
 
 
 def test_a_step_refused_while_cliques_are_renewed_leaves_no_trace() -> None:
-    tried, spared, due = Solver(Options(**OFTEN)), Solver(Options(**OFTEN)), 0
+    tried, spared, due = Solver(Options.of(**OFTEN)), Solver(Options.of(**OFTEN)), 0
     for n, batch in enumerate(steps("city_trees", 200)):
         for solver in (tried, spared):
             solver.stage(batch)
@@ -117,11 +123,11 @@ def numbers_of(solver: Solver) -> list[tuple[list[int], bytes]]:
 
 
 def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    wide = Solver(Options(**OFTEN))
+    wide = Solver(Options.of(**OFTEN))
     for where in ("graph", "tree"):
         monkeypatch.setattr(f"factorbus.solver.{where}.roomy", lambda need, _size: need)
     grown, make_room = list[int](), Tree._make_room
-    tight = Solver(Options(**OFTEN))
+    tight = Solver(Options.of(**OFTEN))
     tree = tree_of(tight)
     tree.numbers = tree.numbers[: int(tree.state[tl.S_NUMBERS])].copy()
     tree.link, tree.stiff, tree.hessian = tree.link[:1].copy(), tree.stiff[:1].copy(), tree.hessian[:121].copy()

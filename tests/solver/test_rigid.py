@@ -15,7 +15,12 @@ from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 
-FAR = {"bent_soon": np.inf, "bent_now": np.inf, "bent_most": np.inf, "converged_share": np.inf}
+FAR = {
+    "relinearize_next_step_share": np.inf,
+    "relinearize_same_step_share": np.inf,
+    "relinearize_max_error": np.inf,
+    "converged_share": np.inf,
+}
 WORLDS: dict[str, Callable[[], Iterator[Batch]]] = {
     "poses": lambda: (step.batch for step in manhattan(500, 5)),
     "landmarks": lambda: (step.batch for step in city_trees(500, seed=5)),
@@ -78,7 +83,7 @@ def motions(solver: Solver) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray
 @pytest.mark.parametrize("world", WORLDS)
 def test_what_moved_along_is_solved(world: str) -> None:
     """R_F δ_F + R_S δ_S = d of every clique, with the separator where the frontals have it."""
-    solver, moved, worst = Solver(Options(**FAR)), 0, 0.0
+    solver, moved, worst = Solver(Options.of(**FAR)), 0, 0.0
     for n, batch in enumerate(WORLDS[world]()):
         solver.stage(batch)
         solver.step()
@@ -115,7 +120,7 @@ def test_what_has_a_position_below_it_does_not_move_along() -> None:
 @pytest.mark.parametrize("world", ["poses", "landmarks", "space"])
 def test_to_move_along_is_as_good_as_to_be_solved(world: str) -> None:
     """χ² of the default along a drive, beside a tree that solves every clique."""
-    exact, default = Solver(Options(ripple=0.0, **FAR)), Solver(Options(**FAR))
+    exact, default = Solver(Options.of(wildfire_threshold=0.0, **FAR)), Solver(Options.of(**FAR))
     for n, batch in enumerate(WORLDS[world]()):
         for solver in (exact, default):
             solver.stage(batch)

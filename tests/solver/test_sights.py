@@ -25,7 +25,7 @@ from factorbus.solver.kernels.model.candidates import evaluate_factors
 X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
 LEVEL = np.array([0.0, 0, 0, 0, 0, 0, 1])
 PINHOLE = CAMERAS["pinhole"]
-TIGHT = {"tolerance": 0.0, "tol": 0.0, "negligible": 1e-20, "max_iterations": 200}
+TIGHT = {"batch_tolerance": 0.0, "incremental_tolerance": 0.0, "chi2_epsilon": 1e-20, "max_iterations": 200}
 
 
 def unit(dim: int) -> np.ndarray:
@@ -76,8 +76,12 @@ def test_every_lens_gives_the_residual_of_the_dense_twin(kind: str, name: str) -
 @pytest.mark.parametrize("mode", ["all-batch", "inc-l", "bayes-tree"])
 @pytest.mark.parametrize("seed", range(2))
 def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
-    tree = {"bent": 0.0, "bent_now": 0.0, "ripple": 0.0, "rounds": 40} if mode == "bayes-tree" else {}
-    solver, twin = Solver(Options(mode=mode, **TIGHT, **tree)), DenseGraph()
+    tree = (
+        {"relinearize_threshold": 0.0, "relinearize_same_step_share": 0.0, "wildfire_threshold": 0.0, "max_rounds": 40}
+        if mode == "bayes-tree"
+        else {}
+    )
+    solver, twin = Solver(Options.of(mode=mode, **TIGHT, **tree)), DenseGraph()
     for batch in camera_steps(seed):
         solver.stage(batch)
         report = solver.step()

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.compile import DISABLED
 from factorbus.solver.lenses.layout import LIMIT
 from factorbus.solver.report import Shares
 
-TIGHT = {"tolerance": 0.0, "tol": 0.0, "negligible": 1e-20, "max_iterations": 100}
+TIGHT = {"batch_tolerance": 0.0, "incremental_tolerance": 0.0, "chi2_epsilon": 1e-20, "max_iterations": 100}
 
 
 def by_key(groups: list[Group]) -> dict[int, tuple[str, np.ndarray]]:
@@ -28,7 +28,7 @@ def by_key(groups: list[Group]) -> dict[int, tuple[str, np.ndarray]]:
 @pytest.mark.parametrize("mode", ["all-batch", "inc-l"])
 @pytest.mark.parametrize("seed", range(4))
 def test_every_step_is_the_dense_gauss_newton_solution(seed: int, mode: str) -> None:
-    solver, twin = Solver(Options(mode=mode, **TIGHT)), DenseGraph()
+    solver, twin = Solver(Options.of(mode=mode, **TIGHT)), DenseGraph()
     for batch in random_steps(seed):
         solver.stage(batch)
         report = solver.step()

@@ -20,13 +20,13 @@ from factorbus.solver import FactorGroup, Group, Options, Solver, errors, solve_
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.model import layout as at
 
-EXACT = {"mode": "bayes-tree", "ripple": 0.0}
+EXACT = {"mode": "bayes-tree", "wildfire_threshold": 0.0}
 # Whole cliques only; as the default; every clique at every place; and a few variables moved to the root in every step.
 WAYS = {
-    "whole": {"split_pivots": 10**9, "split_share": 1.0},
+    "whole": {"clique_split_min_pivots": 10**9, "clique_split_max_affected": 1.0},
     "default": {},
-    "split": {"split_pivots": 0, "split_share": 1.0},
-    "near": {"heavy": 0.0, "worth": 0.0},
+    "split": {"clique_split_min_pivots": 0, "clique_split_max_affected": 1.0},
+    "near": {"reroot_min_flops": 0.0, "reroot_period": 0.0},
 }
 
 
@@ -57,7 +57,7 @@ def linearised(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
 
 
 def follow(steps: Iterable[Batch], **options) -> Solver:
-    solver = Solver(Options(**{**EXACT, **options}))
+    solver = Solver(Options.of(**{**EXACT, **options}))
     for batch in steps:
         solver.stage(batch)
         solver.step()
@@ -119,7 +119,7 @@ def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: s
 
 def test_what_is_left_undone_does_not_add_up() -> None:
     """χ² along 800 steps, beside a tree that leaves nothing undone."""
-    solvers = {ripple: Solver(Options(mode="bayes-tree", ripple=ripple)) for ripple in (0.0, 0.05, 1.0)}
+    solvers = {ripple: Solver(Options(mode="bayes-tree", wildfire_threshold=ripple)) for ripple in (0.0, 0.05, 1.0)}
     ratios = []
     for n, step in enumerate(manhattan(800, 9)):
         for one in solvers.values():
@@ -206,13 +206,13 @@ def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
 
 def test_a_long_drive_does_not_drift() -> None:
     """δ after 10,000 steps is that of R made at once, at the same linearisation points."""
-    solver = Solver(Options(**EXACT))
+    solver = Solver(Options.of(**EXACT))
     for step in manhattan(10_000, 5):
         solver.stage(step.batch)
         solver.step()
     tree, fresh = (
         tree_of(solver),
-        Solver(Options(**EXACT, bent=1e9, converged_share=np.inf, place_new=False)),
+        Solver(Options.of(**EXACT, relinearize_threshold=1e9, converged_share=np.inf, initialize_locally=False)),
     )
     delta = tree.scalars[0, : solver._graph.counts[at.SCALARS]].copy()
     variables, factors = solver.graph()
@@ -258,7 +258,7 @@ def test_a_step_that_would_raise_chi2_is_replaced_by_a_batch() -> None:
         np.tile([1.0, 0.0, 2 * np.pi / n], (n, 1)),
         np.tile([100.0, 0, 0, 100.0, 0, 1000.0], (n, 1)),
     )
-    solver = Solver(Options(mode="bayes-tree", place_new=False))
+    solver = Solver(Options(mode="bayes-tree", initialize_locally=False))
     fixed = Variables("se2", np.array([0]), wild[:1], fixed=True)
     solver.stage(Batch((fixed, Variables("se2", np.arange(1, n), wild[1:])), (edges,)))
     first = DenseGraph()
@@ -279,5 +279,5 @@ def test_a_robot_that_drives_on_touches_the_root_alone() -> None:
         edge = Factors("between_se2", ends, ahead, np.array([[100.0, 0, 0, 100.0, 0, 400.0]]))
         solver.stage(Batch((Variables("se2", np.array([k + 1])),), (edge,)))
         eliminated.append(solver.step().eliminated)
-    assert max(eliminated) <= Options().split_pivots // 3 + 1
+    assert max(eliminated) <= Options().tuning.clique_split_min_pivots // 3 + 1
     assert sum(b == a + 1 for a, b in pairwise(eliminated)) >= 0.7 * len(eliminated)

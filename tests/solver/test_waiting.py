@@ -15,10 +15,10 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import burden, dear
 from factorbus.solver.kernels.model import layout as at
 
 NEVER = {
-    "bent_soon": np.inf,
-    "bent_now": np.inf,
-    "bent_most": np.inf,
-    "patience": 10**9,
+    "relinearize_next_step_share": np.inf,
+    "relinearize_same_step_share": np.inf,
+    "relinearize_max_error": np.inf,
+    "relinearize_max_wait": 10**9,
     "converged_share": np.inf,
 }
 
@@ -40,7 +40,7 @@ def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[tuple[Tree, np.nda
 
 @pytest.mark.parametrize("world", [manhattan, city_trees])
 def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
-    options = Options(bent_now=np.inf, converged_share=np.inf)
+    options = Options.of(relinearize_same_step_share=np.inf, converged_share=np.inf)
     solver, waited, relinearised, largest = Solver(options), 0, 0, 0.0
     for tree, before, due in drive(solver, (step.batch for step in world(700, 11))):
         if due:
@@ -48,10 +48,14 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
             relinearised += 1
         waited += waiting(tree).size > 0 and not tree.state[tl.S_DUE]
         share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
-        rested = options.rest / max(tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1)
-        most = options.bent_soon * min(max(rested**2, 1.0), options.reluctance)
+        rested = options.tuning.relinearize_cooldown_steps / max(
+            tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1
+        )
+        most = options.tuning.relinearize_next_step_share * min(
+            max(rested**2, 1.0), options.tuning.relinearize_cooldown_factor
+        )
         scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
-        most *= min(max((scalars / options.many) ** 3, 0.02), 1.0)
+        most *= min(max((scalars / options.tuning.relinearize_full_batch) ** 3, 0.02), 1.0)
         most *= 24.0 if (solver._graph.var[waiting(tree), at.V_KIND] == at.POINT2).any() else 1.0
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
@@ -65,7 +69,14 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
     """(9.22): with many variables that wait a large share is due, with few of them a small one."""
     shares: dict[bool, list[float]] = {True: [], False: []}
     for many in (10, 10**6):
-        solver = Solver(Options(many=many, bent_now=np.inf, bent_most=np.inf, converged_share=1e5))
+        solver = Solver(
+            Options.of(
+                relinearize_full_batch=many,
+                relinearize_same_step_share=np.inf,
+                relinearize_max_error=np.inf,
+                converged_share=1e5,
+            )
+        )
         for tree, _, _ in drive(solver, (step.batch for step in manhattan(400, 11))):
             share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
             if tree.state[tl.S_DUE] and share > 0.0:  # 0: nothing that waits counts
@@ -79,13 +90,13 @@ def test_poses_in_space_and_landmarks_have_to_be_worth_more() -> None:
     """(9.22): one of them among all that wait is enough."""
     assert [dearness(kind) for kind in (at.SE2, at.SE3, at.POINT2, at.POINT3)] == [1.0, 8.0, 24.0, 24.0]
     settings = np.zeros(tl.P_SIZE)
-    settings[tl.P_MANY] = 1000
+    settings[tl.P_FULL_BATCH] = 1000
     assert [burden(count, settings) for count in (3, 500, 1000, 10**5)] == [0.02, 0.125, 1.0, 1.0]
 
 
 def test_nothing_waits_longer_than_patience() -> None:
     patience = 30
-    solver = Solver(Options(**{**NEVER, "patience": patience}))
+    solver = Solver(Options.of(**{**NEVER, "patience": patience}))
     since: dict[int, int] = {}
     longest = 0
     for n, (tree, _, _) in enumerate(drive(solver, (step.batch for step in manhattan(400, 11)))):
@@ -98,7 +109,7 @@ def test_nothing_waits_longer_than_patience() -> None:
 def test_what_is_bent_far_does_not_wait() -> None:
     """By itself it is nothing in the χ² of a large map, and much where it is."""
     limit = 0.2
-    solver, found = Solver(Options(**{**NEVER, "bent_most": limit})), 0
+    solver, found = Solver(Options.of(**{**NEVER, "bent_most": limit})), 0
     for tree, before, due in drive(solver, (step.batch for step in manhattan(400, 11))):
         if due:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
@@ -109,7 +120,7 @@ def test_what_is_bent_far_does_not_wait() -> None:
 
 
 def test_what_waits_in_vain_is_taken_along_by_a_settle() -> None:
-    solver = Solver(Options(**NEVER))
+    solver = Solver(Options.of(**NEVER))
     for _ in drive(solver, (step.batch for step in manhattan(300, 11))):
         pass
     assert waiting(tree_of(solver)).size > 10

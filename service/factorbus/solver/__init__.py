@@ -18,6 +18,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 from factorbus.solver.starts.batch import BatchResult, solve_batch
+from factorbus.solver.tuning import Tuning
 from factorbus.solver.warm import warm
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "Solver",
     "SolverError",
     "StepReport",
+    "Tuning",
     "chi2_at",
     "compiled_seconds",
     "errors",

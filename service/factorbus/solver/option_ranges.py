@@ -48,48 +48,47 @@ _SHARE, _FINITE, _AMOUNT, _FACTOR = Range(0.0, 1.0), Range(most=1e9), Range(), R
 # to say that it has converged, it is a share, or finite.
 RANGES = types.MappingProxyType(
     {
-        "tolerance": _SHARE,
-        "tol": _FINITE,
-        "small_loop": _count(0),
-        "big_loop": _count(0),
-        "loop_share": _FINITE,
-        "negligible": _SHARE,
+        "batch_tolerance": _SHARE,
+        "incremental_tolerance": _FINITE,
+        "small_loop_threshold": _count(0),
+        "big_loop_threshold": _count(0),
+        "loop_threshold_share": _FINITE,
+        "chi2_epsilon": _SHARE,
         "max_iterations": _count(0),
-        "nonmonotone_steps": _count(0),
-        "settle_tolerance": _SHARE,
-        "settle_iterations": _count(0),
-        "recent_poses": _count(1),
-        "bent": _AMOUNT,
-        "bent_soon": _AMOUNT,
-        "bent_now": _AMOUNT,
-        "many": _count(1),
-        "bent_most": _AMOUNT,
-        "patience": _count(0),
-        "rest": _count(0),
-        "reluctance": _FINITE,
-        "dear": _FACTOR,
-        "rounds": _count(1),
+        "max_nonmonotone_steps": _count(0),
+        "converge_tolerance": _SHARE,
+        "converge_max_iterations": _count(0),
+        "constrain_recent_poses": _count(1),
+        "relinearize_threshold": _AMOUNT,
+        "relinearize_next_step_share": _AMOUNT,
+        "relinearize_same_step_share": _AMOUNT,
+        "relinearize_full_batch": _count(1),
+        "relinearize_max_error": _AMOUNT,
+        "relinearize_max_wait": _count(0),
+        "relinearize_cooldown_steps": _count(0),
+        "relinearize_cooldown_factor": _FINITE,
+        "relinearize_cooldown_flops": _FACTOR,
+        "max_rounds": _count(1),
         "converged_share": _AMOUNT,
-        "ripple": _SHARE,
-        "recent_steps": _count(0),
-        "heavy": _AMOUNT,
-        "near": Range(0.0, 1e6),
-        "around": Range(0.0, 1e6),
-        "worth": _AMOUNT,
-        "rings": Range(1.0, above=True),
-        "detour": _AMOUNT,
-        "split_pivots": _count(0),
-        "split_share": _SHARE,
+        "wildfire_threshold": _SHARE,
+        "constrain_recent_steps": _count(0),
+        "reroot_min_flops": _AMOUNT,
+        "reroot_size_linear": Range(0.0, 1e6),
+        "reroot_size_area": Range(0.0, 1e6),
+        "reroot_period": _AMOUNT,
+        "reroot_ring_ratio": Range(1.0, above=True),
+        "reroot_max_extra": _AMOUNT,
+        "clique_split_min_pivots": _count(0),
+        "clique_split_max_affected": _SHARE,
     }
 )
-SWITCHES = ("keep_factor", "place_new", "last_pose_last")
+SWITCHES = ("reuse_factor", "initialize_locally", "constrain_last_pose")
 
 
-def check_numbers(options: Any) -> None:
-    """Every number in its range, every switch True or False.  Raises BadOption."""
-    for name, allowed in RANGES.items():
-        if not allowed.takes(value := getattr(options, name)):
+def check_numbers(settings: Any) -> None:
+    """Every number of a dataclass in its range, every switch True or False.  Raises BadOption."""
+    for name in settings.__slots__:
+        if (allowed := RANGES.get(name)) and not allowed.takes(value := getattr(settings, name)):
             raise BadOption(name, repr(value), str(allowed))
-    for name in SWITCHES:
-        if not isinstance(value := getattr(options, name), bool):
+        if name in SWITCHES and not isinstance(value := getattr(settings, name), bool):
             raise BadOption(name, repr(value), "True or False")

@@ -17,7 +17,7 @@ class StepReport(NamedTuple):
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
     chi2, chi2_before        Σ rᵀ Ω r of all factors at the published estimate; and at the values before the step, the
-                 new factors included, new variables at their first values (`Options.place_new`)
+                 new factors included, new variables at their first values (`Options.initialize_locally`)
     new_variables, new_factors   taken in by this step
     changed      variables whose values differ from before, the new ones included
     relinearised linearisation points that were moved, counted once per iteration

@@ -133,7 +133,7 @@ class Solver:
         Raises Underconstrained or NotFinite; what was staged since the last step is taken back then, and the solver is
         as it was after that step, bit for bit.
         """
-        return self._tree.step(settle) if self._tree else self._step(settle, self._options.place_new)
+        return self._tree.step(settle) if self._tree else self._step(settle, self._options.initialize_locally)
 
     def _resume(self, settle: bool = False) -> StepReport:
         """The first step of a solver that has taken over a map: it goes on from the estimate, none of which is new."""
@@ -352,9 +352,11 @@ class Solver:
         mark, counts = self._done.graph, self._graph.counts.tolist()
         few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
         if few and self._mode.updates:
+            epsilon = self._options.tuning.chi2_epsilon
+            graph = self._graph
             settle_new(
-                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS],
-                self._options.negligible, self._graph.var, self._graph.fac, self._graph.values, self._graph.payload,
+                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS], epsilon,
+                graph.var, graph.fac, graph.values, graph.payload,
             )  # fmt: skip
 
     def _suspects(self) -> I64:
@@ -386,7 +388,7 @@ class Solver:
             return "nothing is new: to the optimum"
         if self._system.drifted and self._is_batch_due():
             return "a batch is due"
-        if self._done.unsolved + added > self._options.negligible:
+        if self._done.unsolved + added > self._options.tuning.chi2_epsilon:
             return f"new factors add {added:.3g} to χ²"
         return ""
 
@@ -413,7 +415,7 @@ class Solver:
         """Gauss-Newton from the present values, or between forced batches one linear step; and whether that is the
         optimum to what χ² shows."""
         system, options, chi2 = self._system, self._options, self._done.chi2 + added
-        tolerance = options.tol if self._mode.updates else options.tolerance
+        tolerance = options.incremental_tolerance if self._mode.updates else options.batch_tolerance
         rule, goes_on = ordinary_rule(options, tolerance), self._goes_on and not settle
         if settle:
             rule = settling_rule(options)
@@ -444,7 +446,7 @@ class Solver:
         It is where that has led to the new optimum often enough lately; else every `_TRY_AGAIN`-th of the steps that
         move tries, to find out.
         """
-        if not self._options.keep_factor:
+        if not self._options.tuning.reuse_factor:
             return False
         if course.iterations == 0:
             return True

@@ -23,7 +23,7 @@ def optima(
     the last is an ordinary step instead, from the optimum of the one before, until the next one would lower χ² by less
     than 1e-9 of it: that is one pass as a rule, and none where only a pose was added.  χ² is the common evaluator's.
     """
-    solver, wanted, found, values = Solver(Options(mode="all-batch", tolerance=_CLOSE)), set(samples), [], {}
+    solver, wanted, found, values = Solver(Options(mode="all-batch", batch_tolerance=_CLOSE)), set(samples), [], {}
     many = len(wanted) * _STRIDE > len(steps)
     for k, batch in enumerate(steps):
         solver.stage(batch)

@@ -37,7 +37,7 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
         if name not in known:
             raise JournalOption(name, "there is no such option here" + nearest(name, known))
     try:
-        settings = Options(**{**options, "mode": mode, "clock": time.perf_counter})
+        settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
         raise JournalOption(str(bad.detail["name"]), bad.message) from None
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())

@@ -208,7 +208,7 @@ class TreeSteps:
         system = self._system(self._graph)
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
-        rule = (further_rule if continues else ordinary_rule)(options, options.tolerance)
+        rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
         if settle:
             rule = settling_rule(options)
         course = minimise(system, chi2, 0.0, rule)

@@ -34,32 +34,18 @@ class Tree(Arenas):
     NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
 
     def __init__(self, graph: Graph, options: Options) -> None:
-        self._graph, self._rest = graph, options.rest
-        self.settings: F64 = np.empty(tl.P_SIZE)
-        self.settings[[tl.P_RIPPLE, tl.P_BENT, tl.P_BENT_NOW]] = options.ripple, options.bent, options.bent_now
-        self.settings[[tl.P_SPLIT_PIVOTS, tl.P_SPLIT_SHARE]] = options.split_pivots, options.split_share
-        self.settings[[tl.P_CONVERGED, tl.P_RECENT]] = options.converged_share, options.recent_steps
-        self.settings[[tl.P_SOON, tl.P_PATIENCE, tl.P_MOST]] = (
-            options.bent_soon,
-            options.patience,
-            options.bent_most,
-        )
-        self.settings[tl.P_MANY] = options.many
-        self.settings[[tl.P_REST, tl.P_RELUCTANCE, tl.P_DEAR]] = options.rest, options.reluctance, options.dear
-        self.settings[[tl.P_NEGLIGIBLE, tl.P_ROUNDS]] = options.negligible, options.rounds
-        self.settings[[tl.P_HEAVY, tl.P_NEAR, tl.P_AROUND]] = options.heavy, options.near, options.around
-        self.settings[[tl.P_WORTH, tl.P_RINGS, tl.P_DETOUR]] = options.worth, options.rings, options.detour
-        self.settings[tl.P_PLACE] = _FEW if options.place_new else -1
+        self._graph, self._rest = graph, options.tuning.relinearize_cooldown_steps
+        self.settings: F64 = settings_of(options)
         self.clear()
 
     @contextmanager
     def placing_none(self) -> Iterator[None]:
         """While inside, variables that are new to the tree stay at the values that they have."""
-        place, self.settings[tl.P_PLACE] = self.settings[tl.P_PLACE], -1
+        place, self.settings[tl.P_INITIALIZE] = self.settings[tl.P_INITIALIZE], -1
         try:
             yield
         finally:
-            self.settings[tl.P_PLACE] = place
+            self.settings[tl.P_INITIALIZE] = place
 
     def clear(self) -> None:
         """Let go of everything: the next step takes in the whole graph."""
@@ -187,6 +173,34 @@ class Tree(Arenas):
             pages.enlarge(self, "hessian", roomy(need, self.hessian.size))
         if 2 * new > len(self.saved):
             self.saved = np.empty((4 * new, 8))
+
+
+def settings_of(options: Options) -> F64:
+    """The settings of a step, by their entries in `layout`."""
+    tuning, settings = options.tuning, np.empty(tl.P_SIZE)
+    settings[tl.P_WILDFIRE_THRESHOLD] = options.wildfire_threshold
+    settings[tl.P_RELINEARIZE_THRESHOLD] = options.relinearize_threshold
+    settings[tl.P_CONVERGED], settings[tl.P_MAX_ROUNDS] = options.converged_share, options.max_rounds
+    settings[tl.P_INITIALIZE] = _FEW if options.initialize_locally else -1
+    settings[tl.P_CHI2_EPSILON] = tuning.chi2_epsilon
+    settings[tl.P_NEXT_STEP_SHARE] = tuning.relinearize_next_step_share
+    settings[tl.P_SAME_STEP_SHARE] = tuning.relinearize_same_step_share
+    settings[tl.P_MAX_ERROR], settings[tl.P_MAX_WAIT] = tuning.relinearize_max_error, tuning.relinearize_max_wait
+    settings[tl.P_FULL_BATCH] = tuning.relinearize_full_batch
+    settings[tl.P_COOLDOWN_STEPS] = tuning.relinearize_cooldown_steps
+    settings[tl.P_COOLDOWN_FACTOR] = tuning.relinearize_cooldown_factor
+    settings[tl.P_COOLDOWN_FLOPS] = tuning.relinearize_cooldown_flops
+    settings[tl.P_RECENT_STEPS] = tuning.constrain_recent_steps
+    settings[tl.P_SPLIT_MIN_PIVOTS] = tuning.clique_split_min_pivots
+    settings[tl.P_SPLIT_MAX_AFFECTED] = tuning.clique_split_max_affected
+    settings[tl.P_REROOT_MIN_FLOPS], settings[tl.P_REROOT_PERIOD] = tuning.reroot_min_flops, tuning.reroot_period
+    settings[tl.P_REROOT_SIZE_LINEAR] = tuning.reroot_size_linear
+    settings[tl.P_REROOT_SIZE_AREA] = tuning.reroot_size_area
+    settings[tl.P_REROOT_RING_RATIO], settings[tl.P_REROOT_MAX_EXTRA] = (
+        tuning.reroot_ring_ratio,
+        tuning.reroot_max_extra,
+    )
+    return settings
 
 
 def _widened(array: F64, need: int) -> F64:

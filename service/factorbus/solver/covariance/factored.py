@@ -65,7 +65,7 @@ def factored_anew(graph: Graph) -> Factored:
     values = copy.values.copy()
     # The graph is solved, so all of it is held; and the linearisation points are the estimate.  They stay there, in one
     # round, wherever what is left of the gradient leads.
-    tree = Tree(copy, Options(mode="bayes-tree", place_new=False, rounds=1, converged_share=np.inf))
+    tree = Tree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1, converged_share=np.inf))
     if tree.step(sure=True) == tl.FAILED:
         key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
         raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")

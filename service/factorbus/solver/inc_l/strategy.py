@@ -22,8 +22,8 @@ class Plan:
 
 def choose(reach: Reach, factors: int, columns: int, options: Options) -> Plan:
     """The update for what that many new factors reach in R, which has `columns` block columns."""
-    size, share = int(reach.rows.size), _FEW_ROWS + options.loop_share * columns
-    small, big = min(options.small_loop, share), min(options.big_loop, share)
+    size, share = int(reach.rows.size), _FEW_ROWS + options.tuning.loop_threshold_share * columns
+    small, big = min(options.tuning.small_loop_threshold, share), min(options.tuning.big_loop_threshold, share)
     loop = f"a loop over {reach.span} of {counted(columns, 'block column')} that reaches {size}"
     if size <= small and factors <= _FEW_FACTORS:
         return Plan("omega", f"{loop}, no more than smallLoopThresh = {small:.0f}", size)

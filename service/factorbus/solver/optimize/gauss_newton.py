@@ -61,7 +61,7 @@ class LinearProblem(Problem, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """When to stop: the next step would lower χ² by less than `tolerance` χ² + `floor`; or after `limit` tries.
+    """When to stop: the next step would lower χ² by less than `batch_tolerance` χ² + `floor`; or after `limit` tries.
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
     polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.

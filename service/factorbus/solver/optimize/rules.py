@@ -9,7 +9,9 @@ _POLISH = 100
 
 def ordinary_rule(options: Options, tolerance: float) -> Rule:
     """Of a step with something new."""
-    return Rule(tolerance, options.negligible, options.max_iterations, nonmonotone=options.nonmonotone_steps)
+    return Rule(
+        tolerance, options.tuning.chi2_epsilon, options.max_iterations, nonmonotone=options.tuning.max_nonmonotone_steps
+    )
 
 
 def further_rule(options: Options, tolerance: float) -> Rule:
@@ -19,7 +21,8 @@ def further_rule(options: Options, tolerance: float) -> Rule:
 
 def settling_rule(options: Options) -> Rule:
     """Of a step that was asked to settle: to more digits than χ² has."""
+    tuning = options.tuning
     return Rule(
-        options.settle_tolerance, 1e-8 * options.negligible, options.settle_iterations, polish=_POLISH,
-        nonmonotone=options.nonmonotone_steps,
+        tuning.converge_tolerance, 1e-8 * tuning.chi2_epsilon, tuning.converge_max_iterations, polish=_POLISH,
+        nonmonotone=tuning.max_nonmonotone_steps,
     )  # fmt: skip

@@ -68,7 +68,11 @@ class Elimination:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]
-            group = constraint(graph, self._options.recent_poses) if self._options.last_pose_last else None
+            group = (
+                constraint(graph, self._options.tuning.constrain_recent_poses)
+                if self._options.tuning.constrain_last_pose
+                else None
+            )
             perm = order(dims, blocks.rows, blocks.cols, group)
             watch.lap("order")
             self.symbolic, self._pattern = analyze(dims, blocks.rows, blocks.cols, perm), pattern
@@ -82,7 +86,7 @@ class Elimination:
 
 def constraint(graph: Graph, recent_poses: int = 1) -> I64:
     """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it, or from
-    the `recent_poses` last ones, right before it.
+    the `constrain_recent_poses` last ones, right before it.
 
     The next factors will most likely touch these, and changes near the end of the order are cheap (2013 paper, §5.2).
     """

@@ -35,7 +35,7 @@ _SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
 _PATIENCE, _FAR = 2, 2.0
 # Ends whose χ² differ by less than this share are one: of those, the start that comes first in the list counts.
 _EQUAL = 1e-9
-NOTHING = Options().negligible
+NOTHING = Options().tuning.chi2_epsilon
 
 
 @dataclass(slots=True)
@@ -62,7 +62,7 @@ class Descents:
 
     def __init__(self, graph: Graph) -> None:
         options = Options(mode="all-batch")
-        self._rule = options.settle_tolerance, 1e-8 * options.negligible
+        self._rule = options.tuning.converge_tolerance, 1e-8 * options.tuning.chi2_epsilon
         self.graph, none = graph, (0,) * at.COUNTS
         self._system = System(graph, Incremental(Elimination(options), options))
         self._suspects = find_unheld(graph, none)

@@ -67,12 +67,12 @@ def detach(graph: Graph, tree: Tree, marked: I64, settings: F64, affected: I64, 
 def is_split(c: int, first: int, settings: F64, var: I64, clique: I64, lists: I64) -> bool:
     """Whether the frontals before place `first` are worth keeping."""
     pivots = clique[c, tl.C_PIVOTS]
-    if pivots <= settings[tl.P_SPLIT_PIVOTS]:
+    if pivots <= settings[tl.P_SPLIT_MIN_PIVOTS]:
         return False
     kept, start = 0, clique[c, tl.C_LIST]
     for place in range(first):
         kept += dim_of_variable(var, lists[start + place])
-    return pivots - kept <= settings[tl.P_SPLIT_SHARE] * pivots
+    return pivots - kept <= settings[tl.P_SPLIT_MAX_AFFECTED] * pivots
 
 
 @inline_kernel

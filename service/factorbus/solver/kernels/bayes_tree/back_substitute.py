@@ -1,8 +1,8 @@
 """Back-substitution from the new roots down, as far as anything changes.  MATH §9.7.
 
-A clique that was there before is solved again only when its separator has changed its shape by more than `ripple`
-standard deviations since the clique was solved last, and where it has moved by more as a whole, all below moves along;
-so what is left undone never adds up over the steps.
+A clique that was there before is solved again only when its separator has changed its shape by more than
+`wildfire_threshold` standard deviations since the clique was solved last.  Where it has moved by more as a whole, all
+below moves along.  So what is left undone never adds up over the steps.
 """
 
 import numpy as np

@@ -30,8 +30,8 @@ def begin(graph: Graph, tree: Tree) -> int:
         or 2 * (f1 - f0) > len(saved)
     ):
         return tl.NO_ROOM
-    if v1 - v0 <= settings[tl.P_PLACE]:
-        settle_new(v0, v1, f0, f1, settings[tl.P_NEGLIGIBLE], var, fac, values, payload)
+    if v1 - v0 <= settings[tl.P_INITIALIZE]:
+        settle_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], var, fac, values, payload)
     if state[tl.S_CHECKED] == 0 and v1 > v0:
         held = np.empty(v1 - v0, np.int64)
         for v in range(v0, v1):

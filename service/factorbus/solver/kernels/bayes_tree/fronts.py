@@ -66,7 +66,7 @@ def is_root_alone(marked: I64, n: int, new: int, affected: I64, settings: F64, v
     pivots = 0
     for k in range(n):
         pivots += dim_of_variable(var, affected[k])
-    return pivots <= settings[tl.P_SPLIT_PIVOTS]
+    return pivots <= settings[tl.P_SPLIT_MIN_PIVOTS]
 
 
 @part

@@ -150,31 +150,31 @@ DONE, NO_ROOM, FAILED, UNSURE, INFINITE = 0, 1, 2, 3, 4
 WORSE, ROSE, RAISED = 1, 2, 4
 
 # Settings of a step.
-P_RIPPLE = 0  # in units of (9.17): how far a separator moves before its clique is solved again
-P_BENT = 1  # what is bent by more waits to be relinearised
-P_BENT_NOW = 2  # it is so at once, where all that is bent adds more than this share to χ²
-P_SPLIT_PIVOTS = 3  # larger cliques, in pivot scalars,
-P_SPLIT_SHARE = 4  # of which no more than this share is touched, keep their leading frontals
+P_WILDFIRE_THRESHOLD = 0  # in units of (9.17): how far a separator moves before its clique is solved again
+P_RELINEARIZE_THRESHOLD = 1  # what is bent by more waits to be relinearised
+P_SAME_STEP_SHARE = 2  # it is so at once, where all that is bent adds more than this share to χ²
+P_SPLIT_MIN_PIVOTS = 3  # larger cliques, in pivot scalars,
+P_SPLIT_MAX_AFFECTED = 4  # of which no more than this share is touched, keep their leading frontals
 P_CONVERGED = (
     5  # a step goes on while a Gauss–Newton step may lower χ² by more than this share; one that raised it so ends
 )
-P_NEGLIGIBLE = 6  # a χ² that is nothing
-P_RECENT = 7  # variables with a factor in the last so many steps go last
-P_ROUNDS = 8  # eliminations in a step, at most
-P_PLACE = 9  # how many new variables, at most, are first put where their own factors want them
-P_SOON = 10  # and in the next step where it adds more than this share,
-P_PATIENCE = 11  # has waited for so many steps,
-P_MOST = 12  # or something is bent by more than this
-P_HEAVY = 13  # an elimination of more flops brings what is near to the root,
-P_WORTH = 14  # when with it this share has been spent of what that took the last time
-P_NEAR = 15  # so many scalars, times the cube root of the flops
-P_REST = 16  # for so many steps after a relinearisation P_SOON and P_BENT_NOW are more,
-P_RELUCTANCE = 17  # up to so many times
-P_MANY = 18  # P_SOON and P_BENT_NOW are for so many scalars that wait, (9.22)
-P_DEAR = 19  # P_REST is for a relinearisation of so many flops
-P_AROUND = 20  # or so many times its square, if that is more,
-P_RINGS = 21  # in rings, each with all inside it so many times as large as the next one,
-P_DETOUR = 22  # unless that takes more than this share of the elimination in addition
+P_CHI2_EPSILON = 6  # a χ² that is nothing
+P_RECENT_STEPS = 7  # variables with a factor in the last so many steps go last
+P_MAX_ROUNDS = 8  # eliminations in a step, at most
+P_INITIALIZE = 9  # how many new variables, at most, are first put where their own factors want them
+P_NEXT_STEP_SHARE = 10  # and in the next step where it adds more than this share,
+P_MAX_WAIT = 11  # has waited for so many steps,
+P_MAX_ERROR = 12  # or something is bent by more than this
+P_REROOT_MIN_FLOPS = 13  # an elimination of more flops brings what is near to the root,
+P_REROOT_PERIOD = 14  # when with it this share has been spent of what that took the last time
+P_REROOT_SIZE_LINEAR = 15  # so many scalars, times the cube root of the flops
+P_COOLDOWN_STEPS = 16  # for so many steps after a relinearisation P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are more,
+P_COOLDOWN_FACTOR = 17  # up to so many times
+P_FULL_BATCH = 18  # P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are for so many scalars that wait, (9.22)
+P_COOLDOWN_FLOPS = 19  # P_COOLDOWN_STEPS is for a relinearisation of so many flops
+P_REROOT_SIZE_AREA = 20  # or so many times its square, if that is more,
+P_REROOT_RING_RATIO = 21  # in rings, each with all inside it so many times as large as the next one,
+P_REROOT_MAX_EXTRA = 22  # unless that takes more than this share of the elimination in addition
 P_SIZE = 23
 
 # The phases of a step, in the order of `step`.

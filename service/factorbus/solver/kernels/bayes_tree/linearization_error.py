@@ -53,12 +53,12 @@ def measure(graph: Graph, tree: Tree, settings: F64) -> float:
         state[tl.S_WAITING] = state[tl.S_STEP]
     most = 0.0
     if state[tl.S_MOVED] > 0:
-        most = evaluate_moved(graph, tree, settings[tl.P_BENT])  # fmt: skip
+        most = evaluate_moved(graph, tree, settings[tl.P_RELINEARIZE_THRESHOLD])
         if not account[tl.A_ADDED_UP] <= CANCELLED * (account[tl.A_CHI2] + NOTHING):
             sum_anew(stiff, state, account)
     scaled = weighed(account[tl.A_COUNTED], settings, var, pending, state)
     waited = state[tl.S_STEP] - state[tl.S_WAITING]
-    if scaled > settings[tl.P_SOON] or most > settings[tl.P_MOST] or waited >= settings[tl.P_PATIENCE]:
+    if scaled > settings[tl.P_NEXT_STEP_SHARE] or most > settings[tl.P_MAX_ERROR] or waited >= settings[tl.P_MAX_WAIT]:
         state[tl.S_DUE] = 1
     return scaled
 
@@ -163,7 +163,7 @@ def error_of(
     graph: Graph, tree: Tree, f: int, v: int, bent: float, gap: float, chi2: float, turned: float
 ) -> tuple[float, float]:
     """How far factor f, whose first variable is v, is from its linear model, as it counts and in full.  Where
-    that is more than `bent`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
+    that is more than `relinearize_threshold`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
     """
     var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
     node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
@@ -221,7 +221,7 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 @inline_kernel
 def weighed(total: float, settings: F64, var: I64, pending: I64, state: I64) -> float:
     """Σ error² as a multiple of what it has to be worth, (9.22)."""
-    if total <= LEAST_BURDEN * min(settings[tl.P_SOON], settings[tl.P_BENT_NOW]):
+    if total <= LEAST_BURDEN * min(settings[tl.P_NEXT_STEP_SHARE], settings[tl.P_SAME_STEP_SHARE]):
         return 0.0
     scalars, dearest = 0, 1.0
     for k in range(state[tl.S_PENDING]):
@@ -245,7 +245,7 @@ def sum_anew(stiff: F64, state: I64, account: F64) -> None:
 @inline_kernel
 def burden(count: int, settings: F64) -> float:
     """The share that so many scalars have to be worth of what `many` have to, to be relinearized.  (9.22)"""
-    share = count / settings[tl.P_MANY]
+    share = count / settings[tl.P_FULL_BATCH]
     return min(max(share * share * share, LEAST_BURDEN), 1.0)
 
 

@@ -39,12 +39,12 @@ def flops_of_clique(row: I64) -> float:
 def count_near(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> int:
     """How many scalars are to come near the root with the elimination of the marked cliques; 0: it stays as it is."""
     flops = flops_of(marked, clique)
-    if flops <= settings[tl.P_HEAVY]:
+    if flops <= settings[tl.P_REROOT_MIN_FLOPS]:
         return 0
-    if not relinearises and state[tl.S_SPENT] + flops <= settings[tl.P_WORTH] * state[tl.S_MOVING_ROOT]:
+    if not relinearises and state[tl.S_SPENT] + flops <= settings[tl.P_REROOT_PERIOD] * state[tl.S_MOVING_ROOT]:
         return 0
     side = flops ** (1.0 / 3.0)
-    return int(max(settings[tl.P_NEAR] * side, settings[tl.P_AROUND] * side * side))
+    return int(max(settings[tl.P_REROOT_SIZE_LINEAR] * side, settings[tl.P_REROOT_SIZE_AREA] * side * side))
 
 
 @part
@@ -58,7 +58,7 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
     var, fac = graph.var, graph.fac
     node, link, clique, state = tree.node, tree.link, tree.clique, tree.state
     stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
-    detour, wider = settings[tl.P_DETOUR] * flops_of(marked[:count], clique), settings[tl.P_RINGS]
+    detour, wider = settings[tl.P_REROOT_MAX_EXTRA] * flops_of(marked[:count], clique), settings[tl.P_REROOT_RING_RATIO]
     ring, within, scalars = 0, float(room), 0
     while within >= wider * INNERMOST and ring < MOST_RINGS:
         ring, within = ring + 1, within / wider

@@ -62,7 +62,7 @@ from factorbus.solver.kernels.sparse.task_queue import NOBODY
 FREE = 0
 LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
-QUIET = 0.05  # of P_BENT: a turn that bends by less is not counted
+QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn that bends by less is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
 LARGE_GAIN = 0.05  # of χ², in one round or all,
@@ -104,17 +104,17 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, lender: int) -> int
         state[tl.S_CONTINUES] = 1 if nothing_new else 0
     unit = account[tl.A_UNIT]
     scaled = settings.copy()
-    scaled[tl.P_RIPPLE] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
+    scaled[tl.P_WILDFIRE_THRESHOLD] *= unit * math.sqrt(f1 / max(counts[at.SCALARS], 1))  # (9.17)
     if state[tl.S_CONTINUES] != 0:
-        scaled[tl.P_RIPPLE] = 0.0
+        scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0
         await_bound(scaled, var, fac, node, stiff, pending, state, account)
-    scaled[tl.P_BENT] *= unit
-    scaled[tl.P_MOST] *= unit
-    scaled[tl.P_DEAR] = max(state[tl.S_RELINEARISING] / settings[tl.P_DEAR], 1.0)
+    scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
+    scaled[tl.P_MAX_ERROR] *= unit
+    scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARISING] / settings[tl.P_COOLDOWN_FLOPS], 1.0)
     share = unit * unit * max(f1, 1) * reluctance(scaled, state)  # of χ²
-    scaled[tl.P_BENT_NOW] *= share
-    scaled[tl.P_SOON] *= share
-    scaled[tl.P_PATIENCE] *= scaled[tl.P_DEAR]
+    scaled[tl.P_SAME_STEP_SHARE] *= share
+    scaled[tl.P_NEXT_STEP_SHARE] *= share
+    scaled[tl.P_MAX_WAIT] *= scaled[tl.P_COOLDOWN_FLOPS]
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, var, values, node, lin, scalars, turns, state)
     if not take_in_factors(graph, tree, f1):
@@ -203,9 +203,9 @@ def rescale(factors: int, settings: F64, account: F64) -> None:
     unit = residual_unit(factors, account)
     times = unit / account[tl.A_UNIT]
     account[tl.A_UNIT] = unit
-    for each in (tl.P_RIPPLE, tl.P_BENT, tl.P_MOST):
+    for each in (tl.P_WILDFIRE_THRESHOLD, tl.P_RELINEARIZE_THRESHOLD, tl.P_MAX_ERROR):
         settings[each] *= times
-    for each in (tl.P_BENT_NOW, tl.P_SOON):
+    for each in (tl.P_SAME_STEP_SHARE, tl.P_NEXT_STEP_SHARE):
         settings[each] *= times * times
 
 
@@ -226,8 +226,8 @@ def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
     if state[tl.S_ONCE] != 0:
         return False
     if account[tl.A_ERROR] > allowed(settings, state, account):
-        return rounds < (settings[tl.P_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
-    return state[tl.S_CONTINUES] == 0 and pull > settings[tl.P_BENT_NOW] and rounds < settings[tl.P_ROUNDS]
+        return rounds < (settings[tl.P_MAX_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
+    return state[tl.S_CONTINUES] == 0 and pull > settings[tl.P_SAME_STEP_SHARE] and rounds < settings[tl.P_MAX_ROUNDS]
 
 
 @inline_kernel
@@ -260,9 +260,9 @@ def await_bound(
 @inline_kernel
 def reluctance(settings: F64, state: I64) -> float:
     """How many times as much has to be bent, so soon after the last relinearisation.  (9.19)"""
-    dear = settings[tl.P_DEAR]
-    rested = settings[tl.P_REST] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
-    return min(max(rested * rested, 1.0), settings[tl.P_RELUCTANCE] * math.sqrt(dear))
+    dear = settings[tl.P_COOLDOWN_FLOPS]
+    rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
+    return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(dear))
 
 
 @inline_kernel
@@ -317,7 +317,7 @@ def eliminate_again(
     orphans = orphans[:hanging]
     if n == 0 and renewed.size == 0:
         add_constants(state[tl.S_TAKEN], f1, var, fac, link, hessian, account)
-        return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings, listed)  # fmt: skip
+        return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings, listed)
     now = lap(now, tl.MARK, state)
     old = np.empty((renewed.size, OLD), np.int64)
     if renewed.size > 0:
@@ -336,7 +336,7 @@ def eliminate_again(
         # No loop closes and nothing else moves: worth what it may cost that the newest pose is in the root.
         drives_on = f1 - state[tl.S_TAKEN] <= v1 - v0 and moving.size == 0 and state[tl.S_EDITED] == 0
         last = find_newest(v1, var) if drives_on else -1
-        recent = int(settings[tl.P_RECENT])
+        recent = int(settings[tl.P_RECENT_STEPS])
         if n <= MOST:
             near, hung = join_few(graph, tree, n, factors, orphans)
             perm, row, planes = order_few(n, near, affected, recent, last, var, node, state)
@@ -389,7 +389,7 @@ def eliminate_again(
         state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
         state[tl.S_RELINEARISING] = state[tl.S_FLOPS] - flops
     lap(now, tl.COMMIT, state)
-    return substitute_and_measure(graph, tree, tops, ids, settings, listed)  # fmt: skip
+    return substitute_and_measure(graph, tree, tops, ids, settings, listed)
 
 
 @inline_kernel
@@ -405,12 +405,13 @@ def substitute_and_measure(
         begins = np.empty(tops.size + ids.size, np.int64)
         for k in range(begins.size):
             begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
-    substitute(graph, tree, begins, settings[tl.P_RIPPLE], QUIET * settings[tl.P_BENT], listed)  # fmt: skip
+    quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
+    substitute(graph, tree, begins, settings[tl.P_WILDFIRE_THRESHOLD], quiet, listed)
     account[tl.A_CHI2] += account[tl.A_ADDED]
     account[tl.A_BEFORE] += account[tl.A_ADDED]
     account[tl.A_ADDED_UP] += account[tl.A_ADDED]
     account[tl.A_ADDED] = 0.0
-    pull = measure(graph, tree, settings)  # fmt: skip
+    pull = measure(graph, tree, settings)
     lap(now, tl.SUBSTITUTE, state)
     return pull, tl.DONE
 

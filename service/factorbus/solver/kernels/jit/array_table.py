@@ -21,6 +21,14 @@ int_rows: Any
 float_rows: Any
 address_of: Any
 
+
+def array_in_python(table: Any, entry: int, kind: type, dimensions: int) -> Any:
+    """The array at this entry of the table, with entries of `kind`; in Python."""
+    address, *shape = table[WIDTH * entry : WIDTH * entry + 1 + dimensions].tolist()
+    room: Any = (ctypes.c_char * (_WORD * int(np.prod(shape)))).from_address(address)
+    return np.frombuffer(room, kind).reshape(shape)
+
+
 if DISABLED:
 
     def _first_entry(array: Any) -> int:
@@ -28,12 +36,7 @@ if DISABLED:
         return int(array.ctypes.data)
 
     def _plain(kind: type, dimensions: int) -> Any:
-        def found(table: Any, entry: int) -> Any:
-            address, *shape = table[WIDTH * entry : WIDTH * entry + 1 + dimensions].tolist()
-            room: Any = (ctypes.c_char * (_WORD * int(np.prod(shape)))).from_address(address)
-            return np.frombuffer(room, kind).reshape(shape)
-
-        return found
+        return lambda table, entry: array_in_python(table, entry, kind, dimensions)
 
     address_of = _first_entry
     ints, int_rows = _plain(np.int64, 1), _plain(np.int64, 2)

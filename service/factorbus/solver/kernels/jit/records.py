@@ -21,59 +21,73 @@ name is used.  So a table must stay as it is while a kernel runs.
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar, get_type_hints
 
-from factorbus.solver.kernels.jit.array_table import float_rows, floats, int_rows, ints
+import numpy as np
+
+from factorbus.solver.kernels.jit.array_table import array_in_python
 from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, intrinsic, ir, types
 
-Ints = Annotated[I64, ints]
-Floats = Annotated[F64, floats]
-IntRows = Annotated[I64, int_rows]
-FloatRows = Annotated[F64, float_rows]
+# What an array holds, and how many dimensions it has.
+Ints = Annotated[I64, (np.int64, 1)]
+Floats = Annotated[F64, (np.float64, 1)]
+IntRows = Annotated[I64, (np.int64, 2)]
+FloatRows = Annotated[F64, (np.float64, 2)]
 
 Record = TypeVar("Record", bound=tuple[Any, ...])
 
 
 def fields_of(record: type) -> dict[str, Any]:
-    """The names of a record in the order of its table, each with the function that looks it up there."""
+    """The names of a record in the order of its table, each with what the array holds and its dimensions."""
     return {name: hint.__metadata__[0] for name, hint in get_type_hints(record, include_extras=True).items()}
 
 
+def opener(record: type[Record]) -> Callable[[I64], Record]:
+    """The function that makes a record of its table."""
+    return _open(record)
+
+
 table_of: Any
+_open: Any
+
+
+def _open_in_python(record: type) -> Any:
+    """What makes records of tables in Python; tests call parts of kernels with them."""
+    kinds = tuple(fields_of(record).values())
+    with_table: Any = type(record.__name__, (record,), {})
+
+    def record_at(table: I64) -> Any:
+        """The record that this table tells of."""
+        made = with_table(*(array_in_python(table, entry, *kind) for entry, kind in enumerate(kinds)))
+        made.table_ = table
+        return made
+
+    return record_at, with_table
+
 
 if DISABLED:
 
-    def opener(record: type[Record]) -> Callable[[I64], Record]:
-        """The function that makes a record of its table."""
-        found = tuple(fields_of(record).values())
-        with_table: Any = type(record.__name__, (record,), {})
-
-        def record_at(table: I64) -> Record:
-            made = with_table(*(look_up(table, entry) for entry, look_up in enumerate(found)))
-            made.table_ = table
-            return made
-
-        return record_at
+    def _open_only_in_python(record: type) -> Any:
+        return _open_in_python(record)[0]
 
     def _table_of(record: Any) -> I64:
         """The table that the record was made of."""
         return record.table_
 
-    table_of = _table_of
+    table_of, _open = _table_of, _open_only_in_python
 
 else:
     from factorbus.solver.kernels.jit.array_table import WIDTH, array_entry, make_array
     from factorbus.solver.kernels.jit.compile import AttributeTemplate, extending
 
-    _ARRAYS = {
-        kind: types.Array(entry, dimensions, "C")
-        for entry, kinds in ((types.int64, (ints, int_rows)), (types.float64, (floats, float_rows)))
-        for dimensions, kind in enumerate(kinds, start=1)
-    }
+    _ENTRIES = {np.int64: types.int64, np.float64: types.float64}
 
     class RecordType(types.Type):
         """The type of a record: the names and the types of its arrays."""
 
         def __init__(self, record: type) -> None:
-            self.entries = {name: (k, _ARRAYS[kind]) for k, (name, kind) in enumerate(fields_of(record).items())}
+            self.entries = {
+                name: (k, types.Array(_ENTRIES[kind], dimensions, "C"))
+                for k, (name, (kind, dimensions)) in enumerate(fields_of(record).items())
+            }
             super().__init__(name=f"{record.__module__}.{record.__qualname__}")
 
     @extending.register_model(RecordType)
@@ -107,14 +121,23 @@ else:
 
         return made(record), emit
 
-    table_of = _table
+    @extending.unbox(RecordType)
+    def _from_python(_typ: Any, record: Any, c: Any) -> Any:
+        """The address of the table that a record in Python was made of, which keeps it alive."""
+        kind = types.Array(types.int64, 1, "C")
+        table = c.pyapi.object_getattr_string(record, "table_")
+        words = c.unbox(kind, table)
+        c.pyapi.decref(table)
+        data = c.context.make_array(kind)(c.context, c.builder, words.value).data
+        return extending.NativeValue(data, is_error=words.is_error)
 
-    def opener(record: type[Record]) -> Callable[[I64], Record]:
-        """The function that makes a record of its table, in kernels."""
+    def _open_anywhere(record: type) -> Any:
         made = RecordType(record)
+        record_at, with_table = _open_in_python(record)
+        extending.typeof_impl.register(with_table)(lambda _value, _context: made)
 
         @intrinsic
-        def record_at(_typing: Any, table: Any) -> Any:
+        def address(_typing: Any, table: Any) -> Any:
             """The record that this table tells of."""
 
             def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -122,4 +145,10 @@ else:
 
             return made(table), emit
 
+        @extending.overload(record_at)
+        def _in_kernels(table: Any) -> Any:
+            return lambda table: address(table)
+
         return record_at
+
+    table_of, _open = _table, _open_anywhere
