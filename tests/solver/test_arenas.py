@@ -8,10 +8,9 @@ import pytest
 
 from factorbus.solver import Solver
 from factorbus.solver.graph.arenas import Arenas, lines
-from factorbus.solver.graph.factor_graph import Graph
-from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree import records as bayes_tree
 from factorbus.solver.kernels.jit.array_table import WIDTH
-from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model import records as model
 
 
 class Two(Arenas):
@@ -67,10 +66,11 @@ def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
     solver = Solver()
     assert solver._tree
     tree = solver._tree.tree
-    for thing, names in ((solver._graph, at.ARENAS), (tree, tl.ARENAS)):
+    for thing, names in ((solver._graph, model.Graph._fields), (tree, bayes_tree.Tree._fields)):
         assert rows(thing) == [of(getattr(thing, name)) for name in names]
-    assert Graph.ARENAS[at.T_FAC] == "fac"
-    assert type(tree).ARENAS[tl.T_ACCOUNT] == "account"
+    graph, looked_up = model.graph_at(solver._graph.places), bayes_tree.tree_at(tree.places)
+    assert all(np.shares_memory(getattr(graph, name), getattr(solver._graph, name)) for name in graph._fields)
+    assert all(np.shares_memory(getattr(looked_up, name), getattr(tree, name)) for name in looked_up._fields)
 
 
 def test_rows_begin_with_cache_lines() -> None:

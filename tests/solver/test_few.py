@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from naive.records import graph_of, tree_of
 
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -104,8 +105,8 @@ def affected(draw: st.DrawFn) -> Affected:
 def ordered(few: Affected, last: int = -1) -> tuple[I64, I64, I64, I64, dict[str, I64]]:
     """What `order_few` gives, and the orphans' separators."""
     a = few.arrays()
-    n, shared = len(few.kinds), (a["var"], a["fac"], a["node"], a["clique"], a["lists"], a["state"])
-    near, hung = join_few(n, a["factors"], a["orphans"], *shared)
+    n = len(few.kinds)
+    near, hung = join_few(graph_of(a), tree_of(a), n, a["factors"], a["orphans"])
     perm, row, planes = order_few(n, near, a["affected"], RECENT, last, a["var"], a["node"], a["state"])
     return perm, row, planes, hung, a
 
@@ -135,13 +136,13 @@ def test_pivots_have_the_least_degree_of_their_group_and_are_the_last_beside_the
 @given(affected())
 def test_fronts_are_those_that_many_variables_have(few: Affected) -> None:
     perm, row, planes, hung, a = ordered(few)
-    found = analyze_few(len(few.kinds), perm, row, planes, hung, a["affected"], a["var"])
+    fronts, found_lowest = analyze_few(len(few.kinds), perm, row, planes, hung, a["affected"], a["var"])
     label = np.argsort(perm)
-    tree = a["node"], a["clique"], a["lists"], a["state"]
-    lowest = find_lowest(label, a["orphans"], *tree)
-    rows, cols = list_pairs(lowest, a["factors"], a["orphans"], a["var"], a["fac"], *tree)
-    wanted = *analyze_affected(len(few.kinds), perm, a["affected"], a["var"], rows, cols), lowest
-    for one, other in zip(found, wanted, strict=True):
+    lowest = find_lowest(label, a["orphans"], a["node"], a["clique"], a["lists"], a["state"])
+    rows, cols = list_pairs(graph_of(a), tree_of(a), lowest, a["factors"], a["orphans"])
+    wanted = analyze_affected(len(few.kinds), perm, a["affected"], a["var"], rows, cols)
+    np.testing.assert_array_equal(found_lowest, lowest)
+    for one, other in zip(fronts, wanted, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -149,9 +150,8 @@ def test_fronts_are_those_that_many_variables_have(few: Affected) -> None:
 def test_fill_is_near_that_of_many_variables(few: Affected) -> None:
     a = few.arrays()
     other = order_affected(
-        len(few.kinds), a["affected"], a["factors"], a["orphans"], RECENT, -1,
-        a["var"], a["fac"], a["node"], a["clique"], a["lists"], a["state"],
-    )  # fmt: skip
+        graph_of(a), tree_of(a), len(few.kinds), a["affected"], a["factors"], a["orphans"], RECENT, -1
+    )
     assert fill(few, ordered(few)[0]) <= 1.25 * fill(few, other) + 50
 
 

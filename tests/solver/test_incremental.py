@@ -80,7 +80,7 @@ def follow(steps: Iterable[Batch], **options) -> tuple[Solver, Counter]:
 @pytest.mark.parametrize("way", ["omega", "lambda", "all"])
 @pytest.mark.parametrize("seed", range(3))
 def test_r_follows_through_a_map_of_all_kinds(seed: int, way: str) -> None:
-    _, checked = follow(random_steps(seed, steps=14), tol=1e6, **WAYS[way])
+    _, checked = follow(random_steps(seed, steps=14), incremental_tolerance=1e6, **WAYS[way])
     if way == "all":
         assert checked["omega"] > 0
         assert checked["lambda"] > 0
@@ -124,7 +124,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
 @settings(max_examples=60)
 @given(steps=drives(), way=st.sampled_from(sorted(WAYS)), tol=st.sampled_from([0.0, 1e-3, 1e6]))
 def test_r_follows_loops_of_any_length(steps: list[Batch], way: str, tol: float) -> None:
-    solver, _ = follow(steps, tol=tol, **WAYS[way])
+    solver, _ = follow(steps, incremental_tolerance=tol, **WAYS[way])
     whole = Solver(Options(mode="all-batch"))
     for batch in steps:
         whole.stage(batch)

@@ -18,7 +18,7 @@ from factorbus.solver.kernels.jit import lowering as _lowering
 
 MAKERS = Path(_compile_time.__file__), Path(_jit.__file__), Path(_lowering.__file__)
 CALLER = """
-from kernels import _jit
+from kernels.jit import compile as _jit
 from kernels.callee import twice
 
 @_jit.kernel("float64(float64[::1])")
@@ -26,7 +26,7 @@ def four_times(a):
     return twice(twice(a[{index}]))
 """
 CALLEE = """
-from kernels import _jit
+from kernels.jit import compile as _jit
 
 @_jit.inline_kernel
 def twice(x):
@@ -34,7 +34,8 @@ def twice(x):
 """
 SCRIPT = """
 import numpy as np
-from kernels import _jit, caller
+from kernels import caller
+from kernels.jit import compile as _jit
 print(caller.four_times(np.ones(3)), _jit.compiled_seconds() > 0.0, _jit.cache_folder().name)
 """
 
@@ -43,9 +44,9 @@ print(caller.four_times(np.ones(3)), _jit.compiled_seconds() > 0.0, _jit.cache_f
 def kernels(tmp_path: Path) -> Path:
     """A package with the real decorators and two small kernels."""
     folder = tmp_path / "kernels"
-    folder.mkdir()
+    (folder / "jit").mkdir(parents=True)
     for file in MAKERS:
-        shutil.copy(file, folder)
+        shutil.copy(file, folder / "jit")
     write(folder)
     return folder
 
@@ -95,7 +96,7 @@ def test_bounds_checked_kernels_are_others(kernels):
 
 
 PARTS = """
-from kernels import _jit
+from kernels.jit import compile as _jit
 
 @_jit.part
 def entry(a, k):
@@ -115,12 +116,14 @@ def pairs(a):
 """
 CALL_PARTS = """
 import numpy as np
-from kernels import _jit, parts
+from kernels import parts
+from kernels.jit import compile as _jit
 a = np.arange(4.0)
 print(parts.pairs(a), parts.pair(a, 1), parts.entries(a, 1), _jit.is_on_disk(parts.pairs))
 """
 LIST_SYMBOLS = """
-from kernels import _jit, parts
+from kernels import parts
+from kernels.jit import compile as _jit
 list(_jit.iter_compile(parts.pairs))
 (result,) = parts.pairs.overloads.values()
 print(*sorted(one.name for one in result.library.get_defined_functions() if one.linkage.name != "internal"))
@@ -145,7 +148,7 @@ def test_an_index_out_of_bounds_in_a_part_of_a_part_is_told(kernels):
 
 INDICES = """
 import numba
-from kernels import _jit
+from kernels.jit import compile as _jit
 
 @_jit.inline_kernel
 def last(a):

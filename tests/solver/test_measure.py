@@ -1,5 +1,7 @@
 """What moved is measured: the same variable by variable and through all factors."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,9 @@ from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import MUCH, evaluate_moved
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL
+from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 
 # Nothing is relinearised, so a lot is bent.
 NEVER = Options.of(
@@ -54,10 +58,10 @@ def found(solver: Solver, tree: Tree, moved: np.ndarray, bent: float, variables:
     state[[tl.S_MOVED, tl.S_PENDING]] = moved.size, 0
     account[[tl.A_CHI2, tl.A_ERROR, tl.A_COUNTED]] = 0.0
     state[tl.S_VARIABLES] = variables
-    most = evaluate_moved(
-        bent, graph.var, graph.fac, graph.payload, node, tree.link, stiff, tree.lin[0], tree.scalars, graph.values,
-        tree.turns, pending, listed, state, account,
-    )  # fmt: skip
+    copied = copy.copy(tree)
+    copied.node, copied.stiff, copied.pending, copied.moved = node, stiff, pending, listed
+    copied.state, copied.account = state, account
+    most = evaluate_moved(graph_at(graph.places), tree_at(copied.places), bent)
     assert account[tl.A_CHI2] == pytest.approx(stiff[:, tl.B_CHI2].sum())
     assert account[tl.A_ERROR] == pytest.approx(stiff[:, tl.B_ERROR].sum())
     waiting = np.sort(pending[: state[tl.S_PENDING]])

@@ -112,7 +112,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
 
 @pytest.mark.parametrize("world", ["manhattan", "sphere"])
 def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
-    options = Options.of(**{**ALWAYS, "near": 25.0}, **LINEAR)
+    options = Options.of(**{**ALWAYS, "reroot_size_linear": 25.0}, **LINEAR)
     solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
     for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](400, 7)))):
         found = rings(solver)
@@ -152,12 +152,12 @@ def test_above_a_ring_there_are_only_rings_inside_it(world: str) -> None:
 
 @pytest.mark.parametrize("rings", [1.0, 0.0, math.nan])
 def test_a_ring_is_larger_than_what_is_inside_it(rings: float) -> None:
-    with pytest.raises(BadOption, match="rings"):
+    with pytest.raises(BadOption, match="reroot_ring_ratio"):
         Options.of(reroot_ring_ratio=rings)
 
 
 def test_no_more_rings_than_there_are_groups_for() -> None:
-    solver = Solver(Options.of(**{**ALWAYS, "near": 60.0}, reroot_ring_ratio=1.001, **LINEAR))
+    solver = Solver(Options.of(**{**ALWAYS, "reroot_size_linear": 60.0}, reroot_ring_ratio=1.001, **LINEAR))
     for _ in drive(solver, steps("manhattan", 200)):
         assert max(rings(solver).values(), default=0) <= MOST_RINGS
     assert_is_a_tree(solver)
@@ -165,7 +165,7 @@ def test_no_more_rings_than_there_are_groups_for() -> None:
 
 @pytest.mark.parametrize("detour", [0.0, 0.5])
 def test_what_is_out_of_the_way_stays_where_it_is(detour: float) -> None:
-    solver = Solver(Options.of(**{**ALWAYS, "near": 60.0, "detour": detour}, **LINEAR))
+    solver = Solver(Options.of(**{**ALWAYS, "reroot_size_linear": 60.0, "reroot_max_extra": detour}, **LINEAR))
     first, stayed, came = 0, 0, 0
     node, clique = (array.copy() for array in (tree_of(solver).node, tree_of(solver).clique))
     for n, _ in enumerate(drive(solver, steps("manhattan", 500))):

@@ -1,13 +1,17 @@
 """Moving linearisation points: whatever moves, its factors are linearised again, each once, and no others."""
 
+import copy
+
 import numpy as np
 import pytest
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearise_around
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 
 
 @pytest.fixture(scope="module")
@@ -28,11 +32,9 @@ def test_the_factors_of_some_variables_are_linearised(driven: Solver, picked: li
     around = np.flatnonzero(np.isin(ends, picked).any(axis=1))
     if len(picked) == 2:
         assert np.ptp(around) >= SPARSE * around.size, "far apart: found by walking"
-    right, wrong = tree.hessian.copy(), np.full(tree.hessian.size, np.nan)
-    linearise_around(
-        np.array(picked), graph.var, graph.fac, graph.payload, tree.node, tree.link, wrong, tree.lin, tree.stiff,
-        tree.state,
-    )  # fmt: skip
+    right, wrong, copied = tree.hessian.copy(), np.full(tree.hessian.size, np.nan), copy.copy(tree)
+    copied.hessian = wrong
+    linearise_around(graph_at(graph.places), tree_at(copied.places), np.array(picked))
     starts = np.append(tree.link[:count, tl.L_AT], tree.state[tl.S_HESSIAN])
     done = [
         f for f in range(count) if np.array_equal(wrong[starts[f] : starts[f + 1]], right[starts[f] : starts[f + 1]])

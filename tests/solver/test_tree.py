@@ -112,7 +112,7 @@ def drives(draw: st.DrawFn) -> list[Batch]:
 @settings(max_examples=200)
 @given(steps=drives(), way=st.sampled_from(sorted(WAYS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
 def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, bent: float) -> None:
-    solver = follow(steps, **WAYS[way], bent=bent, converged_share=np.inf)
+    solver = follow(steps, **WAYS[way], relinearize_threshold=bent, converged_share=np.inf)
     settled = solver.step(settle=True).chi2
     assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
 

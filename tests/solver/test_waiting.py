@@ -96,7 +96,7 @@ def test_poses_in_space_and_landmarks_have_to_be_worth_more() -> None:
 
 def test_nothing_waits_longer_than_patience() -> None:
     patience = 30
-    solver = Solver(Options.of(**{**NEVER, "patience": patience}))
+    solver = Solver(Options.of(**{**NEVER, "relinearize_max_wait": patience}))
     since: dict[int, int] = {}
     longest = 0
     for n, (tree, _, _) in enumerate(drive(solver, (step.batch for step in manhattan(400, 11)))):
@@ -109,7 +109,7 @@ def test_nothing_waits_longer_than_patience() -> None:
 def test_what_is_bent_far_does_not_wait() -> None:
     """By itself it is nothing in the χ² of a large map, and much where it is."""
     limit = 0.2
-    solver, found = Solver(Options.of(**{**NEVER, "bent_most": limit})), 0
+    solver, found = Solver(Options.of(**{**NEVER, "relinearize_max_error": limit})), 0
     for tree, before, due in drive(solver, (step.batch for step in manhattan(400, 11))):
         if due:
             assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()

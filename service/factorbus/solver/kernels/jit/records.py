@@ -145,7 +145,7 @@ else:
 
             return made(table), emit
 
-        @extending.overload(record_at)
+        @extending.overload(record_at, strict=False)
         def _in_kernels(table: Any) -> Any:
             return lambda table: address(table)
 
