@@ -9,7 +9,7 @@ import click
 
 from factorbus.cli.advice import advising, of_what_is_there
 from factorbus.cli.exits import FAILED, OK, input_file
-from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, Number, file_argument, json_option, timeout_option, zenoh_option
 from factorbus.cli.reading import read_graph
 from factorbus.cli.screen import document, table
 from factorbus.cli.starts import NOT_CONVERGED, optimum_from, ratio_to
@@ -37,7 +37,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
+        timeout_option(30),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):

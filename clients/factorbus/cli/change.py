@@ -9,7 +9,7 @@ import click
 from factorbus.cli.advice import advising_changes
 from factorbus.cli.exits import OK
 from factorbus.cli.merging import merge_command
-from factorbus.cli.options import DEFAULT_ENDPOINT, SECONDS, Number, json_option, zenoh_option
+from factorbus.cli.options import DEFAULT_ENDPOINT, Number, json_option, timeout_option, zenoh_option
 from factorbus.cli.screen import document, table
 from factorbus.cli.starts import optimum_from
 
@@ -43,7 +43,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
+        timeout_option(30),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):
