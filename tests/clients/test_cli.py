@@ -77,7 +77,7 @@ def test_version_names_the_libraries() -> None:
             "missing.g2o: it cannot be read (No such file or directory)",
         ),
         (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
-        (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--wait", "0.1"], UNAVAILABLE, "[unavailable]"),
+        (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.1"], UNAVAILABLE, "[unavailable]"),
         (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
         (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .tum or .kitti"),
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
@@ -85,7 +85,12 @@ def test_version_names_the_libraries() -> None:
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
         (["serve", "--config", "missing.toml"], BAD_FILE, "missing.toml cannot be read"),
         (["serve", "--config", "wrong.toml"], USAGE, "'lisen' is not a setting"),
-        (["work", "--no-warm", "--connect", "nonsense"], USAGE, "[bad_config]"),
+        (["work", "--no-warm", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
+        (["work", "--no-warm", "--connect", "tcp/127.0.0.1"], USAGE, "with a port from 0 to 65535, such as"),
+        (["gateway", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
+        (["watch", "m", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
+        (["ask", "chi2", "m", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
+        (["doctor", "--connect", "nonsense"], USAGE, "factorbus: endpoint 'nonsense' cannot be read; wanted"),
     ],
 )
 def test_ends_with_the_code_and_one_line_that_says_why(

@@ -62,6 +62,11 @@ def test_an_optimum_that_had_not_converged_is_told_at_the_end() -> None:
     told = dict(_rows(result))
     assert "averaged rotations, not converged, the true optimum may be lower" in told["χ² / batch optimum"]
     assert told["batch optimum"] == "2 times not converged, the true optimum may be lower"
+    assert told["estimates received"] == "every one: 30 steps, 30 by the robot, 30 by the viewer"
+    result |= {"estimates_received": {"viewer": 30, "robot": 28}, "every_estimate_received": False}
+    missed = dict(_rows(result))["estimates received"]
+    assert missed.startswith("30 steps, 28 by the robot, 30 by the viewer; where a step's delta came late")
+    assert "every copy is complete at the end" in missed
     result["against_batch"] = [compared[0].as_dict()]
     assert "not converged" not in str(_rows(result))
 

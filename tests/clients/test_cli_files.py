@@ -97,6 +97,18 @@ def test_strict_refuses_and_writes_nothing(folder: Path, capsys: pytest.CaptureF
     assert "b.g2o: 1 bearing_range_se2 left out: g2o has no record for such factors" in capsys.readouterr().err
 
 
+def test_strict_takes_a_vertex_that_is_written_as_it_was(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (
+        "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_SE2 8 5 5 0\nVERTEX_XY 9 1 1\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+    )
+    (folder / "a.g2o").write_text(text)
+    assert main(["convert", "a.g2o", "b.g2o", "--strict"]) == OK
+    assert sorted((folder / "b.g2o").read_text().splitlines()) == sorted(text.splitlines())
+    capsys.readouterr()
+    assert main(["replay", "a.g2o", "--in-process", "--strict"]) == BAD_FILE
+    assert "2 vertices, no edge names 8, 9; wanted nothing that would be left out" in capsys.readouterr().err
+
+
 def test_one_of_each_is_counted_as_one(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "a.g2o").write_text("VERTEX_SE2 0 0 0 0\nVERTEX_XY 1 1 0\nEDGE_SE2_XY 0 1 1 0 1 0 1\n")
     assert main(["convert", "a.g2o", "b.g2o"]) == OK

@@ -187,6 +187,25 @@ def test_a_lost_last_delta_is_noticed_by_asking(start: Callable[..., Service], e
         assert same(kitchen.estimate, service)
 
 
+def test_a_late_delta_counts_although_the_estimate_was_asked_for(start: Callable[..., Service], endpoint: str) -> None:
+    service = start()
+    with connect(endpoint) as bus, bus.map(MAP) as kitchen:
+        heard: list[tuple[int, int]] = []
+        kitchen.estimate.on_delta(lambda delta: heard.append((delta.previous, delta.revision)))
+        kitchen.insert(point("l1", 1))
+        service.mute = True
+        service.before_estimate = lambda: service.publish_last(service.values)
+        assert kitchen.send(point("l2", 2)).result().revision == 2
+        assert kitchen.estimate.stale
+        kitchen.estimate.wait_for(2)
+        assert service.before_estimate is None
+        service.mute = False
+        service.step({3: (3, 3)})
+        kitchen.estimate.wait_for(3)
+        assert heard == [(0, 1), (1, 2), (2, 3)]  # each is one step: no whole estimate, which would be (0, 2)
+        assert same(kitchen.estimate, service)
+
+
 def test_a_mirror_nobody_confirms_is_stale(start: Callable[..., Service], endpoint: str) -> None:
     service = start()
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:

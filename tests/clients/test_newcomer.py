@@ -148,7 +148,7 @@ def test_why_in_python_has_words_and_symbols_and_one_key_will_do(endpoint: str) 
         (["ask", "covariance", "yard", "--timeout", "nan"], "not a finite number"),
         (["ask", "covariance", "yard", "--timeout", "-1"], "range"),
         (["change", "weigh", "yard", "nan", "1"], "not a finite number"),
-        (["stats", "--wait", "1e300"], "range"),
+        (["stats", "--timeout", "1e300"], "range"),
         (["replay", "a.g2o", "--pace", "inf"], "not a finite number"),
         (["top", "--every", "nan"], "not a finite number"),
         (["record", "yard", "--out", "nowhere/a.mcap"], "there is no folder nowhere"),

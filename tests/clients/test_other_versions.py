@@ -45,7 +45,7 @@ def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, ve
 def test_the_command_line_says_so_too(tmp_path: Path) -> None:
     with someone_of("v2", endpoint_in(tmp_path)):
         ran = subprocess.run(
-            [sys.executable, "-m", "factorbus.cli", "stats", "--connect", endpoint_in(tmp_path), "--wait", "40"],
+            [sys.executable, "-m", "factorbus.cli", "stats", "--connect", endpoint_in(tmp_path), "--timeout", "40"],
             capture_output=True,
             text=True,
             timeout=50,

@@ -114,6 +114,18 @@ def test_space_is_drawn_in_space_and_a_floor_in_the_plane() -> None:
     np.testing.assert_allclose(np.ptp(drawn, axis=0), np.ptp(wall[:, [2, 0]], axis=0), rtol=0.05)
 
 
+@pytest.mark.parametrize(("axis", "labels"), [(0, "xy"), (1, "xy"), (2, "xz")])
+def test_a_straight_drive_is_drawn_along_its_own_axis_and_not_as_a_sliver(axis: int, labels: str) -> None:
+    line = np.zeros((20, 7))
+    line[:, axis], line[:, 6] = np.arange(20), 1
+    line[:, 2] += 1.0  # not at the origin
+    axes = map_figure(estimate=[poses("se3", line)]).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == tuple(f"{name} (m)" for name in labels)
+    sides = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
+    assert sides.min() / sides.max() > 0.3
+    assert sides.max() == pytest.approx(19 * 1.08)
+
+
 def test_panels_show_the_course() -> None:
     course = Course(chi2=np.linspace(0, 90, 50), step_ms=np.full(50, 2.5), optimum=np.array([[25, 40.0], [50, 88.0]]))
     figure = map_figure(estimate=[square()], course=course)

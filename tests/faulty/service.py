@@ -7,6 +7,7 @@ answers repeated, deltas with their previous revision.  What it does wrong, it i
 import json
 import threading
 from collections import Counter, deque
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -38,6 +39,7 @@ class Service:
         self.asked: list[str] = []
         self.mute = False
         self.ask_fault = ""
+        self.before_estimate: Callable[[], None] | None = None  # called once, before the estimate is answered
         self.report: dict[str, Any] = {}  # of every step
         self.says: dict[str, Any] = {}  # of the map, besides its row
         self.held: list[zenoh.Query] = []
@@ -63,13 +65,15 @@ class Service:
         self.values |= {key: np.array(value, float) for key, value in values.items()}
         self.revision += 1
         if not self.mute:
-            delta = Delta(self.epoch, self.revision, self.revision - 1, self._columns(list(values)), self.report)
-            self._session.put(
-                keys.delta_key(MAP), codec.encode_delta(delta), congestion_control=zenoh.CongestionControl.BLOCK
-            )
+            self.publish_last(values)
+
+    def publish_last(self, changed: Iterable[int]) -> None:
+        """The delta of the last step, which changed these."""
+        delta = Delta(self.epoch, self.revision, self.revision - 1, self._columns(list(changed)), self.report)
+        self.publish_raw(codec.encode_delta(delta))
 
     def publish_raw(self, data: bytes) -> None:
-        """Something on the delta's key that is none."""
+        """Something on the delta's key, a delta or not."""
         self._session.put(keys.delta_key(MAP), data, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def _run(self) -> None:
@@ -131,6 +135,9 @@ class Service:
             return None
         if question == "stats":
             return codec.encode_map(self._row())
+        if self.before_estimate is not None:
+            first, self.before_estimate = self.before_estimate, None
+            first()
         wanted = codec.decode_keys_asked(payload)
         chosen = list(self.values) if wanted is None else wanted.tolist()
         return codec.encode_estimate(Estimate(self.epoch, self.revision, self._columns(chosen)))

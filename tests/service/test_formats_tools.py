@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factorbus.formats import FormatError, GraphFile, read, write_g2o
+from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import solve_batch
 
@@ -134,6 +135,27 @@ def test_symbols_are_keys_with_their_letters(tmp_path: Path) -> None:
     graph = read_text(tmp_path, f"EDGE_SE2_XY {symbol('b', 3)} {symbol('p', 4)} 1 2 1 0 1\n")
     assert [group.keys.tolist() for group in graph.batch.variables] == [[symbol("b", 3)], [symbol("p", 4)]]
     assert graph.numbering == "keys"
+
+
+def test_one_symbol_among_plain_ids_leaves_every_id_as_it_is_and_says_so(tmp_path: Path) -> None:
+    text = loop() + f"EDGE_SE2_XY 1 {symbol('l', 7)} 1 2 1 0 1\n"
+    graph = read_text(tmp_path, text)
+    keys = {group.kind: group.keys.tolist() for group in graph.batch.variables}
+    assert keys == {"se2": [0, 1, 2, 3], "point2": [symbol("l", 7)]}
+    (note,) = graph.notes
+    assert note.startswith("4 of 5 ids are below 2^56, the others symbols as GTSAM packs them, or time stamps: ")
+    assert "every id is the key itself, so 0, 1, 2, 3 have no letter" in note
+    write_g2o(tmp_path / "out.g2o", graph.batch, ids=graph.numbering)
+    assert read(tmp_path / "out.g2o").batch.variables[0].keys.tolist() == [0, 1, 2, 3]
+    assert read_text(tmp_path, f"EDGE_SE2_XY {symbol('b', 3)} {symbol('p', 4)} 1 2 1 0 1\n").notes == ()
+
+
+@pytest.mark.parametrize("ids", ["auto", "keys"])
+def test_keys_without_letters_are_said_to_get_some_where_the_file_is_read(tmp_path: Path, ids: str) -> None:
+    bare = Batch((Variables("se2", np.array([3, 4]), np.zeros((2, 3))),))
+    (note,) = write_g2o(tmp_path / "out.g2o", bare, ids=ids)
+    assert note == "no key has a letter, and a file of such ids says none: reading gives poses x and points l"
+    assert read(tmp_path / "out.g2o").batch.variables[0].keys.tolist() == [symbol("x", 3), symbol("x", 4)]
 
 
 def test_a_letter_for_each_small_id_even_when_gtsam_numbers_points_apart(tmp_path: Path) -> None:

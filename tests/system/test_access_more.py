@@ -93,7 +93,7 @@ def test_a_password_does_instead_of_a_certificate_and_appears_nowhere(
         [sys.executable, *stats, str(secured.clients["ops"])], capture_output=True, text=True, timeout=60, check=True
     )
     denied = subprocess.run(
-        [sys.executable, *stats, str(secured.clients["wall"]), "--wait", "1"],
+        [sys.executable, *stats, str(secured.clients["wall"]), "--timeout", "1"],
         capture_output=True,
         text=True,
         timeout=60,

@@ -2,10 +2,11 @@
 
     lost ──estimate──▶ live ──delta whose `previous` is our revision──▶ live
       ▲                  │
-      └── gap, other epoch, owner gone, a newer revision heard of
+      └── gap, other epoch, owner gone
 
 While lost, deltas are kept aside, the last values stay readable, and the estimate is asked for; when it comes, the
-deltas that go on from it are applied.  So no change is ever skipped, and what is old says so.
+deltas that go on from it are applied.  So no change is ever skipped, and what is old says so.  A revision heard of
+whose delta is not here is not yet a loss: the estimate is asked for too, and whichever comes first is taken.
 """
 
 from collections import deque

@@ -30,7 +30,7 @@ log = logging.getLogger("factorbus.client")
 # Without deltas for this long the owner is asked for its revision: a last delta that got lost leaves no gap to see.
 PROBE_S = 1.0
 _ANSWER_S = 5.0
-# A revision heard of by another way may be ahead of its delta by so much.
+# A revision heard of by another way may be ahead of its delta by so much before the estimate is asked for.
 _GRACE_S = 0.1
 # Messages that may wait for this thread before they are given up for the whole estimate.
 _BACKLOG = 4096
@@ -322,15 +322,20 @@ class Mirror:
         self._asking = False
         self._silences += 1
         self._ask_at = time.monotonic() + pause(self._silences)  # unless this was it
-        if isinstance(reply, Answer):
+        answered = isinstance(reply, Answer)
+        if answered:
             self._adopt(reply.payload)
-        if self._following.live:
+        if answered and self._following.live:
             self._silences = 0
 
     def _probe(self) -> None:
-        """Nothing came for a while: what we know to be missing got lost; otherwise ask where the map is."""
+        """Nothing came for a while: fetch the estimate if a revision is missing here; otherwise ask where the map is.
+
+        The missing delta may be lost, or late: on a busy machine its sender, or we, may not have run for a while.  So
+        following goes on; the delta still counts if it comes before the estimate.
+        """
         if self._following.revision < self._expected:
-            self._lose()
+            self._ask()
         elif not self._probing:
             self._probing = True
             self._query("stats", b"", "probed")

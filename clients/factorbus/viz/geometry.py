@@ -11,6 +11,8 @@ from factorbus.proto.messages import Variables
 POSITION = {"se2": 2, "point2": 2, "se3": 3, "point3": 3}
 _LETTER_BITS = 56
 _FLAT = 0.1  # a track whose third extent is below that share of its first is drawn in the plane
+_LINE = 1e-3  # and one whose second extent is below that share lies on a line, which many planes have
+_NARROWEST = 0.3  # a picture's shorter side over its longer one, at least: a straight drive stays legible
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +77,16 @@ class View:
 
 
 def view_of(places: F64) -> View:
-    """In space when the places (n, d) fill it, else the plane in which they lie: x and y, or the two widest axes."""
+    """In space when the places (n, d) fill it, else the plane in which they lie: x and y, or the two widest axes.
+
+    A line is drawn in x and y too, or in x and z where it is upright.
+    """
     ground = View(False, np.eye(3)[:2], ("x (m)", "y (m)"))
     if places.shape[1] == 2 or len(places) < 3:
         return ground
     _, spread, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
+    if spread[1] <= _LINE * spread[0]:
+        return ground if abs(axes[0, 2]) < 0.9 else View(False, np.eye(3)[[0, 2]], ("x (m)", "z (m)"))
     if spread[2] > _FLAT * spread[0]:
         return View(True, np.eye(3), ("x (m)", "y (m)", "z (m)"))
     if abs(axes[2, 2]) > 0.9:
@@ -91,13 +98,16 @@ def limits(kept: F64, tried: F64, *, margin: float = 0.04, beyond: float = 0.12)
     """Bounds (2, d) of a picture that has all of `kept` in it, and of `tried` what is not too far out.
 
     margin: added on each side; beyond: how far `tried` may widen the picture on each side; both in parts of its size.
+    In the plane no side is shorter than `_NARROWEST` of the longest.
     """
     low, high = np.nanmin(kept, axis=0), np.nanmax(kept, axis=0)
     size = max(float((high - low).max()), 1e-9)
     if len(tried):
         low = np.maximum(np.minimum(low, np.nanmin(tried, axis=0)), low - beyond * size)
         high = np.minimum(np.maximum(high, np.nanmax(tried, axis=0)), high + beyond * size)
-    return np.stack([low - margin * size, high + margin * size])
+    least = _NARROWEST * float((high - low).max()) if len(low) == 2 else 0.0
+    lacking = np.maximum(least - (high - low), 0.0) / 2
+    return np.stack([low - lacking - margin * size, high + lacking + margin * size])
 
 
 def _positions(variables: Sequence[Variables], prefix: str) -> Track:

@@ -21,11 +21,13 @@ class LeftOut:
     """Collects what is left out of one file.
 
     counts: by the name of the record, or of the kind.  notes: sentences for people, one for each reason.  strict:
-    refuse instead.  Only what the file says and the graph does not is left out; what becomes something else is a note.
+    refuse instead.  whole: the graph is used as it is, and not its replay.  Only what the file says and the graph does
+    not is left out; what becomes something else is a note.
     """
 
     file: str
     strict: bool = False
+    whole: bool = False
     counts: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -43,22 +45,27 @@ class LeftOut:
     def drop(self, name: str, count: int, why: str) -> None:
         """The same for what stands on no line.  Raises FormatError when strict."""
         if count and self.strict:
-            raise FormatError(
-                self.file, None, f"{_counted(count, name)}, {why}", "nothing that would be left out (strict)"
-            )
+            raise self._refused(count, name, why)
         if count:
             self.counts[name] = self.counts.get(name, 0) + count
             self.notes.append(f"{_counted(count, name)} left out: {why}")
 
     def set_aside(self, name: str, count: int, why: str) -> None:
-        """The same for what the graph keeps, and no step of a replay has.  Raises FormatError when strict."""
-        self.drop(name, count, why)
+        """Note what the graph keeps and no step of a replay has.  Raises FormatError when strict, unless `whole`."""
+        if count and self.strict and not self.whole:
+            raise self._refused(count, name, why)
         if count:
-            self.notes[-1] = f"{_counted(count, name)} that a replay leaves out: {why}"
+            self.counts[name] = self.counts.get(name, 0) + count
+            self.notes.append(f"{_counted(count, name)} that a replay leaves out: {why}")
 
     def say(self, note: str) -> None:
         """Nothing is left out, but somebody may want to know."""
         self.notes.append(note)
+
+    def _refused(self, count: int, name: str, why: str) -> FormatError:
+        return FormatError(
+            self.file, None, f"{_counted(count, name)}, {why}", "nothing that would be left out (strict)"
+        )
 
 
 def _counted(count: int, name: str) -> str:

@@ -3,6 +3,7 @@
 "ids"      x12 → 12 and l7 → 7: what reading gives the letters back to.  Needs poses x and points l, all numbered apart.
 "apart"    the same where a pose and a point share a number, as GTSAM writes it; g2o's own programs cannot read that.
 "keys"     the key itself, a letter in the top byte as GTSAM packs its symbols; g2o's own programs want less than 2³¹.
+           Where no key has a letter, reading gives poses x and points l: a note says so.
 "counted"  0, 1, 2, ... in the order of the graph: every program reads that, and the keys are lost.
 "auto"     "ids" where it can be, else "keys".
 """
@@ -13,7 +14,7 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.left_out import LeftOut
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
-from factorbus.proto.symbols import symbol_parts
+from factorbus.proto.symbols import MAX_INDEX, symbol_parts
 
 IDS = ("auto", "ids", "apart", "keys", "counted")
 _POSES = ("se2", "se3")
@@ -31,7 +32,7 @@ def numbered(batch: Batch, ids: str, left: LeftOut) -> tuple[I64, I64]:
     shared = len(np.unique(numbers)) < len(numbers)
     if ids == "auto":
         ids = "ids" if are_usual and not shared else "keys"
-        if ids == "keys" and len(keys):
+        if ids == "keys" and (keys > MAX_INDEX).any():
             left.say(
                 "ids are keys as GTSAM packs its symbols: reading gives the same keys; g2o's own programs want smaller "
                 'ones, which "counted" gives'
@@ -41,6 +42,8 @@ def numbered(batch: Batch, ids: str, left: LeftOut) -> tuple[I64, I64]:
     if ids == "ids" and not (are_usual and not shared):
         raise FormatError("g2o", None, "keys that their numbers do not tell apart", 'ids "auto", "keys" or "counted"')
     if ids == "keys":
+        if len(keys) and (keys <= MAX_INDEX).all():
+            left.say("no key has a letter, and a file of such ids says none: reading gives poses x and points l")
         return _as_keys(keys[order])
     return keys[order], numbers[order]
 

@@ -23,7 +23,9 @@ from factorbus.formats.rotations import normalised_poses
 from factorbus.formats.sniff import named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
+from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import MAX_INDEX, symbol_parts
+from factorbus.wording import counted
 
 READS = (*DIALECTS, TUM)
 
@@ -33,27 +35,30 @@ _SWITCHES = ("VERTEX_SWITCH", SWITCH_PRIOR)
 _CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 
 
-def read(path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False) -> GraphFile:
+def read(
+    path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
+) -> GraphFile:
     """The graph in `path`: g2o, TORO, iSAM, SLAM++ or TUM text, plain or gzipped.
 
     dialect: "g2o", "toro", "isam", "slam++" or "tum"; without it the names of the records decide, and the ending where
     they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.  Keys are
     symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols and time
     stamps are, all keys are the ids themselves.  Quaternions are normalised; angles stay as they are.  Records that
-    have no kind here are left out, which `notes` and `left_out` say; with `strict` they are refused.  Raises
+    have no kind here are left out, which `notes` and `left_out` say; with `strict` they are refused.  So are vertices
+    that no step of a replay would have, unless the graph is wanted `whole`, as it is written to another file.  Raises
     FormatError, which names the file and the line.
     """
     with np.errstate(all="ignore"):  # what overflows is not finite or not positive definite, and refused as such
-        return _read(Path(path), dialect, strict)
+        return _read(Path(path), dialect, strict, whole)
 
 
-def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
+def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFile:
     file = str(path)
     buckets = read_buckets(path)
     if dialect == TUM or (dialect is None and is_trajectory(buckets)):
         return read_trajectory(file, buckets)
     guess = sniffed(path, buckets) if dialect is None else named(file, dialect)
-    chosen, left = guess.dialect, LeftOut(file, strict)
+    chosen, left = guess.dialect, LeftOut(file, strict, whole)
     if guess.why:
         left.say(guess.why)
     vertices = [
@@ -67,6 +72,8 @@ def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     are_keys = any((columns.ids > MAX_INDEX).any() for columns in (*vertices, *edges))
     apart = chosen.one_numbering and not are_keys and numbered_apart(vertices)
     batch, lines = assembled(file, are_keys, chosen.one_numbering and not apart, vertices, edges, fixes)
+    if are_keys:
+        _say_without_letter(batch, left)
     if apart:
         left.say("poses and points are numbered separately")
     lone = _ids_in_file(unnamed(batch), are_keys) if batch.factors else []
@@ -75,6 +82,18 @@ def _read(path: Path, dialect: str | None, strict: bool) -> GraphFile:
     left.set_aside("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
     numbering = "keys" if are_keys else "apart" if apart else "ids"
     return GraphFile(file, chosen.name, batch, lines, tuple(left.notes), dict(left.counts), numbering)
+
+
+def _say_without_letter(batch: Batch, left: LeftOut) -> None:
+    """Say which ids are keys without a letter for the sake of others that are too large to get one."""
+    keys = np.concatenate([np.empty(0, np.int64), *(group.keys for group in batch.variables)])
+    plain = [str(key) for key in keys[keys <= MAX_INDEX].tolist()]
+    if plain:
+        left.say(
+            f"{len(plain):,} of {counted(len(keys), 'id')} are below 2^56, the others symbols as GTSAM packs them, or "
+            f"time stamps: every id is the key itself, so {shown(plain)} have no letter; in a file of such ids alone "
+            "they would get x, or l for points"
+        )
 
 
 def _ids_in_file(keys: I64, are_keys: bool) -> list[str]:

@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 
+from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.keys import checked_name
 from factorbus.proto.problems import Problem
 from factorbus.wording import counted
@@ -30,9 +31,11 @@ class Config:
 
 
 def checked(config: Config) -> Config:
-    """`config`, if it can work.  Raises BadConfig, BadName."""
+    """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
     if not config.connect:
         raise BadConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
+    for endpoint in config.connect:
+        checked_endpoint(endpoint)
     if not 1 <= config.slots <= 1024:
         raise BadConfig(
             f"slots is {config.slots}; wanted 1 to 1024 (this machine has {counted(os.cpu_count() or 1, 'core')})"

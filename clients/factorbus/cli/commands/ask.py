@@ -11,7 +11,14 @@ from factorbus.cli.output.advice import advising, of_what_is_there
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import FAILED, OK, input_file
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, Number, file_argument, json_option, zenoh_option
+from factorbus.cli.process.options import (
+    DEFAULT_ENDPOINT,
+    Number,
+    file_argument,
+    json_option,
+    timeout_option,
+    zenoh_option,
+)
 from factorbus.cli.process.reading import read_graph
 from factorbus.wording import counted
 
@@ -37,7 +44,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
+        timeout_option(30),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):

@@ -11,7 +11,7 @@ from factorbus.cli.output.advice import advising_changes
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
 from factorbus.cli.output.starts import optimum_from
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, SECONDS, Number, json_option, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, json_option, timeout_option, zenoh_option
 
 F = TypeVar("F", bound=Callable[..., Any])
 _COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
@@ -43,7 +43,7 @@ def _asking(command: F) -> F:
     for option in (
         json_option,
         zenoh_option,
-        click.option("--timeout", "timeout_s", type=SECONDS, default=30.0, show_default=True, help="Seconds to wait."),
+        timeout_option(30),
         click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
         click.argument("name"),
     ):

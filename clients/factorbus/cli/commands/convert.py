@@ -50,7 +50,7 @@ def command(
         raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
     from factorbus.cli.output.console import document, note
 
-    graph = read_graph(source, dialect, strict)
+    graph = read_graph(source, dialect, strict, whole=True)
     _check_any(graph, target)
     files, notes, counts = _written(graph, target, strict, robot, ids)
     say(target, notes)

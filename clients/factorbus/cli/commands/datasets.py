@@ -78,7 +78,7 @@ def command(context: click.Context, as_json: bool) -> None:
     default=30,
     show_default=True,
     metavar="S",
-    help="Give up after a silence of S seconds.",
+    help="Give up after S seconds without an answer.",
 )
 @click.option("--keep-source", is_flag=True, help="Leave the downloaded source in the cache, too (sources/NAME).")
 @json_option

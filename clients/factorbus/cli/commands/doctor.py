@@ -27,7 +27,10 @@ def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
     factorbus doctor --json
     """
     from factorbus.cli.doctor.checks import CHECKS
+    from factorbus.proto.endpoints import checked_endpoint
 
+    if endpoint:
+        checked_endpoint(endpoint)  # before the checks of this machine, which take a while
     findings = []
     for look in CHECKS:
         screen.note(f"looking at {look.__doc__}")

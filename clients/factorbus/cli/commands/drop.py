@@ -2,7 +2,7 @@
 
 import click
 
-from factorbus.cli.process.options import SECONDS, connect_option, zenoh_option
+from factorbus.cli.process.options import connect_option, timeout_option, zenoh_option
 
 
 @click.command()
@@ -20,8 +20,8 @@ from factorbus.cli.process.options import SECONDS, connect_option, zenoh_option
 )
 @connect_option
 @zenoh_option
-@click.option("--wait", "wait_s", type=SECONDS, default=30, show_default=True, metavar="S", help="For the answer.")
-def command(name: str, revision: int | None, damaged: bool, endpoint: str, zenoh: str, wait_s: float) -> None:
+@timeout_option(30)
+def command(name: str, revision: int | None, damaged: bool, endpoint: str, zenoh: str, timeout_s: float) -> None:
     """Drop MAP, with its journal. With --revision it stays when somebody inserted meanwhile: `moved_on`, exit code 5.
 
     The last step of moving a map: what was copied is all there is. Where access control is on, ask as an operator.
@@ -36,6 +36,6 @@ def command(name: str, revision: int | None, damaged: bool, endpoint: str, zenoh
     """
     from factorbus.cli.process.bus import open_bus
 
-    with open_bus(endpoint, "drop", zenoh, wait_s) as bus:
+    with open_bus(endpoint, "drop", zenoh, timeout_s) as bus:
         bus.drop(name, revision=revision, damaged=damaged)
     click.echo(f"{name} is gone")

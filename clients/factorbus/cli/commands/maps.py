@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from factorbus.cli.process.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
 from factorbus.wording import counted
 
 if TYPE_CHECKING:
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 @click.command()
 @connect_option
 @zenoh_option
-@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For the answer.")
+@timeout_option(5)
 @json_option
-def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
+def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
     """List the maps of the service at ENDPOINT; at a router, those of all services.
 
     The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
@@ -29,7 +29,7 @@ def command(endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> None:
     from factorbus.cli.output import console as screen
     from factorbus.cli.process.bus import open_bus
 
-    with open_bus(endpoint, "maps", zenoh, wait_s) as bus:
+    with open_bus(endpoint, "maps", zenoh, timeout_s) as bus:
         rows = sorted(bus.maps(), key=lambda row: row.name)
     if as_json:
         screen.document({"maps": [asdict(row) for row in rows]})

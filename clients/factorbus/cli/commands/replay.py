@@ -33,7 +33,7 @@ class Request:
     file: Path
     in_process: bool
     connect: str | None
-    wait_s: float | None
+    timeout_s: float | None
     map_name: str
     mode: str
     every: int
@@ -70,11 +70,11 @@ class Request:
     "--client", default="replay", show_default=True, metavar="NAME", help="Who we are, where access control asks."
 )
 @click.option(
-    "--wait",
-    "wait_s",
+    "--timeout",
+    "timeout_s",
     type=SECONDS,
     metavar="S",
-    help="Wait so long for a service to be there.  [default: 1 where nobody listens, else 10]",
+    help="Give up after S seconds without an answer of the service.  [default: 1 where nobody listens, else 10]",
 )
 @click.option("--map", "map_name", default="replay", show_default=True, metavar="NAME", help="Map to drive into.")
 @mode_option
@@ -249,8 +249,8 @@ def _target(request: Request) -> Iterator[Any]:
                 endpoint,
                 client=request.client,
                 zenoh=request.zenoh,
-                timeout_s=_ANSWER_S if request.wait_s is None else request.wait_s,
-                listening_s=_LISTENING_S if request.wait_s is None else None,
+                timeout_s=_ANSWER_S if request.timeout_s is None else request.timeout_s,
+                listening_s=_LISTENING_S if request.timeout_s is None else None,
             )
         )
         if solver is not None:

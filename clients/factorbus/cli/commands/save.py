@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from factorbus.cli.output.exits import REFUSED, Stopped
-from factorbus.cli.process.options import SECONDS, checked_output, connect_option, zenoh_option
+from factorbus.cli.process.options import checked_output, connect_option, timeout_option, zenoh_option
 from factorbus.cli.process.reading import IDS
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ _WRITES = (".g2o", ".tum", ".kitti")
 )
 @connect_option
 @zenoh_option
-@click.option("--wait", "wait_s", type=SECONDS, default=60, show_default=True, metavar="S", help="For the answer.")
+@timeout_option(60)
 def command(
-    name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, wait_s: float
+    name: str, target: Path, robot: str | None, ids: str | None, endpoint: str, zenoh: str, timeout_s: float
 ) -> None:
     """Write MAP as it is now into FILE: the whole graph as .g2o, or trajectories as .tum or .kitti, by its ending.
 
@@ -51,7 +51,7 @@ def command(
     from factorbus.cli.process.bus import open_bus
 
     form = target.suffix.removeprefix(".")
-    with open_bus(endpoint, "save", zenoh, wait_s) as bus, bus.map(name, mirror=False, create=False) as joined:
+    with open_bus(endpoint, "save", zenoh, timeout_s) as bus, bus.map(name, mirror=False, create=False) as joined:
         robots = [] if form == "g2o" else _robots(joined, robot)
         texts = (
             {letter: joined.export(form, robot=letter) for letter in robots}

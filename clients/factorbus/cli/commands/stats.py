@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import FAILED, OK
-from factorbus.cli.process.options import SECONDS, connect_option, json_option, zenoh_option
+from factorbus.cli.process.options import connect_option, json_option, timeout_option, zenoh_option
 from factorbus.proto.problems import UnknownMap
 from factorbus.wording import counted
 
@@ -15,9 +15,9 @@ from factorbus.wording import counted
 @click.argument("name", metavar="[MAP]", required=False)
 @connect_option
 @zenoh_option
-@click.option("--wait", "wait_s", type=SECONDS, default=5, show_default=True, metavar="S", help="For answers.")
+@timeout_option(5)
 @json_option
-def command(name: str | None, endpoint: str, zenoh: str, wait_s: float, as_json: bool) -> int:
+def command(name: str | None, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
     """Show how services are, what their maps hold, and how long steps and inserts take; with MAP, of that map alone.
 
     The mode is how a map is solved: bayes-tree unless somebody chose another (see factorbus replay --help).
@@ -32,7 +32,7 @@ def command(name: str | None, endpoint: str, zenoh: str, wait_s: float, as_json:
     from factorbus.cli.output import console as screen
     from factorbus.cli.process.bus import open_bus
 
-    with open_bus(endpoint, "stats", zenoh, wait_s) as bus:
+    with open_bus(endpoint, "stats", zenoh, timeout_s) as bus:
         services = sorted(bus.stats(), key=lambda each: str(each.get("service")))
     if name is not None:
         services = _of_map(services, name)

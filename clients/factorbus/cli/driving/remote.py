@@ -22,7 +22,7 @@ class RemoteMap:
         self._map, self._window = joined, window
         self._mirror = joined.estimate
         self._out: deque[Ticket] = deque()
-        self._start = self._mirror.revision
+        self._start = self._waited = self._mirror.revision
         self._received: dict[int, Mapping[str, Any]] = {}
         self._latest: Mapping[str, Any] = {}
         self._lock, self._news = threading.RLock(), False  # entered itself: see `client/promise.py`
@@ -93,12 +93,12 @@ class RemoteMap:
         return self._map.graph(timeout_s=_ANSWER_S).batch
 
     def account(self) -> dict[str, Any]:
-        """What the service says of itself, and the deltas that came here."""
+        """What the service says of itself, and the deltas that came here of revisions that were waited for."""
         stats = self._map.stats(timeout_s=_ANSWER_S)
         return {
             "solver_cpu_s": stats["solver_cpu_s"],
             "kernels_compiled_s": stats["kernels_compiled_s"],
-            "deltas": len(self._received),
+            "deltas": sum(revision <= self._waited for revision in self._received),
         }
 
     @property
@@ -113,6 +113,7 @@ class RemoteMap:
 
     def wait_for(self, revision: int) -> None:
         """Until the estimate of `revision` is here."""
+        self._waited = max(self._waited, revision)
         self._mirror.wait_for(revision, timeout_s=_ANSWER_S)
 
     def await_news(self, timeout_s: float) -> int:

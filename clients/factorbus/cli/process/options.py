@@ -62,6 +62,19 @@ def connect_option(command: F) -> F:
     )(command)
 
 
+def timeout_option(default_s: float) -> Callable[[F], F]:
+    """--timeout: the same word, for the same, in every command that waits for an answer."""
+    return click.option(
+        "--timeout",
+        "timeout_s",
+        type=SECONDS,
+        default=default_s,
+        show_default=True,
+        metavar="S",
+        help="Give up after S seconds without an answer.",
+    )
+
+
 def zenoh_option(command: F) -> F:
     """--zenoh."""
     return click.option(

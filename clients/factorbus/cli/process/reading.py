@@ -40,11 +40,14 @@ def robot_option(command: F) -> F:
     )(command)
 
 
-def read_graph(path: Path, dialect: str | None = None, strict: bool = False) -> "GraphFile":
-    """The graph in `path`; what was left out, assumed or changed is said on standard error.  Raises FormatError."""
+def read_graph(path: Path, dialect: str | None = None, strict: bool = False, whole: bool = False) -> "GraphFile":
+    """The graph in `path`; what was left out, assumed or changed is said on standard error.
+
+    whole: it is not to be replayed, so `strict` does not mind what no step would have.  Raises FormatError.
+    """
     from factorbus.formats import read
 
-    graph = read(path, dialect, strict)
+    graph = read(path, dialect, strict, whole)
     say(path, graph.notes)
     return graph
 
