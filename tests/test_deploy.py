@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from factorbus.service.config import load
-from factorbus.service.core.histogram import Histogram
+from factorbus.service.core.account import Histogram
 from factorbus.service.operations.metrics import families
 
 DEPLOY = Path(__file__).parent.parent / "deploy"

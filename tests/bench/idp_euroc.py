@@ -26,12 +26,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bench.idp_bus import process
 
 from factorbus.cli.demo.ekf import CAMERA, Filter
-from factorbus.cli.demo.visual import Settings, VisualFilter
+from factorbus.cli.demo.visual import VisualFilter, VisualSettings
 from factorbus.client import Camera, Features, connect
 
 _FIRST, _RATE_HZ = 90, 20.0  # before, the camera stands still and no depth can be seen
 _RHO, _SIGMA_RHO = 0.3, 0.3
-_SETTINGS = Settings(sigma_pixel=2.5, velocity=0.06, turn=0.06, most=45)
+_SETTINGS = VisualSettings(sigma_pixel=2.5, velocity=0.06, turn=0.06, most=45)
 
 
 def main() -> None:

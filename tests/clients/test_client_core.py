@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from factorbus.client.draft import Draft
 from factorbus.client.following import Following, tables_of
-from factorbus.client.replies import Again, Answer, Failure, Silence, TimedOut, judge
+from factorbus.client.replies import Again, AnswerReply, Failure, Silence, TimedOut, judge
 from factorbus.client.table import Table
 from factorbus.client.window import Window
 from factorbus.proto.codec import encode_problem
@@ -32,7 +32,7 @@ from factorbus.proto.symbols import symbol
 
 
 def test_an_answer_is_handed_on() -> None:
-    assert judge(Answer(b"x"), 1) == b"x"
+    assert judge(AnswerReply(b"x"), 1) == b"x"
 
 
 def test_silence_is_asked_again_ever_more_slowly() -> None:

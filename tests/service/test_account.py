@@ -1,10 +1,10 @@
 """What a map has done: what is noted is counted when somebody asks, and is in no answer twice."""
 
-from factorbus.service.core.account import Account, Done
+from factorbus.service.core.account import Account, InsertDone
 
 
-def done(chi2: float) -> Done:
-    return Done("tree", chi2, 2.0, 0.004, 100, 200)
+def done(chi2: float) -> InsertDone:
+    return InsertDone("tree", chi2, 2.0, 0.004, 100, 200)
 
 
 def test_what_was_noted_is_in_every_answer_once() -> None:

@@ -176,22 +176,6 @@ def test_a_keyframe_now_and_then(limits: Limits) -> None:
         assert keyframes == (["keyframe"] if sequence == due else [])
 
 
-def test_what_waits_for_the_end_of_a_run_gets_one(core: MapCore) -> None:
-    run = run_of(core.tidy(0.0))
-    assert (run.inserts, run.reads, run.short) == ((), (), False)
-    assert solved(core, run) == [], "and no more than one"
-    run = run_of(core.insert(insert("a", 1)))
-    assert core.tidy(0.0) == [], "there is one"
-    assert not any(isinstance(effect, Run) for effect in solved(core, run))
-    core.block(Internal("x"), 0.0)
-    assert core.tidy(0.0) == [], "nothing can be kept"
-    core.unblock()
-    assert run_of(core.tidy(0.0)).inserts == ()
-    core = MapCore("m", "auto", 5, Limits(), now=0.0)
-    core.stop(0.0)
-    assert core.tidy(0.0) == [], "a map that is drained has none"
-
-
 def test_stopping_answers_everything_accepted_and_takes_nothing_new(core: MapCore) -> None:
     run = run_of(core.insert(insert("a", 1)))
     core.insert(insert("a", 2))

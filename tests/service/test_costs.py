@@ -10,9 +10,9 @@ from factorbus.proto.asking import AskAssociate, AskCovariance, AskGain, AskGate
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.proto.repair_codec import encode_ask_repair
-from factorbus.service.process.memory import Memory, OutOfMemory
+from factorbus.service.process.memory import MemoryLimit, OutOfMemory
 from factorbus.service.questions import costs
-from factorbus.service.questions.answers import Snapshot, answer, parse, snapshot
+from factorbus.service.questions.answers import QuestionCopies, answer, parse, snapshot
 from factorbus.service.questions.question_memory import COPIES, Room
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
@@ -60,11 +60,11 @@ def solver(request: pytest.FixtureRequest) -> Solver:
 
 
 @pytest.fixture
-def memory() -> Memory:
-    return Memory(0)
+def memory() -> MemoryLimit:
+    return MemoryLimit(0)
 
 
-def take(solver: Solver, name: str, payload: bytes, room: Room) -> tuple[bytes, Snapshot]:
+def take(solver: Solver, name: str, payload: bytes, room: Room) -> tuple[bytes, QuestionCopies]:
     question = parse(name, payload)
     taken = snapshot(solver, 7, 1, [question], {}, None, room)
     return answer(question, taken), taken
@@ -93,7 +93,7 @@ def test_what_no_client_could_receive_is_refused_with_the_limit(solver: Solver, 
 
 @pytest.mark.parametrize("asked", sorted(set(ASKED) - {"why"}))
 def test_what_there_is_no_memory_for_is_refused_with_the_limit(
-    solver: Solver, asked: str, memory: Memory, monkeypatch: pytest.MonkeyPatch
+    solver: Solver, asked: str, memory: MemoryLimit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, payload = ASKED[asked]
     monkeypatch.setattr("factorbus.service.questions.question_memory._LITTLE", 0)
@@ -171,7 +171,7 @@ def many(solver: Callable[[], Solver], landmarks: int) -> Solver:
     return made
 
 
-def test_association_is_bounded_in_pairs_and_in_memory(memory: Memory) -> None:
+def test_association_is_bounded_in_pairs_and_in_memory(memory: MemoryLimit) -> None:
     made, one = many(Solver, 1500), np.zeros((1, 2))
     information = np.array([[1.0, 0, 1.0]])
 
@@ -204,7 +204,7 @@ def test_one_that_is_refused_does_not_refuse_the_others_of_its_revision(solver: 
         answer(large, taken)
 
 
-def test_what_is_lent_counts_for_all_until_it_is_given_back(memory: Memory) -> None:
+def test_what_is_lent_counts_for_all_until_it_is_given_back(memory: MemoryLimit) -> None:
     memory.limit = memory.resident + (1 << 30)
     memory.lend(1 << 29)
     with pytest.raises(OutOfMemory):

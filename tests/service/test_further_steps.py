@@ -28,7 +28,7 @@ from factorbus.service.questions.answers import Question
 from factorbus.service.solving.apply import GOES_ON, Folder
 from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import WORLDS
-from factorbus.solver import Options, Solver, fingerprint
+from factorbus.solver import Options, Solver
 from factorbus.solver.errors import NotFinite
 from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 
@@ -134,7 +134,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     assert all(step.converged and step.further for step in steps)
     assert map_.folder.chi2() == pytest.approx(judge.step(settle=True).chi2, rel=1e-6)
     again, late = (folder_in(mode, max_iterations=10, nonmonotone_steps=20) for _ in range(2))
-    assert recover(map_.store, again, fingerprint()).same
+    assert recover(map_.store, again).same
     late.load(state)
     assert late.unfinished, "a snapshot knows"
     while late.unfinished:
@@ -161,7 +161,7 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
         map_.fold(further=True)
     assert not map_.folder.converged
     again = folder_in(mode)
-    recovered = recover(map_.store, again, fingerprint())
+    recovered = recover(map_.store, again)
     assert (recovered.same, recovered.last) == (True, map_.store.last())
     assert (values(again), again.revision, again.converged) == (values(map_.folder), map_.folder.revision, False)
     assert [fold.number for fold in map_.store.folds() if fold.further] == [len(came) + n for n in (1, 2, 3, 5, 6)]
@@ -191,7 +191,7 @@ def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Pat
     map_.store.close()
     store = open_store(tmp_path / "m")
     with pytest.raises(JournalDiffers, match="led to revision"):
-        recover(store, folder_in("inc-l"), fingerprint())
+        recover(store, folder_in("inc-l"))
     store.close()
 
 
@@ -234,7 +234,7 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
     *_, last = map_.store.folds()
     assert (last.further, last.revision, last.entries) == (True, map_.folder.revision, ())
     again = folder_in("all-batch")
-    assert recover(map_.store, again, fingerprint()).same
+    assert recover(map_.store, again).same
     assert len(tried) == 2
     assert (values(again), again.revision) == (values(map_.folder), map_.folder.revision)
 
@@ -269,7 +269,7 @@ def test_one_that_diverges_is_refused_and_the_map_stays_where_it_was(
         escaping(patched)
         steps = map_.fold(further=True)
         again = folder_in("all-batch")
-        assert recover(map_.store, again, fingerprint()).same
+        assert recover(map_.store, again).same
     assert map_.refused
     assert [record.levelname for record in caplog.records if "refused" in record.message] == ["WARNING"] * 2
     assert (values(again), again.revision) == (values(map_.folder), map_.folder.revision)
@@ -303,7 +303,7 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
     assert map_.folder.solver is not broken
     assert len(told([codec.decode_delta(stepped.delta)])) == POSES
     again = folder_in("all-batch")
-    assert recover(map_.store, again, fingerprint()).same
+    assert recover(map_.store, again).same
     assert values(again) == values(map_.folder)
     assert again.revision == map_.folder.revision == revision + 1
 

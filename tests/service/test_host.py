@@ -14,12 +14,11 @@ from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import parse_symbol
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
-from factorbus.service.core.insert_digest import digest_of
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import Lane
 from factorbus.service.solving.apply import Folder
-from factorbus.service.solving.arrival import read_insert
+from factorbus.service.solving.arrival import message_digest, read_insert
 from factorbus.solver import Options, Solver
 
 PATIENCE_S = 120.0
@@ -201,7 +200,7 @@ def test_an_insert_read_where_it_lies_leaves_the_map_as_any_other(setup: Setup) 
         setup.host.insert(located(setup, batch))
         message = codec.encode_insert(Insert(n, batch))
         arrived = other.arrived(batch, size=len(message))
-        other.host.insert(arrived._replace(digest=digest_of(message), message=message))
+        other.host.insert(arrived._replace(digest=message_digest(message), message=message))
         for one in (setup, other):
             one.told.wait_for(lambda one=one: len(said(one)) == one.sequence)
             one.wait_until_free()

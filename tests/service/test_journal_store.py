@@ -146,14 +146,14 @@ def test_a_log_cut_anywhere_is_a_journal_of_whole_transactions(tmp_path: Path) -
 
 
 def test_a_page_torn_while_the_log_was_put_into_the_database_is_whole_again(tmp_path: Path) -> None:
-    """What a power cut in the middle of that leaves: half of a page in the database, and all of the log."""
+    """What a power cut in the middle of that leaves: half of a page of the log in the database, and all of the log."""
     made = long_journal(tmp_path / "m")
     whole = list(made.folds())
     log = made.path.with_name("journal.db-wal").read_bytes()
     made.close()  # puts it in
     content, chance = made.path.read_bytes(), random.Random(5)
-    pages = len(content) // 4096
-    for n, page in enumerate([pages - 1, *chance.sample(range(pages), 10)]):
+    pages = sorted({int.from_bytes(log[at : at + 4], "big") - 1 for at in range(32, len(log), 24 + 4096)})
+    for n, page in enumerate([pages[-1], *chance.sample(pages, 10)]):
         torn = tmp_path / f"torn{n}"
         torn.mkdir()
         half = 4096 * page + 512 * chance.randrange(1, 8)
@@ -253,7 +253,7 @@ def test_snapshots_that_nobody_noted_go(store: Store) -> None:
     folder = store.path.parent
     for number in (1, 2, 3):
         write_snapshot(file_of(folder, number), {"n": number})
-        assert store.add_snapshot(Saved(number, "here", 10), 2) == ([1] if number == 3 else [])
+        assert store.add_snapshot(Saved(number, 1, {"sources": "here"}, "", 10), 2) == ([1] if number == 3 else [])
     (folder / "snapshot-4.part").write_bytes(b"begun")
     remove_strangers(folder, {saved.fold for saved in store.snapshots()})
     assert sorted(p.name for p in folder.glob("snapshot*")) == ["snapshot-2.fbs", "snapshot-3.fbs"]
@@ -261,7 +261,7 @@ def test_snapshots_that_nobody_noted_go(store: Store) -> None:
 
 def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     write_snapshot(file_of(store.path.parent, 3), {"state": np.arange(5)})
-    store.add_snapshot(Saved(3, "here", 1), 2)
+    store.add_snapshot(Saved(3, 1, {"sources": "here"}, "", 1), 2)
     export_map(store.path.parent, tmp_path / "m.fbmap")  # while it is open for writing
     import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     again = open_store(tmp_path / "other" / "n")

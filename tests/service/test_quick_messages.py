@@ -18,10 +18,9 @@ from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Va
 from factorbus.proto.problems import Problem
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.service.core.events import Arrived, Located
-from factorbus.service.core.insert_digest import digest_of
 from factorbus.service.kernels.words import LETTERS, LONGEST, WORDS
 from factorbus.service.kernels.write import write_messages
-from factorbus.service.solving.arrival import read_insert, try_locate
+from factorbus.service.solving.arrival import message_digest, read_insert, try_locate
 from factorbus.solver import Options, Solver, SolverError
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LENS_AT
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -76,7 +75,7 @@ def check_agrees(message: bytes) -> bool:
         return False
     insert = codec.decode_insert(message)
     assert located[:2] == (insert.sequence, insert.epoch)
-    assert located[2] == digest_of(message)
+    assert located[2] == message_digest(message)
     assert located[3].settle == insert.settle
     assert content_of(located[3]) == content(insert.batch)
     return True
@@ -248,13 +247,13 @@ def test_a_digest_tells_messages_apart(message: bytes, seed: int) -> None:
         changed = bytearray(message)
         changed[k // 8] ^= 1 << k % 8
         others.add(bytes(changed))
-    assert len({digest_of(other) for other in (message, *others)}) == len(others) + 1
-    assert 0 <= digest_of(message) < 2**63
+    assert len({message_digest(other) for other in (message, *others)}) == len(others) + 1
+    assert 0 <= message_digest(message) < 2**63
 
 
 def test_the_digest_of_a_message_never_changes() -> None:
     wanted = [7775671951334427883, 6423431365456653165, 9160638965743508112]
-    assert [digest_of(message) for message in (b"", b"factorbus", bytes(range(256)))] == wanted
+    assert [message_digest(message) for message in (b"", b"factorbus", bytes(range(256)))] == wanted
 
 
 # ---- into the solver -------------------------------------------------------------------------------------------

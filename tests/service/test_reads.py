@@ -15,7 +15,7 @@ from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived, Asked, Effect, Folded, Read, Run
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.core.pending_questions import Reads
-from factorbus.service.questions.answers import Question, Snapshot, answer, parse, snapshot
+from factorbus.service.questions.answers import Question, QuestionCopies, answer, parse, snapshot
 from factorbus.service.questions.uncertainty import NEAR
 from factorbus.solver import Options, Solver
 
@@ -133,7 +133,7 @@ class Answers:
             self.sent[asker] = message
             self.arrived.notify_all()
 
-    def _compute(self, question: Question, _: Snapshot) -> bytes:
+    def _compute(self, question: Question, _: QuestionCopies) -> bytes:
         if question.name in ("covariance", "repair", "export"):
             self.begun.release()
             assert self.go.wait(PATIENCE_S)
@@ -158,7 +158,7 @@ def test_what_is_ready_does_not_wait_for_what_is_computed(started: tuple[Answers
     place: Any = None
 
     def ask(name: str, asker: Any) -> None:
-        made.read(place, Read(Question(name), asker), Snapshot(1, 1))
+        made.read(place, Read(Question(name), asker), QuestionCopies(1, 1))
 
     for n, name in enumerate(("covariance", "repair", "export")):
         ask(name, n)

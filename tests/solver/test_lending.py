@@ -54,13 +54,13 @@ def lent(count: int = 1) -> Iterator[list[Lender]]:
 
 
 @pytest.fixture(scope="module")
-def content() -> dict:
-    """Of a map that takes long to eliminate as a whole."""
+def driven() -> Solver:
+    """With a map that takes long to eliminate as a whole."""
     solver = Solver(Options())
     for step in manhattan(POSES, 5):
         solver.stage(step.batch)
         solver.step()
-    return solver.to_order_anew()
+    return solver
 
 
 def numbers(solver: Solver) -> list[bytes]:
@@ -71,10 +71,10 @@ def numbers(solver: Solver) -> list[bytes]:
     return [np.ascontiguousarray(array).tobytes() for array in arrays]
 
 
-def eliminated(content: dict) -> tuple[list[bytes], int]:
+def eliminated(driven: Solver) -> tuple[list[bytes], int]:
     """The numbers of a new solver, and flops."""
     solver = Solver(Options())
-    flops = solver.order_anew(content).flops
+    flops = solver.renew(driven, driven.variable_count, driven.factor_count).flops
     return numbers(solver), flops
 
 
@@ -102,12 +102,12 @@ def factorised(p: int, m: int) -> bytes:
 
 
 @pytest.mark.parametrize("count", [1, MOST])
-def test_a_whole_map_has_the_same_bits(content: dict, count: int) -> None:
-    alone = eliminated(content)
+def test_a_whole_map_has_the_same_bits(driven: Solver, count: int) -> None:
+    alone = eliminated(driven)
     with lent(count) as lenders:
         while not any(lender.made for lender in lenders):
-            assert eliminated(content) == alone
-    assert eliminated(content) == alone
+            assert eliminated(driven) == alone
+    assert eliminated(driven) == alone
 
 
 def test_a_drive_has_the_same_bits() -> None:
@@ -125,11 +125,11 @@ def test_a_drive_has_the_same_bits() -> None:
             assert drive() == alone
 
 
-def test_maps_that_are_eliminated_at_once_share_the_cores(content: dict) -> None:
-    alone, found = eliminated(content), []
+def test_maps_that_are_eliminated_at_once_share_the_cores(driven: Solver) -> None:
+    alone, found = eliminated(driven), []
     with lent() as (lender,):
         while not lender.made:
-            threads = [threading.Thread(target=lambda: found.append(eliminated(content))) for _ in range(3)]
+            threads = [threading.Thread(target=lambda: found.append(eliminated(driven))) for _ in range(3)]
             for thread in threads:
                 thread.start()
             for thread in threads:
@@ -164,14 +164,14 @@ def test_pivots_below_rounding_are_raised_alike() -> None:
             assert taken() == alone
 
 
-def test_who_leaves_is_no_longer_there_and_makes_room_for_others(content: dict) -> None:
-    alone, free = eliminated(content), count_free()
+def test_who_leaves_is_no_longer_there_and_makes_room_for_others(driven: Solver) -> None:
+    alone, free = eliminated(driven), count_free()
     for _ in range(2 * MOST):
         with lent(2) as lenders:
             assert count_free() == free - 2
         assert count_free() == free
     made = [lender.made for lender in lenders]
-    assert eliminated(content) == alone
+    assert eliminated(driven) == alone
     assert [lender.made for lender in lenders] == made
 
 

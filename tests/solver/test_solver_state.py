@@ -8,7 +8,8 @@ import pytest
 from naive.random_graphs import random_steps
 
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver import Options, Solver, errors, fingerprint
+from factorbus.solver import Options, Solver, errors
+from factorbus.solver.build import differences, present_build
 from factorbus.solver.modes import MODES
 from factorbus.solver.state import dump
 
@@ -110,6 +111,26 @@ def test_what_no_state_can_hold_is_an_error_and_so_is_a_state_of_something_else(
         Solver(Options(mode="bayes-tree")).load(Solver(Options(mode="bayes-tree")).dump() | {"_tree": {"_tree": {}}})
 
 
-def test_the_fingerprint_is_that_of_the_sources() -> None:
-    assert fingerprint() == fingerprint()
-    assert len(fingerprint()) == 20
+def test_a_state_with_other_arrays_is_refused() -> None:
+    """Kernels would read past them."""
+    first, *_ = random_steps(3, steps=1)
+    solver = Solver()
+    solver.stage(first)
+    solver.step()
+    for changed in (lambda fac: fac[:, 0].copy(), lambda fac: fac.astype(np.int32), lambda fac: None):
+        state = solver.dump()
+        state["_graph"]["fac"] = changed(state["_graph"]["fac"])
+        with pytest.raises(ValueError, match=r"no state of a solver here: Graph\.fac is .*, wanted int64 in 2 dim"):
+            Solver().load(state)
+
+
+def test_a_build_is_known_by_all_that_bits_depend_on() -> None:
+    here = present_build()
+    assert set(here) == {"sources", "processor", "versions", "flags"}
+    assert all(here[name] for name in ("sources", "processor", "versions"))
+    assert differences(here, here) == ""
+    other = {**here, "processor": "x86_64 i486", "sources": "0"}
+    assert differences(other, here) == (
+        f"sources 0, here {here['sources']}; processor x86_64 i486, here {here['processor']}"
+    )
+    assert differences({}, {"flags": "A=1"}) == "flags none, here A=1"

@@ -46,7 +46,7 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
     services: Callable[..., Services], tmp_path: Path
 ) -> None:
     """Each of these changes is made anew, which takes longer than an exchange: they are told apart by revisions."""
-    endpoint = services(tmp_path / "journal", "snapshot_s=1000", "reorder=0", 'durability="group"').start()
+    endpoint = services(tmp_path / "journal", "snapshot_s=1000", 'durability="group"').start()
     with (
         connect(endpoint, client="changer", timeout_s=PATIENCE_S) as one,
         connect(endpoint, client="bystander", timeout_s=PATIENCE_S) as two,
@@ -76,7 +76,7 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
 def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
     services: Callable[..., Services], tmp_path: Path
 ) -> None:
-    endpoint = services(tmp_path / "journal", "snapshot_s=1000", "reorder=0").start()
+    endpoint = services(tmp_path / "journal", "snapshot_s=1000").start()
     with (
         connect(endpoint, client="changer", timeout_s=PATIENCE_S) as one,
         connect(endpoint, client="viewer", timeout_s=PATIENCE_S) as two,

@@ -88,6 +88,6 @@ def test_the_limit_of_a_control_group_counts(tmp_path: Path, monkeypatch: pytest
     files = [tmp_path / "absent", tmp_path / "max", tmp_path / "own"]
     monkeypatch.setattr(memory, "limit_files", lambda *_: files[: version + 1])
     assert memory.available() == (1 << 28 if version == 2 else memory.os.sysconf("SC_PHYS_PAGES") * 4096)
-    held = memory.Memory(0)
+    held = memory.MemoryLimit(0)
     assert held.limit == int(0.8 * memory.available())
     held.close()

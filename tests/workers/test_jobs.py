@@ -8,7 +8,7 @@ from factorbus.cli.driving.columns import merged
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
-from factorbus.service.jobs import inplace
+from factorbus.service.jobs.running import do_in_place
 from factorbus.simulate import sphere
 from factorbus.solver import SolverError
 from factorbus.solver.starts import descent
@@ -37,7 +37,7 @@ def test_the_batch_job_finds_the_optimum() -> None:
 
 def test_the_service_in_place_finds_the_same_bits() -> None:
     payload = codec.encode_graph(triangle())
-    done = inplace.do(Job("j", "batch", payload))
+    done = do_in_place(Job("j", "batch", payload))
     assert done.payload == jobs.do("batch", payload)
 
 
@@ -65,7 +65,7 @@ def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.
     found = codec.decode_optimum(early)
     assert not found.converged
     assert found.chi2 > 1.0001 * whole.chi2
-    assert inplace.do(Job("j", "batch", payload)).payload == early
+    assert do_in_place(Job("j", "batch", payload)).payload == early
 
 
 def test_what_cannot_be_done_has_a_code() -> None:

@@ -221,4 +221,6 @@ def _row_of(where: str, content: Mapping[str, Any]) -> MapRow:
         protocol=fields.mapping(where, content, "protocol"),
         converged=fields.flag(where, content, "converged") if "converged" in content else None,
         converging=fields.flag(where, content, "converging"),
+        reproducible=fields.flag(where, content, "reproducible") if "reproducible" in content else None,
+        reason=fields.text(where, content, "reason", default=""),
     )

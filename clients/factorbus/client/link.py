@@ -14,7 +14,7 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.client.listening import heard
-from factorbus.client.replies import Answer, Failure, Reply, Silence, TimedOut
+from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, TimedOut
 from factorbus.proto import discreet, keys
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.kept_state import keep_state
@@ -239,7 +239,7 @@ def _settings(endpoints: Sequence[str]) -> dict[str, Any]:
 
 def _read(reply: zenoh.Reply) -> Reply:
     if (answer := reply.ok) is not None:
-        return Answer(answer.payload.to_bytes())
+        return AnswerReply(answer.payload.to_bytes())
     error = reply.err
     payload = error.payload.to_bytes() if error is not None else b""
     return TimedOut() if payload == _TIMED_OUT else Failure(payload)

@@ -44,7 +44,8 @@ class MapRow:
     (`damaged`, `differs`, `other_version`, `unreadable`), and `problem` says why.  Of such a map there are no numbers.
     protocol: the names that its service knows (`changes`, `factors`, ...), as §13 of the contract has them; empty in a
     list of maps.  converged: its last step had; None: the service does not say.  converging: it takes further steps by
-    itself, unless an insert comes.
+    itself, unless an insert comes.  reproducible: as far as is known, its journal gives the same estimate again to the
+    bit; if not, `reason` says why; None: it has no journal, or the service does not say.
     """
 
     name: str
@@ -58,6 +59,8 @@ class MapRow:
     protocol: Mapping[str, Any] = field(default_factory=dict)
     converged: bool | None = None
     converging: bool = False
+    reproducible: bool | None = None
+    reason: str = ""
 
 
 class Map:

@@ -14,7 +14,7 @@ from factorbus.client.arguments import of_type, seconds
 from factorbus.client.following import Following, tables_of
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
-from factorbus.client.replies import Answer, Reply, TimedOut, pause
+from factorbus.client.replies import AnswerReply, Reply, TimedOut, pause
 from factorbus.proto import fields, keys
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_asked
@@ -322,7 +322,7 @@ class Mirror:
         self._asking = False
         self._silences += 1
         self._ask_at = time.monotonic() + pause(self._silences)  # unless this was it
-        answered = isinstance(reply, Answer)
+        answered = isinstance(reply, AnswerReply)
         if answered:
             self._adopt(reply.payload)
         if answered and self._following.live:
@@ -343,13 +343,13 @@ class Mirror:
     def _take_probe(self, reply: Reply) -> None:
         with self._lock:
             self._probing = False
-            if isinstance(reply, Answer):
+            if isinstance(reply, AnswerReply):
                 self._compare(reply)
             elif not isinstance(reply, TimedOut):  # else the service is there and busy
                 self._lose()
             self._changed.notify_all()
 
-    def _compare(self, reply: Answer) -> None:
+    def _compare(self, reply: AnswerReply) -> None:
         told = read_map("stats", reply.payload, ANSWER_LIMITS)
         epoch, revision = fields.integer("stats", told, "epoch"), fields.integer("stats", told, "revision")
         if epoch != self._following.epoch:

@@ -18,7 +18,7 @@ _WAIT = frozenset({"busy", "journal_failed"})
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class AnswerReply:
     """The answer's bytes."""
 
     payload: bytes
@@ -41,7 +41,7 @@ class TimedOut:
     """Somebody has the question and has not replied in time."""
 
 
-Reply: TypeAlias = Answer | Failure | Silence | TimedOut
+Reply: TypeAlias = AnswerReply | Failure | Silence | TimedOut
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def judge(reply: Reply, attempt: int, passing: Callable[[Refused], bool] | None 
     passing: which refusals will not last, besides busy and shutting_down.
     """
     match reply:
-        case Answer(payload):
+        case AnswerReply(payload):
             return payload
         case Silence():
             return Again(pause(attempt), "nobody replies")

@@ -33,8 +33,8 @@ from factorbus.client import Bus, Problem
 from factorbus.client.questions import logged
 from factorbus.gateway.documents import Document, estimate, groups
 from factorbus.gateway.explain import explain
-from factorbus.gateway.live import follow
-from factorbus.gateway.maps import Maps
+from factorbus.gateway.live import follow_map
+from factorbus.gateway.maps import JoinedMaps
 from factorbus.proto.asking import AskWhy
 from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.viz.closures import closures_of
@@ -53,9 +53,9 @@ _MOST_REASON = 120  # bytes of it, of 123 that a WebSocket has room for
 
 def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Starlette:
     """The application, over a connection that stays the caller's.  hosts: names by which it may be called."""
-    maps = Maps(bus)
+    maps = JoinedMaps(bus)
     one = "/api/maps/{name}"
-    answers: dict[str, Callable[[Maps, Request], Awaitable[Response]]] = {
+    answers: dict[str, Callable[[JoinedMaps, Request], Awaitable[Response]]] = {
         "/api/maps": _list,
         f"{one}/estimate": _estimate,
         f"{one}/graph": _graph,
@@ -81,17 +81,17 @@ def make_app(bus: Bus, hosts: Sequence[str] = ("127.0.0.1", "localhost")) -> Sta
     return app
 
 
-async def _list(maps: Maps, _: Request) -> Response:
+async def _list(maps: JoinedMaps, _: Request) -> Response:
     rows = await asyncio.to_thread(maps.bus.maps)
     return Document({"maps": [asdict(row) | {"epoch": str(row.epoch)} for row in rows]})
 
 
-async def _estimate(maps: Maps, request: Request) -> Response:
+async def _estimate(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         return Document(estimate(joined.map.estimate.snapshot()))
 
 
-async def _graph(maps: Maps, request: Request) -> Response:
+async def _graph(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         graph = await maps.graph(joined)
     factors = [
@@ -107,7 +107,7 @@ async def _graph(maps: Maps, request: Request) -> Response:
     return Document(at | {"variables": groups(graph.batch.variables), "factors": factors})
 
 
-async def _closures(maps: Maps, request: Request) -> Response:
+async def _closures(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         graph = await maps.graph(joined)
     found = await asyncio.to_thread(closures_of, graph.batch.variables, graph.batch.factors)
@@ -115,7 +115,7 @@ async def _closures(maps: Maps, request: Request) -> Response:
     return Document({"revision": graph.revision, "keys": keys, "misfit": found.misfit.tolist()})
 
 
-async def _ellipses(maps: Maps, request: Request) -> Response:
+async def _ellipses(maps: JoinedMaps, request: Request) -> Response:
     """Covariances of places (m²): xx xy xz yy yz zz."""
     async with maps.using(request.path_params["name"]) as joined:
         revision, spread = await maps.spread(joined)
@@ -124,13 +124,13 @@ async def _ellipses(maps: Maps, request: Request) -> Response:
     return Document({"revision": revision, "keys": keys, "covariances": upper.tolist()})
 
 
-async def _stats(maps: Maps, request: Request) -> Response:
+async def _stats(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         stats = await asyncio.wrap_future(joined.map.ask.stats(None))
     return Document(stats | {"epoch": str(stats["epoch"])})
 
 
-async def _optimum(maps: Maps, request: Request) -> Response:
+async def _optimum(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         found = await asyncio.wrap_future(joined.map.ask.chi2(True, _OPTIMUM_S))
     names = ("revision", "chi2", "batch", "start", "worker", "seconds", "batch_converged")
@@ -139,7 +139,7 @@ async def _optimum(maps: Maps, request: Request) -> Response:
     return Document(told | {"notice": notice})
 
 
-async def _export(maps: Maps, request: Request) -> Response:
+async def _export(maps: JoinedMaps, request: Request) -> Response:
     async with maps.using(request.path_params["name"]) as joined:
         format, robot = request.query_params.get("format", "g2o"), request.query_params.get("robot")
         exported = await asyncio.wrap_future(joined.map.ask.export(format, None, robot))
@@ -148,14 +148,14 @@ async def _export(maps: Maps, request: Request) -> Response:
     return PlainTextResponse(text, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
-async def _variable(maps: Maps, request: Request) -> Response:
+async def _variable(maps: JoinedMaps, request: Request) -> Response:
     key = parse_symbol(request.path_params["key"])
     async with maps.using(request.path_params["name"]) as joined:
         why = await asyncio.wrap_future(joined.map.doubt.ask.why(AskWhy(key), None))
     return Document(explain(why))
 
 
-async def _live(maps: Maps, socket: WebSocket) -> None:
+async def _live(maps: JoinedMaps, socket: WebSocket) -> None:
     """Only for pages of ours: a browser says where its page is from."""
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # the latter: it was closed before for what it sent
         await socket.accept()
@@ -164,7 +164,7 @@ async def _live(maps: Maps, socket: WebSocket) -> None:
             return
         try:
             async with maps.using(socket.path_params["name"]) as joined:
-                await follow(socket, joined.map.estimate)
+                await follow_map(socket, joined.map.estimate)
         except Problem as problem:
             reason = problem.message.encode()[:_MOST_REASON].decode(errors="ignore")
             await socket.close(_PROBLEM, reason)

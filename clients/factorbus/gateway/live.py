@@ -20,7 +20,7 @@ from factorbus.proto.stamps import NO_STAMP
 _LEAST_PAUSE_S = 0.05
 
 
-async def follow(socket: WebSocket, mirror: Mirror) -> None:
+async def follow_map(socket: WebSocket, mirror: Mirror) -> None:
     """Send until the browser leaves.  `socket` is accepted already."""
     loop, news = asyncio.get_running_loop(), asyncio.Event()
 

@@ -26,7 +26,7 @@ class Joined:
     asking: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-class Maps:
+class JoinedMaps:
     """Joined maps by name.  `using` may be called from any thread; what it gives is used in the event loop."""
 
     def __init__(self, bus: Bus) -> None:

@@ -21,7 +21,7 @@ from factorbus.ros2.messages import LATEST_S, Stamp
 from factorbus.ros2.problems import BadRosMessage
 from factorbus.ros2.settings import Settings
 from factorbus.ros2.space import SPACES
-from factorbus.ros2.track import Place, Sample, Track
+from factorbus.ros2.track import KeyframePlace, OdometryTrack, Sample
 from factorbus.wording import counted
 
 _WAITING = 256
@@ -37,7 +37,7 @@ class FrontEnd:
 
     def __init__(self, settings: Settings, first: int, landmarks: Iterable[int], wait_for_pose: bool) -> None:
         self._settings, self._space, self._floors = settings, SPACES[settings.space], settings.floors
-        self._track = Track()
+        self._track = OdometryTrack()
         self._waiting: deque[tuple[int, str, Any]] = deque(maxlen=_WAITING)
         self.refused: list[BadRosMessage] = []
         self.remarks: list[tuple[str, str]] = []
@@ -132,7 +132,7 @@ class FrontEnd:
         measured = self._space.row(place.T)
         draft.factor(f"between_{self._space.pose}", (place.keyframe.key, key), measured, information=weight)
 
-    def _floored_way(self, place: Place) -> F64:
+    def _floored_way(self, place: KeyframePlace) -> F64:
         floors, metres, radians = self._floors, float(np.linalg.norm(place.T.t)), place.T.angle()
         return self._space.floored(
             place.covariance,
@@ -201,7 +201,7 @@ class FrontEnd:
             kind = f"landmark_{self._space.pose}"
             draft.factor(kind, (place.keyframe.key, key), measured, information=weight)
 
-    def _sighting(self, topic: str, message: Any, seen: Any, place: Place, way: F64) -> tuple[int, F64, F64]:
+    def _sighting(self, topic: str, message: Any, seen: Any, place: KeyframePlace, way: F64) -> tuple[int, F64, F64]:
         """Key of the landmark, where it is from the keyframe, and the information of that.
 
         q = T p', p' = R p + t with T the keyframe's way, (R, t) the mount: Σ_q = R_q Σ_p R_qᵀ + J Σ_T Jᵀ with

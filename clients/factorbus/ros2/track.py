@@ -40,7 +40,7 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class KeyframePlace:
     """Where the robot was: T_keyframe_base, its covariance (6, 6, local) as far as odometry tells one."""
 
     keyframe: Keyframe
@@ -48,7 +48,7 @@ class Place:
     covariance: F64
 
 
-class Track:
+class OdometryTrack:
     """The last odometry, oldest first.
 
     The covariance of a way is the sum of Σ Δt² over its samples, carried along, Σ being the covariance of each sample's
@@ -93,21 +93,21 @@ class Track:
         self._samples = deque((_since(made, at, each) for each in self._samples), maxlen=_KEPT)
         return made
 
-    def try_place(self, stamp_ns: int) -> Place | None:
+    def try_place(self, stamp_ns: int) -> KeyframePlace | None:
         """Where the robot was; None before the first keyframe."""
         before, T_odom_base = self._interpolated(stamp_ns)
         if before.keyframe is None:
             return None
         T = before.keyframe.T_odom_base.inverse() @ T_odom_base
         way = carried(before.way, before.T_odom_base.inverse() @ T_odom_base)
-        return Place(before.keyframe, T, _or_growth(way, before, T))
+        return KeyframePlace(before.keyframe, T, _or_growth(way, before, T))
 
-    def place_of(self, sample: Sample) -> Place:
+    def place_of(self, sample: Sample) -> KeyframePlace:
         """The same for an odometry that has a keyframe."""
         if sample.keyframe is None:
             raise ValueError("an odometry before the first keyframe has no place in the map")
         T = sample.keyframe.T_odom_base.inverse() @ sample.T_odom_base
-        return Place(sample.keyframe, T, _or_growth(sample.way, sample, T))
+        return KeyframePlace(sample.keyframe, T, _or_growth(sample.way, sample, T))
 
     def covers(self, stamp_ns: int) -> bool:
         """Not before the first odometry that is kept."""

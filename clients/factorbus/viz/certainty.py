@@ -38,7 +38,7 @@ def blocks_of(answer: Covariances) -> Mapping[int, F64]:
     return {key: block for g in answer.groups for key, block in zip(g.keys.tolist(), g.covariance, strict=True)}
 
 
-class Certainty:
+class MapCertainty:
     """How certain `joined` is of at most about `most` poses and as many points.  For the thread that looks."""
 
     def __init__(self, joined: Map, most: int, told: Callable[[], None] = lambda: None) -> None:

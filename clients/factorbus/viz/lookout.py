@@ -15,7 +15,7 @@ from factorbus.client.stream import DeltaStream
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Delta, Factors, Graph, Variables
 from factorbus.proto.problems import Problem
-from factorbus.viz.certainty import Certainty
+from factorbus.viz.certainty import MapCertainty
 from factorbus.viz.ellipses import Spread
 from factorbus.viz.polite import Polite
 
@@ -54,7 +54,7 @@ class Lookout:
         self._stream = DeltaStream(self._mirror, self._news.set)
         self._graph = Polite(lambda: joined.ask.graph(None), Graph(0, 0, Batch()), self._news.set)
         self._with_factors = with_factors
-        self._certainty = Certainty(joined, ellipses, self._news.set) if ellipses else None
+        self._certainty = MapCertainty(joined, ellipses, self._news.set) if ellipses else None
 
     def __enter__(self) -> "Lookout":
         return self

@@ -15,13 +15,11 @@ from factorbus.journal.store import NAME, Saved, open_store
 log = logging.getLogger(__name__)
 
 
-def fork_journal(
-    source: Path, target: Path, fold: int, epoch: Epoch, state: Mapping[str, Any], fingerprint: str
-) -> None:
-    """The journal in `source`, which may be at work, up to `fold` into `target`, which must not be there yet.
+def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, Any], saved: Saved) -> None:
+    """The journal in `source`, which may be at work, up to a fold into `target`, which must not be there yet.
 
-    state: of the solver with this fingerprint after that fold, so that a restart is quick; the inserts are there too,
-    as a snapshot counts only for the solver that wrote it.  All of it or nothing.
+    state: of the solver after that fold, so that a restart is quick; saved: which fold that is, and what the state is
+    of.  The inserts are there too.  All of it or nothing.
     Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, JournalFailed.
     """
     beside = target.with_name(f"{UNFINISHED}{target.name}")
@@ -29,7 +27,7 @@ def fork_journal(
     try:
         make_beside(beside)
         _copy(source, beside)
-        _begin(beside, target.name, fold, epoch, _saved(beside, fold, state, fingerprint))
+        _begin(beside, target.name, epoch, saved.fold, _written(beside, state, saved))
         sync_folder(beside)
         beside.rename(target)
         sync_folder(target.parent)
@@ -47,19 +45,19 @@ def _copy(source: Path, beside: Path) -> None:
         store.close()
 
 
-def _saved(beside: Path, fold: int, state: Mapping[str, Any], fingerprint: str) -> Saved | None:
+def _written(beside: Path, state: Mapping[str, Any], saved: Saved) -> Saved | None:
     """The snapshot, if there is room for it: without one a restart takes longer."""
-    if not fold:
+    if not saved.fold:
         return None
-    path = file_of(beside, fold)
+    path = file_of(beside, saved.fold)
     try:
-        return Saved(fold, fingerprint, write_snapshot(path, state))
+        return saved._replace(bytes=write_snapshot(path, state))
     except OSError as error:
         log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
         return None
 
 
-def _begin(beside: Path, name: str, fold: int, epoch: Epoch, saved: Saved | None) -> None:
+def _begin(beside: Path, name: str, epoch: Epoch, fold: int, saved: Saved | None) -> None:
     store = open_store(beside)
     try:
         store.become(name, fold, epoch, saved)

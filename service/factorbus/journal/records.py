@@ -32,9 +32,7 @@ class Fold(NamedTuple):
     """Inserts that went to the solver together, in this order, and the revision that came of it.
 
     number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
-    ever changed, up to here   reordered: another solver took its place, made in a fresh order of what there was after
-    this fold, and given all since; with no inserts of its own.  None: not so   further: a step without an
-    insert, since the one before had not converged
+    ever changed, up to here   further: a step without an insert, since the one before had not converged
     """
 
     number: int
@@ -42,8 +40,17 @@ class Fold(NamedTuple):
     rebuilt: bool
     chain: bytes
     entries: tuple[Entry, ...]
-    reordered: int | None = None
     further: bool = False
+
+
+class Maker(NamedTuple):
+    """The build of the solver that made a fold and those after it, up to the next maker's.
+
+    build: its parts by name, as the solver names them.
+    """
+
+    fold: int
+    build: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)

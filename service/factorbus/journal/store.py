@@ -19,15 +19,14 @@ from factorbus.journal.connecting import APPLICATION, FORM, connected, connectio
 from factorbus.journal.digest import digest_of
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
-from factorbus.journal.records import Entry, Epoch, Fold, Header, Sender
+from factorbus.journal.records import Entry, Epoch, Fold, Header, Maker, Sender
 from factorbus.ownership import private_file
 
 NAME = "journal.db"
 _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
--- rebuilt: 0, 1, or the negative of a fold: the solver was replaced by one that was ordered anew after that one
--- 2: nothing of that, but a step without an insert
+-- rebuilt: 0, or 1 where the solver failed meanwhile and was replaced, or 2 for a step without an insert
 CREATE TABLE fold (
     number INTEGER PRIMARY KEY, revision INTEGER NOT NULL, rebuilt INTEGER NOT NULL, chain BLOB NOT NULL
 );
@@ -37,18 +36,27 @@ CREATE TABLE entry (
     together INTEGER NOT NULL, answer BLOB NOT NULL, message BLOB NOT NULL
 );
 CREATE INDEX entry_of_client ON entry (client);
-CREATE TABLE snapshot (fold INTEGER PRIMARY KEY, fingerprint TEXT NOT NULL, bytes INTEGER NOT NULL);
+CREATE TABLE snapshot (
+    fold INTEGER PRIMARY KEY, format INTEGER NOT NULL, build TEXT NOT NULL, differs TEXT NOT NULL,
+    bytes INTEGER NOT NULL
+);
+CREATE TABLE maker (fold INTEGER PRIMARY KEY, build TEXT NOT NULL);
 """
 _REBUILT, _FURTHER = 1, 2
 _ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
 
 
 class Saved(NamedTuple):
-    """A snapshot that was written: after which fold, by which solver, how large."""
+    """A snapshot that was written: after which fold, in which format of a state, by which build, how large.
+
+    differs: why a replay of the journal up to there may give other bits; empty: as far as is known it gives the same.
+    """
 
     fold: int
-    fingerprint: str
-    bytes: int
+    format: int
+    build: Mapping[str, str]
+    differs: str = ""
+    bytes: int = 0
 
 
 class Last(NamedTuple):
@@ -108,20 +116,17 @@ class Store:
                     row = entries.fetchone()
                 if row is not None and row[0] < number:
                     raise JournalDamaged(self.path, f"an insert of fold {row[0]} is out of order")
-                reordered = -rebuilt if rebuilt < 0 else None
-                yield Fold(number, revision, rebuilt == _REBUILT, digest, tuple(taken), reordered, rebuilt == _FURTHER)
+                yield Fold(number, revision, rebuilt == _REBUILT, digest, tuple(taken), rebuilt == _FURTHER)
             if row is not None:
                 raise JournalDamaged(self.path, f"an insert belongs to fold {row[0]}, which is missing")
 
-    def reordered(self, after: int = 0) -> dict[int, int]:
-        """Of solvers that were ordered anew: the fold after which each was made, and the one that it took its place in.
-
-        after: of those that took it later.  Raises JournalDamaged.
-        """
+    def makers(self) -> list[Maker]:
+        """The builds that made its folds, in their order; one that made none is left out.  Raises JournalDamaged."""
         with self._reading():
-            return dict(
-                self._db.execute("SELECT -rebuilt, number FROM fold WHERE rebuilt < 0 AND number > ?", (after,))
-            )
+            rows = self._db.execute(
+                "SELECT * FROM maker WHERE fold <= (SELECT MAX(number) FROM fold) ORDER BY fold"
+            ).fetchall()
+            return [Maker(fold, json.loads(build)) for fold, build in rows]
 
     def senders(self, first_fold: int, clients: int, entries: int) -> list[Sender]:
         """The `clients` heard last, each with up to `entries` of its last inserts.
@@ -147,13 +152,14 @@ class Store:
     def snapshots(self) -> list[Saved]:
         """The snapshots that were written, newest first."""
         with self._reading():
-            return [Saved(*row) for row in self._db.execute("SELECT * FROM snapshot ORDER BY fold DESC")]
+            rows = self._db.execute("SELECT * FROM snapshot ORDER BY fold DESC").fetchall()
+            return [Saved(fold, form, json.loads(build), *more) for fold, form, build, *more in rows]
 
     def append(self, folds: Sequence[Fold]) -> None:
         """Write `folds` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
         with self._writing():
             self._db.executemany(
-                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, _replaced(f), f.chain) for f in folds]
+                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, _kind(f), f.chain) for f in folds]
             )
             self._db.executemany(
                 f"INSERT INTO entry (fold, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -163,15 +169,21 @@ class Store:
     def add_snapshot(self, saved: Saved, keep: int) -> list[int]:
         """Note a snapshot, and forget all but the last `keep`: gives the folds of those.  Raises JournalFailed."""
         with self._writing():
-            self._db.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?)", saved)
+            self._insert_snapshot(saved)
             old = self._db.execute("SELECT fold FROM snapshot ORDER BY fold DESC LIMIT -1 OFFSET ?", (keep,)).fetchall()
             self._db.executemany("DELETE FROM snapshot WHERE fold = ?", old)
         return [fold for (fold,) in old]
 
-    def begin(self, durability: str, epoch: Epoch | None = None) -> None:
-        """Somebody is at work with it from now on, in a new epoch if there is one.  Raises JournalFailed."""
+    def begin(self, durability: str, epoch: Epoch | None = None, maker: Maker | None = None) -> None:
+        """Somebody is at work with it from now on, in a new epoch if there is one.
+
+        maker: who makes the next fold, if it is not who made the last one.  Raises JournalFailed.
+        """
         with self._writing():
             self._set({"clean": "0", "durability": durability})
+            self._db.execute("DELETE FROM maker WHERE fold > (SELECT COALESCE(MAX(number), 0) FROM fold)")
+            if maker is not None:
+                self._db.execute("INSERT INTO maker VALUES (?, ?)", (maker.fold, _text(maker.build)))
             if epoch is not None:
                 self._add_epoch(epoch)
                 self._seal()
@@ -190,10 +202,11 @@ class Store:
             self._db.execute("DELETE FROM entry WHERE fold > ?", (fold,))
             self._db.execute("DELETE FROM fold WHERE number > ?", (fold,))
             self._db.execute("DELETE FROM epoch WHERE fold > ?", (epoch.fold,))
+            self._db.execute("DELETE FROM maker WHERE fold > ?", (fold,))
             self._add_epoch(epoch)
             self._db.execute("DELETE FROM snapshot")
             if saved is not None:
-                self._db.execute("INSERT INTO snapshot VALUES (?, ?, ?)", saved)
+                self._insert_snapshot(saved)
             self._set({"map": name, "clean": "1"})
             self._seal()
 
@@ -285,6 +298,10 @@ class Store:
             "INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.fold, epoch.because)
         )
 
+    def _insert_snapshot(self, saved: Saved) -> None:
+        row = saved.fold, saved.format, _text(saved.build), saved.differs, saved.bytes
+        self._db.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?, ?, ?)", row)
+
     def _checked(self, entry: Entry) -> Entry:
         if digest_of(entry) != entry.digest:
             raise JournalDamaged(self.path, f"insert {entry.sequence} of client {entry.client} is not what was written")
@@ -354,11 +371,13 @@ def _sealed(named: Mapping[str, str], epochs: Sequence[Epoch]) -> str:
     return blake2b(content.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
 
 
-def _replaced(fold: Fold) -> int:
-    """As the table has it."""
-    if fold.reordered is not None:
-        return -fold.reordered
+def _kind(fold: Fold) -> int:
+    """As the table has it, in the column `rebuilt`."""
     return _FURTHER if fold.further else _REBUILT * fold.rebuilt
+
+
+def _text(build: Mapping[str, str]) -> str:
+    return json.dumps(dict(build), ensure_ascii=False)
 
 
 def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int, durability: str) -> None:

@@ -29,10 +29,19 @@ from factorbus.proto.protocol import known
 from factorbus.proto.version import __version__
 from factorbus.service.bus.delivery import Delivery
 from factorbus.service.bus.senders import Senders
-from factorbus.service.bus.zenoh_session import Bus, ignore, key_of, open_bus, payload_of, received, refuse, reply
+from factorbus.service.bus.zenoh_session import (
+    ServiceBus,
+    ignore,
+    key_of,
+    open_service_bus,
+    payload_of,
+    received,
+    refuse,
+    reply,
+)
 from factorbus.service.config import BadConfig, Config, checked
 from factorbus.service.core.events import Asked, Asker, Refuse
-from factorbus.service.jobs.features import Features
+from factorbus.service.jobs.features import FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
 from factorbus.service.jobs.worker_latency import Trips
@@ -44,7 +53,7 @@ from factorbus.service.operations.start import ready_to_compute
 from factorbus.service.process.health import Health
 from factorbus.service.process.worker_threads import LentCores
 from factorbus.service.questions.admin import NotHere, read_create, read_drop, read_fork
-from factorbus.service.questions.answers import Question, Snapshot
+from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.registry import Maps
 from factorbus.service.solving.arrival import read_insert
@@ -91,7 +100,7 @@ def _serve(
     stop: threading.Event,
     on_look: Callable[[Health], None],
 ) -> None:
-    bus = open_bus(config)
+    bus = open_service_bus(config)
     try:
         shell = Shell(bus, config, library)
         shell.vitals.chapters["cores"] = cores.account
@@ -116,7 +125,7 @@ def _serve(
 class Shell:
     """Everything a running service has declared on the bus, and the threads behind it."""
 
-    def __init__(self, bus: Bus, config: Config, library: Library | None = None) -> None:
+    def __init__(self, bus: ServiceBus, config: Config, library: Library | None = None) -> None:
         self._bus, self._config = bus, config
         self._service = config.name or f"s{secrets.token_hex(4)}"
         self._decoding = config.limits.message()
@@ -136,7 +145,7 @@ class Shell:
         self._trips = Trips(self._desk, bus.send_job, self._jobs)
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
-        self._features = Features(
+        self._features = FeatureQuestions(
             self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s,
             Room(self.vitals.memory, limits.answer_bytes),
         )  # fmt: skip
@@ -249,10 +258,10 @@ class Shell:
             "workers": self._worker_rows,
         }
 
-    def _find_optimum(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+    def _find_optimum(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
         self._desk.hand(self._optima.batch, asker, question, taken)
 
-    def _fork(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+    def _fork(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
         self._desk.hand(self.maps.forked, asker, question, taken)
 
     def _no_map(self, query: Asker, name: str, following: int | None = None) -> None:

@@ -88,8 +88,6 @@ class Config:
     durability: str = "commit"  # what an answer promises of it: none, group or commit
     group_s: float = 0.05  # durability group: written no later than this after the answer
     snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
-    # A map is ordered anew beside the steps where R has so many times the numbers of a fresh order; 0: never.
-    reorder: float = 1.15
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
     standby: bool = False  # wait until whoever owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
@@ -126,8 +124,6 @@ def checked(config: Config) -> Config:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
     if config.cores < 1:
         raise BadConfig(f"cores is {config.cores}; wanted 1, for the map's own thread alone, or more")
-    if config.reorder < 0:
-        raise BadConfig(f"reorder is {config.reorder}; wanted 0, for never, or a share such as 1.15")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
     if config.durability not in DURABILITIES:

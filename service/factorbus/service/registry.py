@@ -16,15 +16,15 @@ from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, ShuttingDown, TooLarge, UnknownMap
 from factorbus.proto.protocol import known
 from factorbus.service.bus.delivery import Delivery
-from factorbus.service.bus.zenoh_session import Bus, Place
+from factorbus.service.bus.zenoh_session import MapPlace, ServiceBus
 from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
-from factorbus.service.journal.library import Kept, Library, make_folder, restored
+from factorbus.service.journal.library import CopiedAt, Kept, Library, make_folder, restored
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import Lane
 from factorbus.service.process.heap import give_back
-from factorbus.service.process.memory import Memory, OutOfMemory
+from factorbus.service.process.memory import MemoryLimit, OutOfMemory
 from factorbus.service.questions.admin import (
     Drop,
     Fork,
@@ -36,9 +36,8 @@ from factorbus.service.questions.admin import (
     ours,
     settled_mode,
 )
-from factorbus.service.questions.answers import Copied, Question, Snapshot
+from factorbus.service.questions.answers import Copied, Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
-from factorbus.service.reordering import Reordering
 from factorbus.service.solving.apply import Folder
 
 log = logging.getLogger(__name__)
@@ -55,10 +54,10 @@ class _Forking:
     room: int
 
 
-class Owned:
+class OpenMap:
     """A map, its place on the bus, and the end of it."""
 
-    def __init__(self, host: Host, place: Place, options: dict[str, Any]) -> None:
+    def __init__(self, host: Host, place: MapPlace, options: dict[str, Any]) -> None:
         self.host, self.place, self.options = host, place, options
         self.drained = threading.Event()
         self.on_drained: Callable[[], None] = self.drained.set
@@ -68,19 +67,19 @@ class Maps:
     """All maps of one service.  named: of the service, in tokens."""
 
     def __init__(
-        self, bus: Bus, config: Config, named: str, library: Library | None, delivery: Delivery, desk: Lane,
-        memory: Memory,
+        self, bus: ServiceBus, config: Config, named: str, library: Library | None, delivery: Delivery, desk: Lane,
+        memory: MemoryLimit,
     ) -> None:  # fmt: skip
         self._bus, self._config, self._service, self._library = bus, config, named, library
         self._delivery, self._desk, self._memory = delivery, desk, memory
-        self._maps: dict[str, Owned] = {}
-        self._leaving: list[Owned] = []
+        self._maps: dict[str, OpenMap] = {}
+        self._leaving: list[OpenMap] = []
         self._unopened: dict[str, Problem] = {}  # that are on disk and do not open
         self._forks: dict[str, Fork] = {}  # what maps were forked from, since this service began
         self._stopping = False
         self._seat = threading.Lock()  # of the one callback that may solve
 
-    def get(self, name: str) -> Owned | None:
+    def get(self, name: str) -> OpenMap | None:
         """Map `name`, if it is here."""
         return self._maps.get(name)
 
@@ -152,7 +151,7 @@ class Maps:
         asked = _Forking(fork, found.host.core.epoch, self._memory.room())
         found.host.read(Read(Question("copy", ask=asked), asker))
 
-    def forked(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+    def forked(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
         """The original is copied: make the other map of it."""
         asked: _Forking = question.ask
         try:
@@ -229,11 +228,11 @@ class Maps:
         for found in self._maps.values():
             found.place.close()
 
-    def _make(self, name: str, mode: str | None) -> Owned:
+    def _make(self, name: str, mode: str | None) -> OpenMap:
         """mode: None for that of the map which is there.  Raises Problem."""
         return self._at_work(*self._begin(name, mode))
 
-    def _at_work(self, core: MapCore, folder: Folder, kept: Kept | None) -> Owned:
+    def _at_work(self, core: MapCore, folder: Folder, kept: Kept | None) -> OpenMap:
         name = core.name
         folder.bound(Room(self._memory, self._config.limits.answer_bytes))
         place, options = self._bus.place(name, self._service), folder.options()
@@ -242,9 +241,8 @@ class Maps:
             return {"options": options, **made.host.journal()}
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
-        reordering = Reordering(folder, self._config.reorder, self._memory.room, name)
-        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept, reordering)
-        made = Owned(host, place, options)
+        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept)
+        made = OpenMap(host, place, options)
         return made
 
     def _begin(self, name: str, mode: str | None) -> tuple[MapCore, Folder, Kept | None]:
@@ -265,7 +263,7 @@ class Maps:
         kept.restore(core)
         return core, kept.folder, kept
 
-    def _open(self, name: str, made: Owned) -> dict[str, Any]:
+    def _open(self, name: str, made: OpenMap) -> dict[str, Any]:
         """A map is made: let others see it.  Its row."""
         self._maps[name] = made
         made.place.announce()
@@ -305,7 +303,7 @@ class Maps:
             self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
         return done
 
-    def _split(self, asked: _Forking, taken: Snapshot) -> Owned:
+    def _split(self, asked: _Forking, taken: QuestionCopies) -> OpenMap:
         """A map of its own from the copy `taken`.  Raises Problem."""
         fork, copied, found = asked.fork, taken.copied or Copied(None, 0), self._maps.get(asked.fork.source)
         if copied.state is None:
@@ -315,17 +313,18 @@ class Maps:
         limits, was, now = self._config.limits, found.host.core, time.monotonic()
         kept = None
         if self._library is not None:
-            kept = self._library.fork(fork.source, fork.target, taken.fold, copied.state, limits)
+            copy = CopiedAt(taken.fold, copied.state, was.differs or "")
+            kept = self._library.fork(fork.source, fork.target, copy, limits)
             epoch, folder = kept.header.epoch, kept.folder
         else:
             epoch = secrets.randbits(62) | 1
             folder = make_folder(was.mode, found.options, epoch, limits)
             folder.load(copied.state)
         core = MapCore(fork.target, was.mode, epoch, limits, now)
-        core.restore((), restored(folder))
+        core.restore((), restored(folder, was.differs))
         return self._at_work(core, folder, kept)
 
-    def _dropped(self, asker: Asker, found: Owned) -> None:
+    def _dropped(self, asker: Asker, found: OpenMap) -> None:
         name = found.host.core.name
         self._leaving.remove(found)
         found.host.end(keep=False)
@@ -341,7 +340,7 @@ class Maps:
         self._desk.hand(self._delivery.answer, asker, codec.encode_map({}))
         log.info("map %s dropped", name, extra={"map": name})
 
-    def _no_more(self) -> list[Owned]:
+    def _no_more(self) -> list[OpenMap]:
         """The maps there are once the desk is done with what it had: no map is created after this."""
         reached = threading.Event()
 

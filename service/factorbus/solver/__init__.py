@@ -10,7 +10,6 @@
 
 from factorbus.solver import errors
 from factorbus.solver.errors import SolverError
-from factorbus.solver.fingerprint import fingerprint
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.kernels.jit.compile import compiled_seconds
 from factorbus.solver.optimize.evaluate import chi2_at
@@ -33,7 +32,6 @@ __all__ = [
     "chi2_at",
     "compiled_seconds",
     "errors",
-    "fingerprint",
     "solve_batch",
     "warm",
 ]

@@ -30,6 +30,7 @@ from factorbus.solver.kernels.graph.admit_bytes import admit_bytes
 from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.sparse.fronts import LANES
 from factorbus.solver.modes import mode_named
 from factorbus.solver.optimize.gauss_newton import Course, glide, minimise
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
@@ -67,6 +68,7 @@ class _Done:
     finished: bool = True
 
 
+_LANES = "lanes"
 _VALUES = MappingProxyType({kind.__name__: kind for kind in (_Done, Symbolic, Where)})
 
 
@@ -263,18 +265,6 @@ class Solver:
         self._graph.take(edited(other._graph, edits))
         return self._resume()
 
-    def to_order_anew(self) -> State:
-        """What `order_anew` needs, a copy: all of the map as of the last step, but not R.  Nothing may be staged."""
-        return dump(self._graph)
-
-    def order_anew(self, content: Mapping[str, Any]) -> StepReport:
-        """The first step of a new solver, with the `content` of another: linearised at the estimate, in a fresh order.
-
-        That is a full elimination, for a thread of its own.  Raises as `step` does; this solver is of no use then.
-        """
-        load(self._graph, content, _VALUES)
-        return self._resume()
-
     def asleep(self) -> list[tuple[int, str, str]]:
         """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
         return sights.asleep(self._graph)
@@ -303,13 +293,23 @@ class Solver:
     def dump(self) -> State:
         """All that later steps depend on, as of the last step: `load` it into a solver with the same options.
 
-        That one goes on with the same bits, if it has the same `fingerprint`.  Nothing may be staged.
+        That one goes on with the same bits, if it is of the same `build`.  Nothing may be staged.
         """
-        return dump(self)
+        return dump(self) | {_LANES: LANES}
 
-    def load(self, state: Mapping[str, Any]) -> None:
-        """Be where the solver that gave `state` was.  Raises ValueError, and is of no use then."""
-        load(self, state, _VALUES)
+    def load(self, state: Mapping[str, Any]) -> StepReport | None:
+        """Be where the solver that gave `state` was; None: to the bit.
+
+        Rows of R are as wide as the vectors of a processor.  Where those are others the map is taken over with its
+        estimate, and all of it is eliminated anew: the report is of that step.  Raises ValueError, and what `step`
+        does, and is of no use then.
+        """
+        parts = dict(state)
+        if parts.pop(_LANES, LANES) == LANES:
+            load(self, parts, _VALUES)
+            return None
+        load(self._graph, parts["_graph"], _VALUES)
+        return self._resume()
 
     def factored(self) -> Factored:
         """A copy of R and of all that it is of, as of the last step: what covariances are computed from, elsewhere.

@@ -6,7 +6,8 @@ kept unless somebody says otherwise, and one that cannot be written is an error 
 
 Of an array with room behind what is in use, only that much is kept: the class tells of it in `in_use`.
 
-A state is a dict of arrays, numbers, text, None, lists, and dicts like it.
+A state is a dict of arrays, numbers, text, None, lists, and dicts like it.  Which, and what their numbers mean, is its
+`FORMAT`: whoever keeps a state keeps that beside it, and gives a solver only one in its own.
 """
 
 from collections.abc import Mapping
@@ -19,6 +20,11 @@ import numpy as np
 from factorbus.solver.graph.arenas import lines
 
 State: TypeAlias = dict[str, Any]
+
+# One more whenever a state of before cannot be gone on from: a part, its type, the width of a row, the place or the
+# meaning of a number has changed (`kernels/model/layout.py`, `kernels/bayes_tree/layout.py`).
+# tests/service/test_state_format.py notices all of these but meanings, and says how to note the new one.
+FORMAT = 1
 
 _PLAIN = (bool, int, float, str, type(None))
 _TYPE = "type"
@@ -44,10 +50,23 @@ def load(thing: Any, state: Mapping[str, Any], types: Mapping[str, type]) -> Non
         raise ValueError(f"this is no state of {type(thing).__name__}: {', '.join(odd)} are in one of them only")
     for name in names:
         present = getattr(thing, name)
+        _check_alike(f"{type(thing).__name__}.{name}", present, state[name])
         if _is_part(present) and isinstance(state[name], dict):
             load(present, state[name], types)
         else:
             setattr(thing, name, _loaded(state[name], types))
+
+
+def _check_alike(where: str, present: Any, value: Any) -> None:
+    """Raises ValueError for an array of other numbers, or of more or fewer dimensions, than kernels work on there."""
+    if isinstance(present, np.ndarray):
+        here, there = _form(present), _form(value)
+        if here != there:
+            raise ValueError(f"this is no state of a solver here: {where} is {there}, wanted {here}")
+
+
+def _form(value: Any) -> str:
+    return f"{value.dtype} in {value.ndim} dimensions" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
 
 
 def aligned_copy(array: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ _COMPARISONS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class DemoRequest:
     """What the command line asked for."""
 
     world: str
@@ -75,14 +75,14 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
     if plot is None:
         plot = Path("out") / "demo.png"
         plot.parent.mkdir(exist_ok=True)
-    result = demo(Request(plot=plot, **asked))
+    result = demo(DemoRequest(plot=plot, **asked))
     if as_json:
         screen.document(result)
     else:
         screen.table(_rows(result), title=f"{result['world']}, {counted(result['poses'], 'pose')}")
 
 
-def demo(request: Request) -> dict[str, Any]:
+def demo(request: DemoRequest) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
     from factorbus.cli.demo.ground_truth import World
     from factorbus.cli.driving.picture import course_of, draw
@@ -142,7 +142,7 @@ def demo(request: Request) -> dict[str, Any]:
     return result
 
 
-def _write(request: Request, estimate: Any, truth: Any) -> None:
+def _write(request: DemoRequest, estimate: Any, truth: Any) -> None:
     """The trajectories that were asked for."""
     from factorbus.formats import write_tum
     from factorbus.proto.messages import Batch
@@ -152,7 +152,7 @@ def _write(request: Request, estimate: Any, truth: Any) -> None:
             write_tum(path, Batch(tuple(variables)))
 
 
-def _look_on(request: Request, solver: Any, robot: Any, viewer: Any) -> None:
+def _look_on(request: DemoRequest, solver: Any, robot: Any, viewer: Any) -> None:
     """Show how far the robot is, from what arrives here, and have the map compared now and then.  Raises Stopped."""
     from factorbus.cli.output.console import progress
 

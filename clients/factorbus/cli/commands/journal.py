@@ -48,6 +48,8 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
             {"map": name, "mode": header.mode, "epoch": header.epoch, "revision": last.revision, **counts}
             | {"snapshots": [saved.fold for saved in store.snapshots()], "durability": header.durability}
             | {"epochs": [epoch.because for epoch in header.epochs], "closed_in_order": header.clean}
+            | {"builds": [{"from_fold": maker.fold, **maker.build} for maker in store.makers()]}
+            | {"differs": next((saved.differs for saved in store.snapshots()), "")}
         )
     if as_json:
         screen.document({"maps": rows})

@@ -41,4 +41,5 @@ def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
 
 def _told(row: "MapRow") -> str:
     held = f"{counted(row.variables, 'variable')}, {counted(row.factors, 'factor')}"
-    return f"{held}, revision {row.revision:,}, mode {row.mode}"
+    caveat = "" if row.reproducible is not False else "; not reproducible"
+    return f"{held}, revision {row.revision:,}, mode {row.mode}{caveat}"

@@ -95,10 +95,10 @@ def drive_command(
     \b
     factorbus plot drive intel --mode bayes-tree --out intel-drive.svg
     """
-    from factorbus.cli.driving.plot_source import file_of
+    from factorbus.cli.driving.plot_source import file_named
 
     require("service", "factorbus plot drive")
-    file = _ready(lambda: file_of(source, dialect, strict), out)
+    file = _ready(lambda: file_named(source, dialect, strict), out)
     from factorbus.cli.driving.drive import drive
     from factorbus.cli.driving.local import LocalMap
     from factorbus.cli.driving.picture import course_of

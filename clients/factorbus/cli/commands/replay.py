@@ -27,7 +27,7 @@ _ANSWER_S, _LISTENING_S = 10.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ReplayRequest:
     """What the command line asked for."""
 
     file: Path
@@ -129,7 +129,7 @@ def command(as_json: bool, **asked: Any) -> None:
                    batch_converged false: its search ended before it had converged, the true optimum may be lower
       adopted      null, or what the map left for a better optimum at the end (better_optimum)
     """
-    request = Request(**asked)
+    request = ReplayRequest(**asked)
     if request.in_process and request.connect:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
     if request.in_process and request.live:
@@ -147,7 +147,7 @@ def command(as_json: bool, **asked: Any) -> None:
     replay(request, told)
 
 
-def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
+def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
     """Do it, with progress on standard error; returns the document, and hands it to `told` while the map is there."""
     from factorbus.cli.driving.drive import drive
     from factorbus.cli.driving.replay_source import source_of
@@ -183,7 +183,7 @@ def replay(request: Request, told: Callable[[dict[str, Any]], None] = lambda _: 
     return result
 
 
-def _adopt(request: Request, target: Any, last: Any) -> tuple[Any, dict[str, Any] | None]:
+def _adopt(request: ReplayRequest, target: Any, last: Any) -> tuple[Any, dict[str, Any] | None]:
     """The optimum found from scratch, if it is better than where the map has settled; says so."""
     from factorbus.cli.output.console import note
 
@@ -198,7 +198,7 @@ def _adopt(request: Request, target: Any, last: Any) -> tuple[Any, dict[str, Any
 
 
 def _document(
-    request: Request, driven: Any, target: Any, steps: Any, last: Any, unsettled: float, before: Any
+    request: ReplayRequest, driven: Any, target: Any, steps: Any, last: Any, unsettled: float, before: Any
 ) -> dict[str, Any]:
     """What was measured."""
     measured, after = driven.measures(), target.account()
@@ -221,7 +221,7 @@ def _document(
 
 
 @contextmanager
-def _target(request: Request) -> Iterator[Any]:
+def _target(request: ReplayRequest) -> Iterator[Any]:
     """The map to drive into: here, in a service of our own, or in one that runs."""
     if request.in_process:
         require("service", "factorbus replay --in-process")
@@ -291,7 +291,7 @@ def _stay() -> None:
         wait_until(stop)
 
 
-def _write(request: Request, target: Any, numbering: str) -> list[Path]:
+def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
     from factorbus.cli.output.console import note
     from factorbus.cli.process.reading import say

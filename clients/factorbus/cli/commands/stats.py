@@ -84,6 +84,7 @@ def _map(row: Mapping[str, Any]) -> str:
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
         f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
+        *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in _told(row.get("journal", {}))),
     ]
     return "\n".join(lines)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.cli.demo.ekf import CAMERA, FEATURE, Filter
-from factorbus.cli.demo.visual import Settings, Tracked, VisualFilter
+from factorbus.cli.demo.visual import Tracked, VisualFilter, VisualSettings
 from factorbus.client import Features
 from factorbus.proto.arrays import F64
 from factorbus.simulate import Frame, MonocularWorld
@@ -21,7 +21,7 @@ _LONG_ENOUGH = 10  # pixels of a feature that is judged
 
 
 @dataclass(slots=True)
-class Course:
+class DepthCourse:
     """How well a feature's depth was known: σ_ρ/ρ frame by frame, and its last error in standard deviations."""
 
     rho_true: float
@@ -30,7 +30,7 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SeenFeature:
     """One frame, judged.  rays (n, 6): y of the features; spread (n,): their σ_ρ."""
 
     number: int
@@ -48,12 +48,12 @@ class Sightseer:
 
     def __init__(self, world: MonocularWorld, front: Features, most: int) -> None:
         self._world = world
-        settings = Settings(world.sigma_pixel, most=most)
+        settings = VisualSettings(world.sigma_pixel, most=most)
         self.visual = VisualFilter(front, settings, Filter(np.zeros(CAMERA), np.zeros((CAMERA, CAMERA))))
-        self._courses: dict[Tracked, Course] = {}
-        self.ended: list[tuple[Tracked, Course]] = []
+        self._courses: dict[Tracked, DepthCourse] = {}
+        self.ended: list[tuple[Tracked, DepthCourse]] = []
 
-    def run(self) -> Iterator[Seen]:
+    def run(self) -> Iterator[SeenFeature]:
         """All frames.  Raises Unavailable, Refused."""
         for number, frame in enumerate(self._world):
             started = time.perf_counter()
@@ -81,7 +81,7 @@ class Sightseer:
             order = np.argsort(frame.outlier, kind="stable")
         for feature in self.visual.grow(number, frame.points, frame.pixels, order.tolist()):
             distance = float(np.linalg.norm(self._world.points[feature.track] - frame.pose[:3]))
-            self._courses[feature] = Course(1 / distance)
+            self._courses[feature] = DepthCourse(1 / distance)
         if number == 0:
             self._measure_target()
 
@@ -93,7 +93,7 @@ class Sightseer:
         H[np.arange(count), CAMERA + FEATURE * np.arange(count) + 5] = 1.0
         filter.update(truth - filter.features[:count, 5], H, np.diag((_TARGET_SHARE * truth) ** 2))
 
-    def _judged(self, number: int, frame: Frame, filter_ms: float, grow_ms: float) -> Seen:
+    def _judged(self, number: int, frame: Frame, filter_ms: float, grow_ms: float) -> SeenFeature:
         filter, count = self.visual.filter, len(self.visual.tracked)
         spread = np.sqrt(np.array([filter.feature_covariance(i)[5, 5] for i in range(count)]))
         for feature, rho, sigma in zip(self.visual.tracked, filter.features[:, 5], spread, strict=True):
@@ -103,12 +103,12 @@ class Sightseer:
         off = filter.x[:3] - frame.pose[:3]
         nees = float(off @ np.linalg.solve(filter.P[:3, :3] + 1e-18 * np.eye(3), off))
         position = filter.x[:3].copy()
-        return Seen(
+        return SeenFeature(
             number, position, float(np.linalg.norm(off)), nees, filter.features.copy(), spread, grow_ms, filter_ms
         )
 
 
-def verdict(frames: list[Seen], sightseer: Sightseer) -> dict[str, Any]:
+def verdict(frames: list[SeenFeature], sightseer: Sightseer) -> dict[str, Any]:
     """What the run comes to: errors, consistency, how rays became points."""
     lasting = [course for feature, course in sightseer.ended if feature.matched >= _LONG_ENOUGH]
     errors = np.abs([course.error for course in lasting])

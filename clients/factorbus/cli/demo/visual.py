@@ -26,7 +26,7 @@ _LOST_FRAMES, _WRONG_SHARE, _JUDGED_AFTER = 20, 0.4, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class VisualSettings:
     """sigma_pixel: noise of u and of v.  velocity (m/s), turn (rad/s): impulses of the camera's motion in a frame, as
     standard deviations.  most: features in the filter at a time."""
 
@@ -50,7 +50,7 @@ class Tracked:
 class VisualFilter:
     """A filter and its features, which come from `front`."""
 
-    def __init__(self, front: Features, settings: Settings, start: Filter) -> None:
+    def __init__(self, front: Features, settings: VisualSettings, start: Filter) -> None:
         self._front, self._settings = front, settings
         self.filter = start
         self.tracked: list[Tracked] = []

@@ -16,7 +16,7 @@ from factorbus.proto.problems import BetterOptimum
 
 
 @dataclass(frozen=True, slots=True)
-class Stepped:
+class DriveStep:
     """One insert that is in: from `revision` on.  bus_ms: waited beyond the solver's time; None without a bus."""
 
     revision: int
@@ -60,15 +60,15 @@ class Compared:
 class Target(Protocol):
     """A map to drive into."""
 
-    def send(self, batch: Batch) -> list[Stepped]:
+    def send(self, batch: Batch) -> list[DriveStep]:
         """Insert `batch`; gives the inserts whose answers came since the last call, oldest first."""
         ...
 
-    def flush(self) -> list[Stepped]:
+    def flush(self) -> list[DriveStep]:
         """Wait until all inserts are answered and their estimate is here; gives those not given yet."""
         ...
 
-    def settle(self) -> Stepped:
+    def settle(self) -> DriveStep:
         """Iterate until converged."""
         ...
 
@@ -84,7 +84,7 @@ class Target(Protocol):
         """The same with the optimum itself, waited for."""
         ...
 
-    def adopt(self, found: Compared) -> Stepped:
+    def adopt(self, found: Compared) -> DriveStep:
         """Go to an optimum, and settle there."""
         ...
 
@@ -114,7 +114,7 @@ class Driven:
     poses: int = 0
     landmarks: int = 0
     factors: int = 0
-    steps: list[Stepped] = field(default_factory=list)
+    steps: list[DriveStep] = field(default_factory=list)
 
     def add(self, batch: Batch) -> None:
         """Count `batch`."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.cli.driving.drive import Compared, Stepped
+from factorbus.cli.driving.drive import Compared, DriveStep
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
@@ -23,17 +23,17 @@ class LocalMap:
         self._cpu_s = 0.0
         self._compared: list[Compared] = []
 
-    def send(self, batch: Batch) -> list[Stepped]:
+    def send(self, batch: Batch) -> list[DriveStep]:
         """Stage and step.  Raises SolverError."""
         start = time.thread_time()
         self._solver.stage(batch)
         return [self._step(start, settle=False)]
 
-    def flush(self) -> list[Stepped]:
+    def flush(self) -> list[DriveStep]:
         """Nothing is ever out."""
         return []
 
-    def settle(self) -> Stepped:
+    def settle(self) -> DriveStep:
         """Iterate until converged."""
         return self._step(time.thread_time(), settle=True)
 
@@ -53,14 +53,14 @@ class LocalMap:
         values = _variables(batch.values)
         return Compared(self._revision, chi2, batch.chi2, "in-process", seconds, batch.start, values, batch.converged)
 
-    def adopt(self, found: Compared) -> Stepped:
+    def adopt(self, found: Compared) -> DriveStep:
         """Go to an optimum, and settle there."""
         start = time.thread_time()
         changes = [Change("place", keys=g.keys, kind=g.kind, values=g.values, carry=True) for g in found.variables]
         self._solver, _, report, counted = self._solver.with_changes(changes, settle=True)
         self._cpu_s += time.thread_time() - start
         self._revision += 1
-        return Stepped(self._revision, report.as_dict() | counted, None)
+        return DriveStep(self._revision, report.as_dict() | counted, None)
 
     def compared(self) -> list[Compared]:
         """All comparisons."""
@@ -82,11 +82,11 @@ class LocalMap:
         """CPU seconds of this thread in the solver, seconds of compiling."""
         return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compiled_seconds(), "deltas": None}
 
-    def _step(self, start: float, settle: bool) -> Stepped:
+    def _step(self, start: float, settle: bool) -> DriveStep:
         report = self._solver.step(settle=settle).as_dict()
         self._cpu_s += time.thread_time() - start
         self._revision += 1
-        return Stepped(self._revision, report, None)
+        return DriveStep(self._revision, report, None)
 
 
 def chi2_unsolved(batches: Iterable[Batch]) -> float:

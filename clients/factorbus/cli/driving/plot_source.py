@@ -38,11 +38,11 @@ def graph_of(
     """The graph of a file, or, with an endpoint, of the map of that name.  Raises Stopped, FormatError, Problem."""
     if connect is not None:
         return _from_bus(source, connect, zenoh)
-    file = file_of(source, dialect, strict)
+    file = file_named(source, dialect, strict)
     return Drawn(Path(file.path).stem, file.whole(), f"values as in {Path(file.path).name}")
 
 
-def file_of(source: str, dialect: str | None = None, strict: bool = False) -> "GraphFile":
+def file_named(source: str, dialect: str | None = None, strict: bool = False) -> "GraphFile":
     """The file of that name, or the data set; says what was left out.  Raises Stopped, FormatError."""
     from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.process.reading import read_graph

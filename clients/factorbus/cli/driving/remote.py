@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
 
-from factorbus.cli.driving.drive import Compared, Stepped
+from factorbus.cli.driving.drive import Compared, DriveStep
 from factorbus.client import Changes, Map, Ticket
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
 
@@ -30,7 +30,7 @@ class RemoteMap:
         self._forget = self._mirror.on_delta(self._on_delta)
         self._comparisons: list[Future[Chi2]] = []
 
-    def send(self, batch: Batch) -> list[Stepped]:
+    def send(self, batch: Batch) -> list[DriveStep]:
         """Insert, waiting with a window of 1; otherwise with up to `window` inserts out."""
         if self._window == 1:
             start = time.perf_counter()
@@ -40,14 +40,14 @@ class RemoteMap:
         self._out.append(self._map.send(batch, timeout_s=_ANSWER_S))
         return self._collect(wait=False)
 
-    def flush(self) -> list[Stepped]:
+    def flush(self) -> list[DriveStep]:
         """Until all are answered and mirrored."""
         steps = self._collect(wait=True)
         if steps:
             self.wait_for(steps[-1].revision)
         return steps
 
-    def settle(self) -> Stepped:
+    def settle(self) -> DriveStep:
         """Iterate until converged."""
         start = time.perf_counter()
         accepted = self._map.settle(timeout_s=_ANSWER_S)
@@ -71,7 +71,7 @@ class RemoteMap:
         """The batch optimum of the present revision, waited for."""
         return _compared(self._map.ask.chi2(True, _ANSWER_S, values=True).result(_ANSWER_S))
 
-    def adopt(self, found: Compared) -> Stepped:
+    def adopt(self, found: Compared) -> DriveStep:
         """Go to an optimum, and settle there."""
         start = time.perf_counter()
         changes = Changes().place(found.variables, carry=True)
@@ -135,7 +135,7 @@ class RemoteMap:
             self._news = True
             self._changed.notify_all()
 
-    def _collect(self, wait: bool) -> list[Stepped]:
+    def _collect(self, wait: bool) -> list[DriveStep]:
         steps = []
         while self._out and (wait or self._out[0].done()):
             ticket = self._out.popleft()
@@ -144,8 +144,8 @@ class RemoteMap:
         return steps
 
 
-def _stepped(accepted: Accepted, seconds: float) -> Stepped:
-    return Stepped(accepted.revision, accepted.report, seconds * 1e3 - accepted.report["solver_ms"])
+def _stepped(accepted: Accepted, seconds: float) -> DriveStep:
+    return DriveStep(accepted.revision, accepted.report, seconds * 1e3 - accepted.report["solver_ms"])
 
 
 def _compared(answer: Chi2) -> Compared:

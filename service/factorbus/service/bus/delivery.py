@@ -14,10 +14,10 @@ from typing import Any
 
 from factorbus.proto import codec
 from factorbus.proto.problems import Busy, Internal, Problem
-from factorbus.service.bus.zenoh_session import Place, refuse, reply
+from factorbus.service.bus.zenoh_session import MapPlace, refuse, reply
 from factorbus.service.core.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
 from factorbus.service.maps.serial_executor import Lane, Lanes
-from factorbus.service.questions.answers import Question, Snapshot, answer, check_ready, is_computed
+from factorbus.service.questions.answers import Question, QuestionCopies, answer, check_ready, is_computed
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -38,14 +38,14 @@ class Delivery:
         self,
         most: int,
         about: Callable[[], dict[str, Any]],
-        batch: Callable[[Asker, Question, Snapshot], None],
-        copied: Callable[[Asker, Question, Snapshot], None],
+        batch: Callable[[Asker, Question, QuestionCopies], None],
+        copied: Callable[[Asker, Question, QuestionCopies], None],
     ) -> None:
         self.outbox, self.refusals, self._answers = Lane("outbox"), Lane("refusals"), Lanes("answers", _ANSWERERS)
         self._computed, self._most = Lanes("computed", _COMPUTERS), most
         self._about, self._batch, self._copied = about, batch, copied
 
-    def of_map(self, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
+    def of_map(self, place: MapPlace, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
         """For a map at `place`; `tell` adds to its stats, `drained` hears that nothing waits any more."""
         return MapDelivery(self, place, tell, drained)
 
@@ -75,7 +75,7 @@ class Delivery:
         """Answer with `content` and what the service adds."""
         self._answers.hand(lambda: reply(asker, codec.encode_map({**content, **self._about()})))
 
-    def read(self, place: Place, read: Read, taken: Snapshot) -> None:
+    def read(self, place: MapPlace, read: Read, taken: QuestionCopies) -> None:
         """Answer `read` from `taken`."""
         if not is_computed(read.question, taken):
             self._answers.hand(self._read, place, read, taken)
@@ -84,7 +84,7 @@ class Delivery:
         else:
             self.refusals.hand(refuse, read.asker, Busy(waiting, _RETRY_S))
 
-    def _read(self, place: Place, read: Read, taken: Snapshot) -> None:
+    def _read(self, place: MapPlace, read: Read, taken: QuestionCopies) -> None:
         try:
             check_ready(read.question, taken)
             if read.question.name == "keyframe":
@@ -109,7 +109,7 @@ class MapDelivery:
     """The same for one map: what its host calls.  Returns at once, except `send` where nothing goes before."""
 
     def __init__(
-        self, all_: Delivery, place: Place, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]
+        self, all_: Delivery, place: MapPlace, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]
     ) -> None:
         self._all, self._place, self._tell, self._drained = all_, place, tell, drained
 
@@ -149,13 +149,13 @@ class MapDelivery:
         """What was written in one piece is small enough to be sent at once."""
         self._all.outbox.hand_or_do(_send_both, self._place, asker, message, delta)
 
-    def answer_reads(self, reads: Sequence[Read], taken: Snapshot) -> None:
+    def answer_reads(self, reads: Sequence[Read], taken: QuestionCopies) -> None:
         """Answer `reads` from `taken`, elsewhere."""
         for read in reads:
             self._all.read(self._place, read, taken)
 
 
-def _send(place: Place, effects: list[Effect]) -> None:
+def _send(place: MapPlace, effects: list[Effect]) -> None:
     """On the outbox, or on the thread that made the step."""
     for effect in effects:
         if isinstance(effect, Answer):
@@ -164,6 +164,6 @@ def _send(place: Place, effects: list[Effect]) -> None:
             place.publish(effect.channel, effect.message)
 
 
-def _send_both(place: Place, asker: Asker, message: bytes, delta: bytes) -> None:
+def _send_both(place: MapPlace, asker: Asker, message: bytes, delta: bytes) -> None:
     reply(asker, message)
     place.publish("delta", delta)

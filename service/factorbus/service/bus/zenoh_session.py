@@ -37,7 +37,7 @@ _PRIORITY = {
 }
 
 
-def open_bus(config: Config) -> "Bus":
+def open_service_bus(config: Config) -> "ServiceBus":
     """The bus as `config` describes it.  Raises BadConfig; Exposed and UnsafeKeys are such.  Raises PortTaken,
     CannotListen.
     """
@@ -59,7 +59,7 @@ def open_bus(config: Config) -> "Bus":
         if config.mode != "client":
             refuse_exposed(config.listen, setting)
     try:
-        return Bus(zenoh.open(settings))
+        return ServiceBus(zenoh.open(settings))
     except zenoh.ZError as error:
         if config.mode != "client":
             check_endpoints(config.listen)
@@ -69,7 +69,7 @@ def open_bus(config: Config) -> "Bus":
         ) from None
 
 
-class Bus:
+class ServiceBus:
     """The service's session and what it has declared."""
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -114,9 +114,9 @@ class Bus:
         """The liveliness tokens there are on `tokens`."""
         return [str(r.ok.key_expr) for r in self._session.liveliness().get(tokens, timeout=2.0) if r.ok is not None]
 
-    def place(self, name: str, service: str) -> "Place":
+    def place(self, name: str, service: str) -> "MapPlace":
         """Where map `name` publishes and is announced."""
-        return Place(self._session, name, service)
+        return MapPlace(self._session, name, service)
 
     def send_job(self, worker: str, job: Job, deadline_s: float, done: Callable[[Any], None]) -> None:
         """Send `job`; `done` gets a JobDone or a problem: the first reply or, without any, silence at the end."""
@@ -146,7 +146,7 @@ class Bus:
         self._session.close()
 
 
-class Place:
+class MapPlace:
     """One map's publications, and its token."""
 
     def __init__(self, session: zenoh.Session, name: str, service: str) -> None:

@@ -89,9 +89,7 @@ class Stepped(NamedTuple):
 
     converged, unfinished: if not, or if so, further steps are to follow when no insert does.  changed: how many
     variables; damping: what the next step would begin with.  further: without an insert, because the map was not at its
-    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.  reordered: another
-    solver took its place, which was made of what there was after this fold, in a fresh order, and has been given all
-    since.
+    optimum.  rebuilt: it brought back what had been accepted, in a new solver, after a fault.
     """
 
     revision: int
@@ -100,7 +98,6 @@ class Stepped(NamedTuple):
     chi2: float
     solver_ms: float
     rebuilt: bool = False
-    reordered: int | None = None
     converged: bool = True
     changed: int = 0
     damping: float = 0.0

@@ -17,7 +17,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
-from factorbus.service.core.account import Account, Done
+from factorbus.service.core.account import Account, InsertDone
 from factorbus.service.core.admission import Admission
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
@@ -50,7 +50,11 @@ _ROUND_TRIP_S = 0.0002
 
 
 class Restored(NamedTuple):
-    """How a map is that was here before."""
+    """How a map is that was here before.
+
+    differs: why its journal, run again, may give other bits; empty: as far as is known it gives the same; None: it has
+    none.
+    """
 
     revision: int
     variables: int
@@ -58,6 +62,7 @@ class Restored(NamedTuple):
     chi2: float
     converged: bool = True
     unfinished: bool = False
+    differs: str | None = None
 
 
 class MapCore:
@@ -66,12 +71,13 @@ class MapCore:
     def __init__(self, name: str, mode: str, epoch: int, limits: Limits, now: float) -> None:
         self.name, self.mode, self.epoch = name, mode, epoch
         self.revision = self.variables = self.factors = 0
+        self.differs: str | None = None  # as `Restored` has it
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
         self._reads = Reads()
         self._running: Run | None = None
         self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
-        self._must_reload = self._must_tidy = False
+        self._must_reload = False
         self._started = self._ended = 0.0
         self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
         self._closing: Problem | None = None
@@ -94,7 +100,13 @@ class MapCore:
             "state": "blocked" if self._admission.blocked else "open",
             "converged": self._converging.converged,
             "converging": self._converging.converging,
+            **self._reproducible(),
         }
+
+    def _reproducible(self) -> dict[str, Any]:
+        if self.differs is None:
+            return {}
+        return {"reproducible": False, "reason": self.differs} if self.differs else {"reproducible": True}
 
     def created(self) -> list[Effect]:
         """The map is on the bus: new, or as it was before."""
@@ -160,7 +172,7 @@ class MapCore:
         self._unjudged -= 1
         self._unjudged_bytes -= insert.size
         seconds = alone.now - insert.now
-        self._account.note(Done(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
+        self._account.note(InsertDone(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
         self._moved_on(alone.revision, size)
         self._converging.moved_on(alone.converged, alone.unfinished, alone.chi2)
         self._moved_at = alone.revision
@@ -202,7 +214,7 @@ class MapCore:
             self._admission.restore(name, following, answered, self._created)
         self.revision, self.variables, self.factors, self._account.chi2 = restored[:4]
         self._converging.moved_on(restored.converged, restored.unfinished, restored.chi2)
-        self._moved_at = restored.revision
+        self._moved_at, self.differs = restored.revision, restored.differs
 
     def stepped(self, stepped: Stepped) -> list[Effect]:
         """The solver made a step."""
@@ -261,11 +273,6 @@ class MapCore:
         self._converging.look(now)
         return self._go_on(self._admission.expire(now), now)
 
-    def tidy(self, now: float) -> list[Effect]:
-        """Something waits for the end of a Run: where there is none, one with nothing in it, if it can be kept."""
-        self._must_tidy = self._running is None and self._closing is None and not self._admission.blocked
-        return self._go_on([], now)
-
     def stop(self, now: float) -> list[Effect]:
         """Take nothing new; Drained comes when everything accepted is answered."""
         self._closing = ShuttingDown()
@@ -321,13 +328,13 @@ class MapCore:
         limits = self._limits
         room = self._has_room()
         further = self._may_go_on(now)
-        if self._reads or self._must_reload or self._must_tidy or (self._admission.ready and room) or further:
+        if self._reads or self._must_reload or (self._admission.ready and room) or further:
             reads, inserts = self._reads.take(), self._admission.take(limits.fold) if room else ()
             short = self._is_short(reads, inserts, now)
             self._running = Run(reads, inserts, short, self._must_reload, further)
             if inserts or further:
                 self._converging.began(further)
-            self._must_reload = self._must_tidy = False
+            self._must_reload = False
             self._unjudged += len(inserts)
             self._unjudged_bytes += sum([insert.size for insert in inserts])
             self._started = now

@@ -56,7 +56,7 @@ class _Cutting:
     rates: Rates
 
 
-class Features:
+class FeatureQuestions:
     """The questions for features of one service.  Thread-safe: what is called from outside only hands over."""
 
     def __init__(

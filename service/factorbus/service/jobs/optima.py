@@ -10,7 +10,7 @@ from factorbus.proto.problems import BetterOptimum, Busy, Problem
 from factorbus.service.core.events import Asker
 from factorbus.service.jobs.dispatch import Ended
 from factorbus.service.jobs.running import Jobs
-from factorbus.service.questions.answers import Question, Snapshot
+from factorbus.service.questions.answers import Question, QuestionCopies
 
 
 @dataclass(slots=True)
@@ -24,7 +24,7 @@ class Optima:
     most: int
     open: int = 0
 
-    def batch(self, asker: Asker, question: Question, taken: Snapshot) -> None:
+    def batch(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
         """Answer `question` with χ² and the batch optimum of the snapshot's graph."""
         if self.open >= self.most:
             self.refuse(asker, Busy(self.open, 1.0))
@@ -37,7 +37,7 @@ class Optima:
 
         self.jobs.submit("batch", codec.encode_graph(taken.graph), ended, self.deadline_s, question.timeout_s)
 
-    def _answer(self, asker: Asker, question: Question, taken: Snapshot, job: Ended) -> None:
+    def _answer(self, asker: Asker, question: Question, taken: QuestionCopies, job: Ended) -> None:
         result = job.result
         if not isinstance(result, JobDone):
             self.refuse(asker, result)

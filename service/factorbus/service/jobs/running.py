@@ -11,12 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from factorbus.proto.messages import Job, JobDone
-from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable
-from factorbus.service.jobs import inplace
+from factorbus.proto import codec
+from factorbus.proto.messages import Job, JobDone, Optimum
+from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable, UnknownKind
 from factorbus.service.jobs.dispatch import Dispatch, Distrusted, Effect, Ended, InPlace, Send
 from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, is_quick, judged
 from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.questions.answers import as_variables
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -196,10 +197,37 @@ class Jobs:
 def do_here(job: Job) -> JobDone | Any:
     """What comes of `job` when the service does it itself: a JobDone or a problem."""
     try:
-        return inplace.do(job)
+        return do_in_place(job)
     except (Problem, SolverError) as problem:
         return problem
     except Exception:
         reference = secrets.token_hex(4)
         log.exception("fault %s: job %s (%s) in place", reference, job.job, job.kind)
         return Internal(reference)
+
+
+def do_in_place(job: Job) -> JobDone:
+    """What a worker would answer to `job`, bit for bit.  Raises Problem, SolverError."""
+    if job.kind not in _DO:
+        raise UnknownKind("job.kind", job.kind, tuple(_DO))
+    started = time.perf_counter()
+    return JobDone(job.job, job.kind, _DO[job.kind](job.payload), time.perf_counter() - started)
+
+
+def _batch(payload: bytes) -> bytes:
+    from factorbus.solver import solve_batch
+
+    graph = codec.decode_graph(payload)
+    result = solve_batch(graph.batch.variables, graph.batch.factors)
+    values = as_variables(result.values)
+    optimum = Optimum(result.chi2, result.iterations, values, result.start, result.converged)
+    return codec.encode_optimum(optimum)
+
+
+def _idp(payload: bytes) -> bytes:
+    from factorbus.idp import job as idp_job
+
+    return idp_job.do(payload)
+
+
+_DO = {"batch": _batch, "idp": _idp}

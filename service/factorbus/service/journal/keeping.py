@@ -26,6 +26,8 @@ from factorbus.journal.store import Last, Saved, Store, open_store
 from factorbus.service.core.events import Arrived, Judged, Stepped
 from factorbus.service.journal.writing import written
 from factorbus.service.solving.apply import Folder
+from factorbus.solver.build import present_build
+from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
 
@@ -81,12 +83,15 @@ class _Reloaded:
     """The solver is where the journal is."""
 
 
-class _Snapshot:
-    """When the solver's state is to be written next, and the thread that does."""
+class SnapshotPlan:
+    """When the solver's state is to be written next, and the thread that does.
 
-    def __init__(self, every_s: float) -> None:
-        self.every_s = every_s
-        self.steps_s = self.copying_s = 0.0
+    every_s: of steps.  steps_s: of those that a restart would make again already.  differs: what is noted beside each,
+    see `Saved`.
+    """
+
+    def __init__(self, every_s: float, steps_s: float = 0.0, differs: str = "") -> None:
+        self.every_s, self.differs, self.steps_s, self.copying_s = every_s, differs, steps_s, 0.0
         self.thread: threading.Thread | None = None
         self.fold = 0
 
@@ -112,18 +117,18 @@ class Keeper:
     """One map's journal.  `hand` to `snapshot`: on the solver's thread only."""
 
     def __init__(
-        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot_s: float,
-        fingerprint: str, begin: Callable[[Store], None] = lambda _: None,
+        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot: "SnapshotPlan",
+        begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._listener = store, listener
         self._folder, self._durability = store.path.parent, durability
         self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
-        self._fingerprint, self._begin, self._begun = fingerprint, begin, False
+        self._begin, self._begun = begin, False
         self._last, self._number = last, last.fold
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._problem: JournalFailed | None = None
-        self._snapshot = _Snapshot(snapshot_s)
+        self._snapshot = snapshot
         self._life = 0  # counts how often the solver went back to where the journal ends
         self._commits, self._commit_s, self._longest_s, self._inserts = 0, 0.0, 0.0, 0
         self._thread = threading.Thread(target=self._run, name=f"journal {self._folder.name}", daemon=True)
@@ -143,7 +148,7 @@ class Keeper:
 
     def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False) -> None:
         """Write down that `inserts` were folded, and what came of it; of none, a `further` step, which may have been
-        refused, or another solver."""
+        refused."""
         if inserts or events or further:
             self._number += 1
             self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
@@ -377,7 +382,7 @@ class Keeper:
             log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
             return
         log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
-        self._items.put(_Noted(Saved(fold, self._fingerprint, size), life))
+        self._items.put(_Noted(Saved(fold, FORMAT, present_build(), self._snapshot.differs, size), life))
 
     def _note(self, noted: _Noted) -> None:
         """A snapshot counts once it is noted; one of folds that did not happen must not."""

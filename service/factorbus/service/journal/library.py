@@ -1,28 +1,31 @@
 """The folder of a service's journals: which maps are there, made, opened, and brought to where they were."""
 
 import logging
+import math
 import secrets
 import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
-from factorbus.journal.records import Epoch, Header
+from factorbus.journal.records import Epoch, Header, Maker
 from factorbus.journal.snapshots import remove_strangers
-from factorbus.journal.store import NAME, Last, Store, create, open_store
+from factorbus.journal.store import NAME, Last, Saved, Store, create, open_store
 from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
 from factorbus.service.core.map_state import MapCore, Restored
-from factorbus.service.journal.keeping import Keeper, Listener
+from factorbus.service.journal.keeping import Keeper, Listener, SnapshotPlan
 from factorbus.service.journal.recovery import Recovered, answers, recover
 from factorbus.service.solving.apply import Folder
+from factorbus.solver.build import present_build
+from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
 
@@ -43,15 +46,23 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
-def restored(folder: Folder) -> Restored:
-    """How the map in `folder` is."""
+def restored(folder: Folder, differs: str | None = None) -> Restored:
+    """How the map in `folder` is.  differs: as `Restored` has it."""
     chi2 = folder.chi2() if folder.revision else 0.0
-    return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished)
+    return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished, differs)
 
 
 def log_owner(owner: str) -> None:
     """Say who is waited for."""
     log.info("standing by: the journal belongs to %s", owner or "a service that has not said who it is")
+
+
+class CopiedAt(NamedTuple):
+    """The state of a map after a fold.  differs: why its journal may give other bits when it is run again."""
+
+    fold: int
+    state: Mapping[str, Any]
+    differs: str
 
 
 class Library:
@@ -87,7 +98,7 @@ class Library:
         where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
         folder = make_folder(mode, {}, epoch, limits)
         store = create(where, name, mode, folder.options(), epoch, self._config.durability)
-        return Kept(store, store.header(), folder, Recovered(store.last(), True, 0, 0), self._config)
+        return Kept(store, store.header(), folder, Recovered(store.last()), self._config)
 
     def open(self, name: str, limits: Limits) -> "Kept":
         """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
@@ -106,19 +117,18 @@ class Library:
             log.exception("%s: a fault while it was opened", path)
             raise JournalDamaged(path, f"opening it ends in {type(fault).__name__} ({fault})") from fault
 
-    def fork(self, source: str, target: str, fold: int, state: Mapping[str, Any], limits: Limits) -> "Kept":
-        """A new map `target` with a journal, which is in `state` as `source` was after `fold`.  Raises Problem."""
-        from factorbus.solver import fingerprint
-
+    def fork(self, source: str, target: str, copied: CopiedAt, limits: Limits) -> "Kept":
+        """A new map `target` with a journal, which is as `source` was when it was copied.  Raises Problem."""
+        fold, state = copied.fold, copied.state
         where, config, because = self._owned.folder, self._config, f"forked from {source} after fold {fold}"
         epoch = Epoch(secrets.randbits(62) | 1, fold + 1, because)
-        fork_journal(where / source, where / target, fold, epoch, state, fingerprint())
+        fork_journal(where / source, where / target, epoch, state, Saved(fold, FORMAT, present_build(), copied.differs))
         store = open_store(where / target, config.durability)
         try:
             header = store.header()
             folder = make_folder(header.mode, header.options, header.epoch, limits)
             folder.load(state)
-            return Kept(store, header, folder, Recovered(store.last(), True, fold, 0), config)
+            return Kept(store, header, folder, Recovered(store.last(), fold, differs=copied.differs), config)
         except BaseException:
             store.close()
             self.remove(target)
@@ -163,26 +173,30 @@ class Kept:
         senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
         core.restore(
             [(sender.client, sender.next, answers(sender)) for sender in senders],
-            restored(self.folder),
+            restored(self.folder, self.recovered.differs),
         )
 
     def keeper(self, listener: Listener) -> Keeper:
         """As `keeping.Keeping`."""
-        from factorbus.solver import fingerprint
-
-        config = self._config
+        config, recovered = self._config, self.recovered
+        # One that has other bits than those before is written as soon as may be: until then they cannot be had again.
+        replayed_s = recovered.solver_s if recovered.same else math.inf
+        plan = SnapshotPlan(config.snapshot_s, replayed_s, recovered.differs)
         return Keeper(
-            self.store, self.recovered.last, listener, config.durability, config.group_s, config.snapshot_s,
-            fingerprint(), lambda store: store.begin(config.durability, self._epoch),
+            self.store, recovered.last, listener, config.durability, config.group_s, plan,
+            lambda store: store.begin(config.durability, self._epoch, self._new_maker(store)),
         )  # fmt: skip
+
+    def _new_maker(self, store: Store) -> Maker | None:
+        """Who makes the next fold, if it is not who made the last one."""
+        here, makers = Maker(self.recovered.last.fold + 1, present_build()), store.makers()
+        return None if makers and makers[-1].build == here.build else here
 
     def reload(self, folder: Folder) -> Last:
         """As `keeping.Keeping`."""
-        from factorbus.solver import fingerprint
-
         store = open_store(self.store.path.parent, read_only=True)
         try:
-            return recover(store, folder, fingerprint()).last
+            return recover(store, folder).last
         finally:
             store.close()
 
@@ -201,13 +215,11 @@ def open_library(config: Config, waiting: Callable[[str], None], stop: Any) -> L
 
 
 def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
-    from factorbus.solver import fingerprint
-
     started = time.perf_counter()
     store.check_form()
     header = store.header()
     folder = make_folder(header.mode, header.options, header.epoch, limits)
-    recovered = recover(store, folder, fingerprint())
+    recovered = recover(store, folder)
     if store.writable:
         remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
     epoch = None
@@ -218,6 +230,10 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
         "map %s is back at revision %d in %.2f s: snapshot %d and %d folds after it", header.map,
         recovered.last.revision, time.perf_counter() - started, recovered.from_fold, recovered.folds,
     )  # fmt: skip
+    if recovered.other_build:
+        log.warning("map %s was made by another build of the solver: %s", header.map, recovered.other_build)
+    if recovered.differs:
+        log.warning("map %s is not reproducible: %s", header.map, recovered.differs)
     return Kept(store, header, folder, recovered, config, epoch)
 
 

@@ -1,10 +1,12 @@
 """A map as its journal has it: from the newest good snapshot and what came after it, or from the very beginning.
 
-Folded again in the same groups by the same solver, the inserts give the same revisions to the bit; the chain of digests
-proves it.  A snapshot counts only for the solver that wrote it (`fingerprint`): another one begins at the beginning.
+Folded again in the same groups by the same build of the solver, the inserts give the same revisions to the bit; the
+journal's digests of every fold tell whether they do.  A further step, of a map that had not converged, is made again,
+too.
 
-A solver that was ordered anew beside the steps (`reordering.py`) is made again where it was, given the folds that it
-was given, and takes the place where it did.  A further step, of a map that had not converged, is made again, too.
+A snapshot counts in the format of a state that this version reads, whichever build wrote it: where another one rounds
+otherwise, the map has what it had up to there, and the rest, folded again, is as good as it was and has other bits.
+That is said, and is no reason to begin at the beginning.  See docs/decisions/state-format.md.
 """
 
 import logging
@@ -15,82 +17,89 @@ from factorbus.journal import chain
 from factorbus.journal.problems import JournalDiffers
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold, Sender
 from factorbus.journal.snapshots import file_of, read_snapshot
-from factorbus.journal.store import Last, Store
+from factorbus.journal.store import Last, Saved, Store
 from factorbus.proto import codec
-from factorbus.service.core.events import Arrived, Judged, Stepped
-from factorbus.service.core.insert_digest import digest_of
+from factorbus.service.core.events import Arrived, Judged
 from factorbus.service.solving.apply import Folder
-from factorbus.service.solving.arrival import read_again
+from factorbus.service.solving.arrival import message_digest, read_again
+from factorbus.solver.build import differences, present_build
+from factorbus.solver.errors import SolverError
+from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
 
 
 class Recovered(NamedTuple):
-    """Where a folder is now.  same: every value has the bits it had; from_fold: the snapshot it began with, or 0."""
+    """Where a folder is now.
+
+    from_fold: the snapshot it began with, or 0.  folds, solver_s: what was folded again, and what its steps took.
+    other_build: in what the build that made the map differs from this one; empty: in nothing.  same: no fold gave other
+    bits than it had.  differs: why the journal, run again from its first insert, may give other bits; empty: as far as
+    is known it gives the same.
+    """
 
     last: Last
-    same: bool
-    from_fold: int
-    folds: int
+    from_fold: int = 0
+    folds: int = 0
+    solver_s: float = 0.0
+    other_build: str = ""
+    same: bool = True
+    differs: str = ""
 
 
-def recover(store: Store, folder: Folder, fingerprint: str) -> Recovered:
+def recover(store: Store, folder: Folder) -> Recovered:
     """Bring `folder` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
-    begin = _from_snapshot(store, folder, fingerprint)
-    last, same, folds = begin, True, 0
-    history = _History(store, folder, begin.fold)
+    saved, whole = _from_snapshot(store, folder)
+    begin = store.at(saved.fold) if saved else Last(0, 0, chain.START)
+    history, (other, compared) = _History(store, folder), _other_builds(store, saved)
+    last, folds, differs_from = begin, 0, 0
     for fold in store.folds(begin.fold):
-        last = Last(fold.number, fold.revision, history.again(fold, last.chain))
-        if same and last.chain != fold.chain:
+        if history.again(fold, last.chain, bool(other)) != fold.chain and not differs_from:
             log.warning("%s: from revision %d on, values have other bits than they had", store.path, fold.revision)
-            same = False
-        folds += 1
-    return Recovered(last, same, begin.fold, folds)
+            differs_from = fold.revision
+        last, folds = Last(fold.number, fold.revision, fold.chain), folds + 1
+    differs = _why_it_differs(saved, other, compared, differs_from)
+    if not whole:
+        differs = f"R was computed anew: snapshot {begin.fold} has it for vectors of another width ({other})"
+    return Recovered(last, begin.fold, folds, history.solver_s, other, whole and not differs_from, differs)
 
 
 def verify(store: Store, folder: Folder) -> Iterator[tuple[Fold, bool]]:
-    """Fold everything again from the beginning; gives each fold and whether all bits up to there are the same.
+    """Fold everything again from the beginning; gives each fold, and whether it gave the same bits.
 
     Raises JournalDamaged, JournalDiffers.
     """
     folder.load(None)
-    present, history = chain.START, _History(store, folder, 0)
+    last, history, other = chain.START, _History(store, folder), bool(_other_builds(store, None)[0])
     for fold in store.folds():
-        present = history.again(fold, present)
-        yield fold, present == fold.chain
+        yield fold, history.again(fold, last, other) == fold.chain
+        last = fold.chain
 
 
 class _History:
     """What happened to a map, once more, to `folder`."""
 
-    def __init__(self, store: Store, folder: Folder, begin: int) -> None:
-        """begin: the fold that `folder` is at."""
+    def __init__(self, store: Store, folder: Folder) -> None:
         self._store, self._folder = store, folder
-        self._reordered = store.reordered(begin)
-        self._beside: Folder | None = None
+        self.solver_s = 0.0
 
-    def again(self, fold: Fold, present: bytes) -> bytes:
-        """Fold `fold` in again; gives the chain of digests after it.  Raises JournalDiffers."""
+    def again(self, fold: Fold, before: bytes, other: bool) -> bytes:
+        """Fold `fold` in again; gives the chain of digests after it.  Raises JournalDiffers.
+
+        before: the chain as the journal has it, so that one fold with other bits does not hide whether the next ones
+        have the same.  other: another build made the map, which a threshold may have taken another way: where
+        that cost a step more or less, revisions are counted as the journal has them.
+        """
         store, folder = self._store, self._folder
-        if fold.reordered is not None:
-            present = chain.follow(present, self._reorder(fold, fold.reordered).delta)
-        else:
-            present = self._fold(fold, present)
+        present = self._fold(fold, before)
         if folder.revision != fold.revision:
-            raise JournalDiffers(
-                store.path, f"fold {fold.number} led to revision {fold.revision}, and leads to {folder.revision}"
-            )
-        if fold.number in self._reordered:
-            self._beside = folder.beside(folder.content())
+            tried = fold.further or fold.rebuilt or any(entry.outcome != UNTRIED for entry in fold.entries)
+            if not (other and tried):
+                raise JournalDiffers(
+                    store.path, f"fold {fold.number} led to revision {fold.revision}, and leads to {folder.revision}"
+                )
+            folder.count_from(fold.revision)
         return present
-
-    def _reorder(self, fold: Fold, after: int) -> Stepped:
-        if self._beside is None:
-            raise JournalDiffers(
-                self._store.path, f"fold {fold.number} was by a solver of fold {after}, which was not made again"
-            )
-        other, self._beside = self._beside, None
-        return self._folder.take_place(other, after, "replayed")
 
     def _fold(self, fold: Fold, present: bytes) -> bytes:
         inserts = [_arrived(entry) for entry in fold.entries if entry.outcome != UNTRIED]
@@ -104,15 +113,13 @@ class _History:
                         log.debug("refused again: %s", outcome.answer)
             else:
                 present = chain.follow(present, event.delta)
+                self.solver_s += event.solver_ms * 1e-3
         for entry in fold.entries:
             if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
                 was, now = ("accepted", "refused") if entry.outcome == ACCEPTED else ("refused", "accepted")
                 raise JournalDiffers(
                     self._store.path, f"insert {entry.sequence} of client {entry.client} was {was}, and is {now}"
                 )
-        if self._beside is not None:
-            for _ in self._beside.fold_again(inserts, further=fold.further):
-                pass
         return present
 
 
@@ -120,27 +127,48 @@ def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:
     """What a client was answered: (sequence, digest, answer), to the byte."""
     for entry in sender.entries:
         accepted = entry.outcome == ACCEPTED
-        yield entry.sequence, digest_of(entry.message), entry.answer if accepted else codec.decode_problem(entry.answer)
+        answer = entry.answer if accepted else codec.decode_problem(entry.answer)
+        yield entry.sequence, message_digest(entry.message), answer
 
 
-def _from_snapshot(store: Store, folder: Folder, fingerprint: str) -> Last:
-    """Begin with the newest snapshot that can be used, or with nothing."""
-    reordered = store.reordered()
+def _from_snapshot(store: Store, folder: Folder) -> tuple[Saved | None, bool]:
+    """Begin with the newest snapshot that can be used, or with nothing; and whether `folder` has it to the bit."""
     for saved in store.snapshots():
         path = file_of(store.path.parent, saved.fold)
-        if any(made <= saved.fold < took for made, took in reordered.items()):
-            continue  # the other solver cannot be made again from it
-        if saved.fingerprint != fingerprint:
-            log.info("%s is of another solver or machine: not used", path)
+        if saved.format != FORMAT:
+            log.warning("%s has a state of format %d, this version reads %d: not used", path, saved.format, FORMAT)
             continue
         try:
-            folder.load(read_snapshot(path))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            return saved, folder.load(read_snapshot(path))
+        except (OSError, ValueError, KeyError, TypeError, SolverError) as error:
             log.warning("%s cannot be used: %s", path, error)
-            continue
-        return store.at(saved.fold)
-    folder.load(None)
-    return Last(0, 0, chain.START)
+    return None, folder.load(None)
+
+
+def _other_builds(store: Store, saved: Saved | None) -> tuple[str, int]:
+    """In what another build differs that made the snapshot or a fold after it, and how many folds such a one made."""
+    here, begin, makers = present_build(), saved.fold if saved else 0, store.makers()
+    found, count = differences(saved.build, here) if saved else "", 0
+    ends = [*(maker.fold for maker in makers[1:]), store.last().fold + 1]
+    for maker, end in zip(makers, ends, strict=True) if makers else ():
+        folds, other = end - max(maker.fold, begin + 1), differences(maker.build, here)
+        if folds > 0 and other:
+            found, count = found or other, count + folds
+    return found, count
+
+
+def _why_it_differs(saved: Saved | None, other: str, compared: int, differs_from: int) -> str:
+    """compared: folds of another build that were folded again."""
+    if differs_from:
+        why = f"another build made them ({other})" if other else "the same build made them"
+        return f"from revision {differs_from} on, values have other bits than they had: {why}"
+    if saved is None:
+        return ""
+    of_snapshot = differences(saved.build, present_build())
+    if not saved.differs and of_snapshot and not compared:
+        none = "no fold of it follows that could be compared"
+        return f"another build wrote the snapshot of fold {saved.fold} ({of_snapshot}), and {none}"
+    return saved.differs
 
 
 def _arrived(entry: Entry) -> Arrived:

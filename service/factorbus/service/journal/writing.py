@@ -15,7 +15,7 @@ def written(
     number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last, further: bool = False
 ) -> Fold:
     """What is written down of a Run.  further: it was for a further step, which may have been refused."""
-    present, revision, rebuilt, reordered = last.chain, last.revision, False, None
+    present, revision, rebuilt = last.chain, last.revision, False
     outcomes: dict[int, tuple[Outcome, Judged]] = {}
     for event in events:
         if isinstance(event, Judged):
@@ -23,9 +23,9 @@ def written(
             revision = max(revision, event.revision)
         else:
             present, revision = chain.follow(present, event.delta), event.revision
-            rebuilt, reordered = rebuilt or event.rebuilt, event.reordered
+            rebuilt = rebuilt or event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
-    return Fold(number, revision, rebuilt, present, entries, reordered, further and not rebuilt)
+    return Fold(number, revision, rebuilt, present, entries, further and not rebuilt)
 
 
 def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:

@@ -39,8 +39,7 @@ from factorbus.service.core.events import (
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.keeping import Events, Keeper, Keeping
 from factorbus.service.process.health import Pulse
-from factorbus.service.questions.answers import Snapshot
-from factorbus.service.reordering import Reordering
+from factorbus.service.questions.answers import QuestionCopies
 from factorbus.service.solving.apply import Folder
 from factorbus.solver.errors import SolverError
 
@@ -49,7 +48,7 @@ log = logging.getLogger(__name__)
 # What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
 Perform: TypeAlias = Callable[[list[Effect]], None]
 SendBoth: TypeAlias = Callable[[Asker, bytes, bytes], None]
-AnswerReads: TypeAlias = Callable[[Sequence[Read], Snapshot], None]
+AnswerReads: TypeAlias = Callable[[Sequence[Read], QuestionCopies], None]
 
 
 class Host:
@@ -69,10 +68,8 @@ class Host:
         seat: threading.Lock,
         send_both: SendBoth,
         keeping: Keeping | None = None,
-        reordering: Reordering | None = None,
     ) -> None:
         self.core = core
-        self._reordering = reordering
         self._keeper = keeping.keeper(self) if keeping else None
         self._keeping = keeping
         self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
@@ -125,8 +122,6 @@ class Host:
         """Time went by."""
         with self._lock:
             effects = self.core.tick(time.monotonic())
-            if self._reordering is not None and self._reordering.waits:
-                effects += self.core.tidy(time.monotonic())
         self._perform(effects)
 
     def account(self) -> dict[str, Any]:
@@ -226,14 +221,13 @@ class Host:
                 self._read(run.reads)
             events = self._folder.fold_run(run.inserts, run.further)
             if not isinstance(events, Alone):
-                self._tell(run, events, tell)
+                self._tell(events, tell)
                 return
             answered = events.insert.askers[0]
             if tell is self._send:
                 self._send_both(answered, events.answer, events.delta)
             else:
                 tell([Answer(answered, events.answer), Publish("delta", events.delta)])
-            self._tidy(run, ())
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:
@@ -245,18 +239,15 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _tell(self, run: Run, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
+    def _tell(self, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
         """What comes of a Run, step by step."""
         effects: list[Effect] = []
-        came: list[Judged | Stepped] = []
         for event in events:
             if isinstance(event, Folded):
-                self._tidy(run, came)
                 with self._lock:
                     effects += self.core.folded(event)
                 self._perform(effects)
                 return
-            came.append(event)
             with self._lock:
                 if isinstance(event, Judged):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
@@ -280,33 +271,12 @@ class Host:
                 effects = self.core.kept(events, time.monotonic())
             tell(effects)
         replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
-        replaced = self._tidy_kept(run, events, keeper) or replaced
-        busy = self._reordering is not None and self._reordering.busy
-        if replaced or ((run.inserts or run.further) and keeper.wants_snapshot() and not busy):
+        if replaced or ((run.inserts or run.further) and keeper.wants_snapshot()):
             started = time.perf_counter()
             keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
         with self._lock:
             effects = self.core.folded(folded)
         self._perform(effects)
-
-    def _tidy(self, run: Run, events: Sequence[Judged | Stepped]) -> None:
-        """What is done when a Run is told and the solver is not free yet."""
-        stepped = self._reordering.after(run, events, 0) if self._reordering is not None else None
-        if stepped is not None:
-            with self._lock:
-                effects = self.core.stepped(stepped)
-            self._do(effects)
-
-    def _tidy_kept(self, run: Run, events: Sequence[Judged | Stepped], keeper: Keeper) -> bool:
-        """The same with a journal; gives whether another solver took the place."""
-        stepped = self._reordering.after(run, events, keeper.folds) if self._reordering is not None else None
-        if stepped is not None:
-            keeper.hand((), [stepped])
-            if not keeper.waits:
-                with self._lock:
-                    effects = self.core.kept([stepped], time.monotonic())
-                self._do(effects)
-        return stepped is not None
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:
@@ -320,7 +290,7 @@ class Host:
         else:
             self._answer_after(reads, taken)
 
-    def _answer_after(self, reads: Sequence[Read], taken: Snapshot) -> None:
+    def _answer_after(self, reads: Sequence[Read], taken: QuestionCopies) -> None:
         """Nobody sees what a crash could take back, and a copy goes on from what is in the journal."""
         keeper = self._keeper
         if keeper is None:

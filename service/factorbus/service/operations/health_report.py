@@ -10,7 +10,7 @@ from factorbus.service.config import Config
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import Lane
 from factorbus.service.process.health import Health, Pulse, Signs
-from factorbus.service.process.memory import Memory
+from factorbus.service.process.memory import MemoryLimit
 
 # What others have to say in the account, by name: a function for each, called on any thread.
 Chapters = dict[str, Callable[[], Any]]
@@ -24,7 +24,7 @@ class Vitals:
     ) -> None:
         """hosts: the maps there are at the moment."""
         self.health = Health(config.stuck_s)
-        self.memory = Memory(config.limits.memory_bytes)
+        self.memory = MemoryLimit(config.limits.memory_bytes)
         self.chapters: Chapters = {}
         self._service, self._started = service, time.monotonic()
         self._pulses = {name: Pulse(lane.hand) for name, lane in lanes.items()}

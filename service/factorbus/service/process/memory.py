@@ -47,7 +47,7 @@ class NoRoom(OutOfMemory):
         )
 
 
-class Memory:
+class MemoryLimit:
     """Of this process.  limit: bytes; 0: four fifths of what the container or the machine has."""
 
     def __init__(self, limit: int) -> None:

@@ -20,9 +20,8 @@ from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Vari
 from factorbus.proto.problems import BadOption, Problem, UnknownQuestion
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.proto.stamps import NO_STAMP
-from factorbus.service.questions.missing_variables import NotInMap
 from factorbus.service.questions.question_memory import COPIES, Room
-from factorbus.service.questions.uncertainty import DECODE, Uncertain, check_keys, near_variables
+from factorbus.service.questions.uncertainty import DECODE, MissingVariables, Uncertain, check_keys, near_variables
 from factorbus.solver.changes.repair import repair
 from factorbus.solver.errors import SolverError
 
@@ -62,7 +61,7 @@ class Copied:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class QuestionCopies:
     """Copies of what some questions need, all of one revision.
 
     uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
@@ -130,7 +129,7 @@ def snapshot(
     account: Mapping[str, Any],
     uncertain: Uncertain | None = None,
     room: Room = _UNBOUNDED,
-) -> Snapshot:
+) -> QuestionCopies:
     """What `questions` need of `solver`, copied.  account: of its last step.  uncertain: R, if it is copied already.
 
     room: what has no room is refused by itself.
@@ -154,7 +153,7 @@ def snapshot(
         uncertain = Uncertain(solver.factoring(), epoch, revision, keeps_steps, account, room)
     content = solver.content() if "repair" in names else None
     groups = as_variables(variables), as_factors(factors)
-    return Snapshot(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)
+    return QuestionCopies(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)
 
 
 def _refused(solver: Any, questions: Sequence[Question], has_copy: bool, room: Room) -> dict[int, bytes | Exception]:
@@ -195,7 +194,7 @@ def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
     return tuple(Factors(g.kind, g.keys, g.measured, g.information, g.loss, g.scale, g.ids) for g in groups)
 
 
-def answer(question: Question, taken: Snapshot) -> bytes:
+def answer(question: Question, taken: QuestionCopies) -> bytes:
     """The answer to any question but stats and chi2 against batch.  Raises Problem, SolverError."""
     message = _answer(question, taken)
     if question.name != "keyframe":
@@ -203,18 +202,18 @@ def answer(question: Question, taken: Snapshot) -> bytes:
     return message
 
 
-def is_computed(question: Question, taken: Snapshot) -> bool:
+def is_computed(question: Question, taken: QuestionCopies) -> bool:
     """Whether there is more to do for the answer than to put together what `taken` has."""
     return id(question) not in taken.ready and (question.name in DECODE or question.name in ("repair", "export"))
 
 
-def check_ready(question: Question, taken: Snapshot) -> None:
+def check_ready(question: Question, taken: QuestionCopies) -> None:
     """Raises what `question` was refused with when the snapshot was taken."""
     if isinstance(ready := taken.ready.get(id(question)), Exception):
         raise ready
 
 
-def _answer(question: Question, taken: Snapshot) -> bytes:
+def _answer(question: Question, taken: QuestionCopies) -> bytes:
     check_ready(question, taken)
     if question.name == "repair":
         return _repaired(taken, question.ask)
@@ -233,7 +232,7 @@ def _answer(question: Question, taken: Snapshot) -> bytes:
     return codec.encode_map({**told, "text": text, "notes": notes})
 
 
-def _repaired(taken: Snapshot, ask: AskRepair) -> bytes:
+def _repaired(taken: QuestionCopies, ask: AskRepair) -> bytes:
     """On the thread that answers, which may take seconds: nobody else waits for it."""
     started = time.perf_counter()
     found = repair(taken.content, ask.factors, ask.probability)
@@ -260,7 +259,7 @@ def _answer_or_problem(uncertain: Uncertain, question: Question) -> bytes | Exce
         return problem
 
 
-def _uncertain(taken: Snapshot) -> Uncertain:
+def _uncertain(taken: QuestionCopies) -> Uncertain:
     if taken.uncertain is None:
         raise ValueError("the snapshot was not taken for this question")
     return taken.uncertain
@@ -278,7 +277,7 @@ def _chosen(groups: Iterable[Variables], keys: I64) -> tuple[Variables, ...]:
             chosen.append(Variables(group.kind, *columns, group.fixed, stamps if told else None))
             missing = np.setdiff1d(missing, group.keys[rows])
     if missing.size:
-        raise NotInMap(missing)
+        raise MissingVariables(missing)
     return tuple(chosen)
 
 

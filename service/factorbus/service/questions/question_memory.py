@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import TooLarge
-from factorbus.service.process.memory import Memory
+from factorbus.service.process.memory import MemoryLimit
 
 # Of an answer there are for a moment: the numbers, their bytes, the message, and what Zenoh sends.
 COPIES = 4
@@ -17,7 +17,7 @@ _LITTLE = 1 << 20
 class Taken:
     """Memory that one question has been given; `take` more as it becomes known what it needs."""
 
-    def __init__(self, memory: Memory | None) -> None:
+    def __init__(self, memory: MemoryLimit | None) -> None:
         self._memory, self.bytes = memory, 0
 
     def take(self, size: int) -> None:
@@ -31,7 +31,7 @@ class Taken:
 class Room:
     """Of one service.  memory: None: not bounded.  answer_bytes: no client could receive what is larger."""
 
-    memory: Memory | None = None
+    memory: MemoryLimit | None = None
     answer_bytes: int = ANSWER_LIMITS.max_bytes
 
     @contextmanager

@@ -6,7 +6,7 @@ What an answer comes to is known before anything is allocated for it (`costs`).
 """
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,9 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.asking import Associated, CovarianceGroup, Covariances, Gained, Gated, Why
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Factors
-from factorbus.proto.problems import TooLarge
+from factorbus.proto.problems import Problem, TooLarge
+from factorbus.proto.symbols import format_symbol
 from factorbus.service.questions import costs
-from factorbus.service.questions.missing_variables import NoPose, NotInMap
 from factorbus.service.questions.question_memory import Room, Taken
 from factorbus.solver.covariance.association import associate
 from factorbus.solver.covariance.blocks import Blocks
@@ -63,6 +63,29 @@ def near_variables(ask: Any) -> int:
     elif isinstance(ask, asking.AskWhy) and ask.factor is not None:
         count = _ENDS
     return count if count <= NEAR else 0
+
+
+class MissingVariables(Problem):
+    """A question about a variable that the map does not have."""
+
+    code = "unknown_variable"
+
+    def __init__(self, keys: Iterable[int]) -> None:
+        missing = [int(key) for key in keys]
+        names = ", ".join(map(format_symbol, missing[:5]))
+        shown = names + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        super().__init__(
+            f"the map has no {shown}; ask without keys for all there are", key=missing[0], keys=missing[:100]
+        )
+
+
+class NoPose(Problem):
+    """A question about the last pose of a map that has none."""
+
+    code = "unknown_variable"
+
+    def __init__(self) -> None:
+        super().__init__("the map has no pose yet: ask again when one is inserted")
 
 
 class Uncertain:
@@ -217,10 +240,10 @@ class Uncertain:
         )
 
     def _find(self, keys: I64) -> I64:
-        """Indices of variables.  Raises NotInMap."""
+        """Indices of variables.  Raises MissingVariables."""
         found = np.array([self._graph.find(int(key)) for key in keys], np.int64)
         if (found < 0).any():
-            raise NotInMap(np.unique(keys[found < 0]).tolist())
+            raise MissingVariables(np.unique(keys[found < 0]).tolist())
         return found
 
     def _last_pose(self) -> I64:

@@ -8,7 +8,7 @@ from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
 from factorbus.service.core.events import Arrived, Asker, Located, Refuse
-from factorbus.service.core.insert_digest import digest_of
+from factorbus.service.kernels.digest import digest
 from factorbus.service.kernels.read import read_insert as read_usual
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.solver.kernels.model import layout
@@ -35,8 +35,8 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
         place = find_place(payload)
         if place is None:
             return Refuse(asker, problem)
-        return Arrived([asker], client, *place, size, digest_of(payload), problem, now, payload)
-    return Arrived([asker], client, insert.sequence, insert.epoch, size, digest_of(payload), insert, now, payload)
+        return Arrived([asker], client, *place, size, message_digest(payload), problem, now, payload)
+    return Arrived([asker], client, insert.sequence, insert.epoch, size, message_digest(payload), insert, now, payload)
 
 
 def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:
@@ -44,9 +44,9 @@ def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:
     if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, ANSWER_LIMITS)):
         return located[2:]
     try:
-        return digest_of(payload), codec.decode_insert(payload, ANSWER_LIMITS)
+        return message_digest(payload), codec.decode_insert(payload, ANSWER_LIMITS)
     except Problem as problem:
-        return digest_of(payload), problem
+        return message_digest(payload), problem
 
 
 def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] | None:
@@ -60,3 +60,8 @@ def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] 
     if not sequence:
         return None
     return int(sequence), int(epoch), int(digest), Located(payload, groups, bool(settle))
+
+
+def message_digest(message: bytes) -> int:
+    """63 bits that tell an insert from another of the same number: the same in every process, unlike Python's hash."""
+    return int(digest(message))

@@ -10,7 +10,7 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from factorbus.proto.messages import Delta
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Stepped
-from factorbus.service.questions.answers import Copied, Question, Snapshot, snapshot
+from factorbus.service.questions.answers import Copied, Question, QuestionCopies, snapshot
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver.divergence import check_step, is_usual, undone
@@ -65,7 +65,7 @@ class Holding:
         """Questions may take no more than this."""
         self._room = room
 
-    def snapshot(self, questions: Sequence[Question]) -> Snapshot:
+    def snapshot(self, questions: Sequence[Question]) -> QuestionCopies:
         """Copies of what `questions` need, at the present revision.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
@@ -120,61 +120,28 @@ class Holding:
         size = _COPIES * self.memory_bytes()
         return Copied(self.dump() if size <= room else None, size)
 
-    def load(self, state: Mapping[str, Any] | None) -> None:
-        """Be where the one was that gave `state`; None: where a new one is.  Raises ValueError, KeyError."""
+    def load(self, state: Mapping[str, Any] | None) -> bool:
+        """Be where the one was that gave `state`; None: where a new one is.  Gives whether that is so to the bit.
+
+        Raises ValueError, KeyError, SolverError.
+        """
         self._solver, self._revision, self._broken, self._wary = self._make(), 0, "", False
         self._held, self._converged, self._unfinished = (0, 0), True, False
-        if state is not None:
-            self._solver.load(state["solver"])
-            self._wary = not is_usual(self._solver)
-            self._revision = int(state["revision"])
-            self._held = tuple(state["held"])
-            self._converged = bool(state["converged"])
-            self._unfinished = bool(self._solver.unfinished)
+        if state is None:
+            return True
+        anew = self._solver.load(state["solver"])
+        if anew is not None:
+            check_step(self._solver, anew)
+        self._wary = not is_usual(self._solver)
+        self._revision = int(state["revision"])
+        self._held = tuple(state["held"])
+        self._converged = bool(state["converged"] if anew is None else anew.converged)
+        self._unfinished = bool(self._solver.unfinished)
+        return anew is None
 
-    def content(self) -> dict[str, Any]:
-        """What another one `beside` this one begins with, a copy.  Raises Broken."""
-        if self._broken:
-            raise Broken(self._broken)
-        return {"graph": self._solver.to_order_anew(), "revision": self._revision, "held": list(self._held)}
-
-    def beside(self, content: Mapping[str, Any]) -> Self:
-        """Another one of the same map, where all of `content` is ordered anew; it is to be given what came since.
-
-        Takes as long as all of the map takes to eliminate, on any thread.  Raises SolverError.
-        """
-        made = type(self)(self._make, self._epoch, self._limits, self._options)
-        report = made._solver.order_anew(content["graph"])
-        check_step(made._solver, report)
-        made._account = report.as_dict()
-        made._converged = _has_converged(made._account)
-        made._revision, made._held = int(content["revision"]), tuple(content["held"])
-        return made
-
-    def take_place(self, other: Self, after: int, because: str) -> Stepped:
-        """Go on with the solver of `other`, which has all that this one has: a step, whose delta has everything.
-
-        after: the fold after which `other` began.
-        """
-        started = time.perf_counter()
-        self._solver = other._solver
-        account = other._account | {
-            "strategy": "full", "because": because, "chi2": self.chi2(), "new_variables": 0, "new_factors": 0,
-            "changed": self._solver.variable_count,
-        }  # fmt: skip
-        everything = tuple(self._solver.estimate())
-        account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(account)
-        delta = codec.encode_delta(Delta(self._epoch, self._revision, 0, everything, account))
-        told = account["strategy"], account["chi2"], account["solver_ms"]
-        left = {"converged": self._converged, "unfinished": self._unfinished}
-        return Stepped(self._revision, delta, *told, reordered=after, **left)
-
-    @property
-    def nonzeros(self) -> int:
-        """Of R, as of the last step; 0: not known, or R is not kept from step to step."""
-        known = self._account.get("mode") == "bayes-tree" and not self._broken
-        return int(self._account.get("nnz_r", 0)) if known else 0
+    def count_from(self, revision: int) -> None:
+        """The last step led to this revision, as a journal has it of another build, which took more steps or fewer."""
+        self._revision = revision
 
     @property
     def solver(self) -> Any:

@@ -76,6 +76,7 @@ __all__ = [
     "is_on_disk",
     "iter_compile",
     "kernel",
+    "machine",
     "part",
     "sources_hash",
     "types",
@@ -221,20 +222,20 @@ def sources_hash(folder: Path, *also: Path) -> str:
     for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
-    features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
-    digest.update(
-        repr(
-            (
-                sys.version,
-                platform.machine(),
-                (np.__version__, numba.__version__, llvmlite.__version__),
-                (llvmlite.binding.get_host_cpu_name(), features),
-                sorted((name, value) for name, value in os.environ.items() if _changes_code(name)),
-                sorted(_FASTMATH),
-            )
-        ).encode()
-    )
+    digest.update(repr((sys.version, sorted(machine().items()), sorted(_FASTMATH))).encode())
     return digest.hexdigest()[:20]
+
+
+def machine() -> dict[str, str]:
+    """What compiled code depends on besides its sources: the processor with a hash of its features, versions, flags."""
+    features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
+    can = hashlib.sha256(" ".join(features).encode()).hexdigest()[:8]
+    libraries = f"numpy {np.__version__}, numba {numba.__version__}, llvmlite {llvmlite.__version__}"
+    return {
+        "processor": f"{platform.machine()} {llvmlite.binding.get_host_cpu_name()} {can}",
+        "versions": f"Python {sys.version.split()[0]}, {libraries}",
+        "flags": " ".join(sorted(f"{name}={value}" for name, value in os.environ.items() if _changes_code(name))),
+    }
 
 
 def _changes_code(variable: str) -> bool:

@@ -1,0 +1,70 @@
+"""A public name stands for one thing: no function or class is defined under it in two modules.
+
+Not counted: twins that are alike on purpose (asyncio's client, a kernel for each kind of processor), the subcommands of
+the command line, whose names are those that a user types, and what starts a process.  `LEFT` has those that are still
+to get a name of their own; one that has it leaves the list.
+"""
+
+import ast
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TWINS = (
+    {"client/aio", "client/bus"},
+    {"client/aio", "client/map"},
+    {"client/aio", "client/features"},
+    {"client/aio_uncertainty", "client/uncertainty"},
+    {"solver/kernels/simd_checked", "solver/kernels/simd_llvm", "solver/kernels/simd_plain"},
+    {
+        "solver/covariance/kernels/tiles_checked",
+        "solver/covariance/kernels/tiles_llvm",
+        "solver/covariance/kernels/tiles_plain",
+    },
+)
+STARTS = {"main"}
+LEFT = {
+    # in the solver
+    "Blocks", "add_end", "check_numbers", "collect", "ends_of", "extend_add", "has_room", "hold", "list_moved",
+    "list_roots", "list_runs", "padded", "put_block", "solve_lower", "solve_rows", "solve_upper",
+    # in the solver and outside it
+    "BadLoss", "BadOption", "BadShape", "Course", "FactorKind", "Factored", "Graph", "Problem", "Rule", "Shares",
+    "Space", "TooLarge", "UnknownKind", "VariableKind", "begin", "check", "compiled_seconds", "connect", "dims_of",
+    "factor_chi2", "factored", "fetch", "follow", "gather", "grown", "is_relative", "judge", "label_of", "load",
+    "loss_of", "machine", "note", "placed", "rotation", "rows_size", "spread", "warm", "word",
+    # in the mathematics of inverse depth, or the workers
+    "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
+    "product", "rays", "rays_of", "rows",
+    # between packages
+    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
+}  # fmt: skip
+
+
+def test_no_public_name_is_defined_twice() -> None:
+    found = {name for name, modules in defined().items() if len(modules) > 1 and not any(modules <= t for t in TWINS)}
+    assert sorted(found - LEFT) == [], "give one of each a name of its own"
+    assert sorted(LEFT - found) == [], "these have one: take them from the list"
+
+
+def defined() -> dict[str, set[str]]:
+    """Modules by the public name of a function or class that each defines, at its outermost level."""
+    modules = defaultdict[str, set[str]](set)
+    for root in ("proto", "service", "workers", "clients"):
+        for path in sorted((ROOT / root / "factorbus").rglob("*.py")):
+            module = path.relative_to(ROOT / root / "factorbus").with_suffix("").as_posix()
+            for name in names(ast.parse(path.read_text(encoding="utf-8"))):
+                modules[name].add(module)
+    return modules
+
+
+def names(module: ast.Module) -> Iterator[str]:
+    for node in module.body:
+        defines = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+        if defines and not node.name.startswith("_") and node.name not in STARTS and not is_subcommand(node):
+            yield node.name
+
+
+def is_subcommand(node: ast.AST) -> bool:
+    decorators = [ast.unparse(each) for each in getattr(node, "decorator_list", ())]
+    return any(each.partition("(")[0].endswith((".command", ".group")) for each in decorators)
