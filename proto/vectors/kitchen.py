@@ -189,7 +189,7 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
         asking.AskGain: asked.encode_ask_gain, asking.AskAssociate: asked.encode_ask_associate,
         asking.AskWhy: asked.encode_ask_why,
     }  # fmt: skip
-    uncertain = Uncertain(solver.factoring(), EPOCH, 3, False, report)
+    uncertain = Uncertain(solver.covariances.factoring(), EPOCH, 3, False, report)
     made = {name: uncertain.answer(ask) for name, (_, ask) in questions.items()}
     made |= {name: encode[type(ask)](ask) for name, ask in questions.values()}
     ask = asking.AskRepair(np.array([2, FALSE]), 0.95, values=True)

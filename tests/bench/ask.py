@@ -94,13 +94,13 @@ def _large(problem: Problem) -> dict[str, Any]:
     """One map at its end: blocks, gates, and what they are held against."""
     solver = Solver(Options(mode="bayes-tree"))
     steps_ms = [_ms(lambda batch=batch: (solver.stage(batch), solver.step())) for batch in load(problem)]
-    copy_ms = _best(lambda: Blocks(solver.factored()))
-    fresh = [Blocks(solver.factored()) for _ in range(_REPEAT)]
+    copy_ms = _best(lambda: Blocks(solver.covariances.factored()))
+    fresh = [Blocks(solver.covariances.factored()) for _ in range(_REPEAT)]
     diagonal_ms = min(_ms(blocks.diagonal) for blocks in fresh)
     candidates = _candidates(solver)
     gate_ms = np.inf
     for _ in range(2 * _REPEAT):  # one after the other, as a service makes them: where there is memory already
-        blocks = Blocks(solver.factored())
+        blocks = Blocks(solver.covariances.factored())
         gate_ms = min(gate_ms, _ms(lambda blocks=blocks: judge_candidates(blocks, [candidates])))
     known_ms = _best(lambda: judge_candidates(blocks, [candidates]))
     random_ms = _ms(lambda: judge_candidates(blocks, [_candidates(solver, spread=True)]))
@@ -129,7 +129,7 @@ def _large(problem: Problem) -> dict[str, Any]:
 def _every_step(problem: Problem) -> dict[str, Any]:
     """One replay, with the last pose's covariance, and all diagonal blocks, after every step."""
     solver = Solver(Options(mode="bayes-tree"))
-    upkeep = solver.try_upkeep()
+    upkeep = solver.covariances.try_upkeep()
     if upkeep is None:
         raise RuntimeError("the mode tree keeps nothing up")
     step_ms, last_ms, upkeep_ms, worst = [], [], [], 0.0
@@ -137,10 +137,10 @@ def _every_step(problem: Problem) -> dict[str, Any]:
         step_ms.append(_ms(lambda batch=batch: (solver.stage(batch), solver.step())))
         if k:
             last = np.array([solver.variable_count - 1])
-            last_ms.append(_ms(lambda last=last: solver.try_joint(last)))
+            last_ms.append(_ms(lambda last=last: solver.covariances.try_joint(last)))
             upkeep_ms.append(_ms(upkeep.update))
         if k % 50 == 49:
-            wanted = Blocks(solver.factored()).diagonal()
+            wanted = Blocks(solver.covariances.factored()).diagonal()
             worst = max(worst, _worst(upkeep.diagonal()[:, : wanted.shape[1], : wanted.shape[1]], wanted))
     return {
         "name": problem.label,

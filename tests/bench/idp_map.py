@@ -228,7 +228,7 @@ def judged(front: FrontEnd, graph: Batch) -> dict[str, Any]:
 def _covariance(solver: Solver) -> tuple[np.ndarray, dict[int, int], dict[int, np.ndarray]]:
     """Λ⁻¹, dense; first scalars and values by key."""
     solver.step()
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     n = int(graph.counts[at.SCALARS])
     offsets = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[at.COLUMNS]])])
     information = np.zeros((n, n))

@@ -55,7 +55,7 @@ def test_the_covariance_of_a_prior_is_that_of_its_sigmas_in_radians() -> None:
     solver = Solver(Options())
     solver.stage(Draft().se3("x0", IDENTITY).prior_se3("x0", IDENTITY, sigmas=SIGMAS).batch())
     solver.step(settle=True)
-    found = Blocks(solver.factored()).of(np.array([0]))[0]
+    found = Blocks(solver.covariances.factored()).of(np.array([0]))[0]
     np.testing.assert_allclose(found, np.diag(SIGMAS) ** 2, rtol=1e-9, atol=1e-15)
 
 
@@ -80,9 +80,9 @@ def test_covariances_of_poses_in_space_are_those_of_gtsam_and_of_a_dense_inverse
     dense = DenseGraph()
     dense.add(Batch((Variables("se3", estimate.keys, estimate.values),), batch.factors))
     dense.put([estimate])
-    exact, blocks = DenseCovariance(dense), Blocks(solver.factored())
+    exact, blocks = DenseCovariance(dense), Blocks(solver.covariances.factored())
     for i in range(5):
-        place = solver.factored().graph.keys.tolist().index(symbol("x", i))
+        place = solver.covariances.factored().graph.keys.tolist().index(symbol("x", i))
         found = blocks.of(np.array([place]))[0]
         wanted = exact.joint([symbol("x", i)])
         np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-12)

@@ -36,7 +36,7 @@ def dense_r(rows, sparse: bool = False):
 
 def dense_lambda(solver, sparse: bool = False):
     """(Λ, η) as the solver holds them, in insertion order."""
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     starts = np.concatenate([[0], np.cumsum(dims)])
     entries, rows, cols = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]

@@ -39,7 +39,7 @@ def sparse_r(rows) -> tuple[csr_array, I64, F64]:
 
 def sparse_lambda(solver) -> tuple[csr_array, F64]:
     """(Λ, η) as the solver holds them, in insertion order."""
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     starts = np.concatenate(([0], np.cumsum(dims)))
     rows, cols, offsets = blocks.rows, blocks.cols, blocks.offsets

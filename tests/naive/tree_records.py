@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
@@ -24,8 +25,8 @@ class Clique:
 
 def tree_of(solver: Solver) -> Tree:
     """The tree of a solver in the mode "bayes-tree"."""
-    assert solver._tree is not None
-    return solver._tree.tree
+    assert isinstance(solver._stepper, TreeSteps)
+    return solver._stepper.tree
 
 
 def cliques(solver: Solver) -> dict[int, Clique]:

@@ -143,7 +143,7 @@ def test_the_cost_is_not_below_the_answer() -> None:
     made = Solver(Options())
     made.stage(Batch((Variables("se2", np.arange(9), np.zeros((9, 3)), fixed=True),), ()))
     made.step()
-    blocks, here = Blocks(made.factored()), Uncertain(made.factoring(), 7, 1, True, {})
+    blocks, here = Blocks(made.covariances.factored()), Uncertain(made.covariances.factoring(), 7, 1, True, {})
     rows, columns = np.arange(9), np.arange(4)
     asked: list[tuple[AskCovariance, costs.Cost]] = [
         (AskCovariance("joint", rows), costs.of_matrix(blocks, rows, rows)),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factorbus.solver import Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.kernels.bayes_tree import records as bayes_tree
 from factorbus.solver.kernels.jit.array_table import WIDTH
@@ -64,8 +65,8 @@ def test_what_no_kernel_could_work_on_is_refused(wrong: np.ndarray) -> None:
 
 def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
     solver = Solver()
-    assert solver._tree
-    tree = solver._tree.tree
+    assert isinstance(solver._stepper, TreeSteps)
+    tree = solver._stepper.tree
     for thing, names in ((solver._graph, model.Graph._fields), (tree, bayes_tree.Tree._fields)):
         assert rows(thing) == [of(getattr(thing, name)) for name in names]
     graph, looked_up = model.graph_at(solver._graph.places), bayes_tree.tree_at(tree.places)

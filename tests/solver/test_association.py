@@ -90,7 +90,7 @@ def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
     solver.step()
     seen = row + np.array([0.4, 0.0]) + rng.normal(0, 0.01, (n, 2))
     weight = np.tile([1e4, 0.0, 1e4], (n, 1))
-    blocks, landmarks = Blocks(solver.factored()), np.arange(2, 2 + n)
+    blocks, landmarks = Blocks(solver.covariances.factored()), np.arange(2, 2 + n)
     found = associate(blocks, "landmark_se2", 1, seen, weight, landmarks, 0.99)
     nearest = [found.landmarks[found.sightings == i][0] for i in range(n)]
     assert nearest[:-1] == (landmarks[1:]).tolist()
@@ -110,14 +110,14 @@ def test_sightings_are_told_apart_and_strangers_left_out(kind: str) -> None:
     if kind == "bearing_range_se2":
         seen = np.column_stack([np.arctan2(seen[:, 1], seen[:, 0]), np.linalg.norm(seen, axis=1)])
     found = associate(
-        Blocks(solver.factored()), kind, 1, seen, np.tile([400.0, 0, 400.0], (4, 1)), np.arange(2, 10), 0.95
+        Blocks(solver.covariances.factored()), kind, 1, seen, np.tile([400.0, 0, 400.0], (4, 1)), np.arange(2, 10), 0.95
     )
     assert found.landmark.tolist() == [7, 2, 5, -1]
     assert found.distance < threshold(np.array([6]), 0.95)[0]
 
 
 def test_nothing_to_see_and_nothing_to_choose_from() -> None:
-    blocks = Blocks(room(8.0, 0.05)[0].factored())
+    blocks = Blocks(room(8.0, 0.05)[0].covariances.factored())
     none = associate(blocks, "landmark_se2", 1, np.empty((0, 2)), np.empty((0, 3)), np.arange(2, 10), 0.95)
     assert none.landmark.size == 0
     weight = np.array([[1.0, 0, 1.0]])
@@ -127,7 +127,7 @@ def test_nothing_to_see_and_nothing_to_choose_from() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    blocks, weight = Blocks(room(8.0, 0.05)[0].factored()), np.array([[1.0, 0, 1.0]])
+    blocks, weight = Blocks(room(8.0, 0.05)[0].covariances.factored()), np.array([[1.0, 0, 1.0]])
     with pytest.raises(errors.KindMismatch):
         associate(blocks, "landmark_se2", 2, np.ones((1, 2)), weight, np.arange(2, 10), 0.95)
     with pytest.raises(errors.KindMismatch):

@@ -15,6 +15,7 @@ from naive.tree_solution import assert_is_solution, normal_equations
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
@@ -77,11 +78,11 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
             found.append(slot)
             slot = int(tree.link[slot // 2, tl.L_I + slot % 2])
         assert sorted(found) == sorted(2 * f + e for f, e in np.argwhere(ends == v).tolist())
-    assert solver._tree is not None
+    assert isinstance(solver._stepper, TreeSteps)
     information, eta, model, delta = normal_equations(solver)
-    if solver._tree.tree.raised:  # then R is not quite that of Λ
+    if solver._stepper.tree.raised:  # then R is not quite that of Λ
         return
-    if not solver._tree._held:  # else the estimate is where the tree is linearised, and R waits for the next step
+    if not solver._stepper._held:  # else the estimate is where the tree is linearised, and R waits for the next step
         assert_is_solution(solver, information, eta, model, delta, least=2e-8)
     scale = np.sqrt(np.diag(information))
     unit = information / scale / scale[:, None]
@@ -89,7 +90,7 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     last = int(np.flatnonzero(graph.var[: solver.variable_count, at.V_SCALAR] >= 0)[-1])
     wanted = whole[graph.var[last, at.V_SCALAR] :, graph.var[last, at.V_SCALAR] :]
     tell = max(1e-8, 1e-13 * float(np.linalg.cond(unit))) * np.abs(wanted).max()
-    np.testing.assert_allclose(Blocks(solver.factored()).joint(np.array([last])), wanted, rtol=0, atol=tell)
+    np.testing.assert_allclose(Blocks(solver.covariances.factored()).joint(np.array([last])), wanted, rtol=0, atol=tell)
 
 
 def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
@@ -254,8 +255,8 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
             broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
             assert solver.try_change(change) is None
         else:
-            assert solver._tree is not None
-            broken.setattr(type(solver._tree.tree), "step", lambda *_: 1 / 0)
+            assert isinstance(solver._stepper, TreeSteps)
+            broken.setattr(type(solver._stepper.tree), "step", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
                 solver.try_change(change)
     assert rows_of(solver) == before[1]
@@ -349,21 +350,21 @@ def test_a_changed_solver_goes_on_from_its_state_with_the_same_bits() -> None:
         assert came is not None
     assert bits(solver) == bits(again)
     assert rows_of(solver) == rows_of(again)
-    assert why_factor(Blocks(solver.factored()), int(ids[6])).factor == int(ids[6])
+    assert why_factor(Blocks(solver.covariances.factored()), int(ids[6])).factor == int(ids[6])
     with pytest.raises(errors.UnknownFactor, match="has been removed"):
-        why_factor(Blocks(solver.factored()), int(ids[0]))
+        why_factor(Blocks(solver.covariances.factored()), int(ids[0]))
 
 
 def test_diagonal_blocks_are_kept_up_over_changes() -> None:
     solver, loops = drive(300, 4)
-    upkeep = solver.try_upkeep()
+    upkeep = solver.covariances.try_upkeep()
     assert upkeep is not None
     upkeep.update()
     for n, each in enumerate(loops[:12]):
         what = [Change("remove_factors", np.array([each])), Change("weigh", np.array([each]), weight=np.array([0.1]))]
         assert solver.try_change(what[n % 2 : n % 2 + 1]) is not None
         upkeep.update()
-        wanted = Blocks(solver.factored()).diagonal()
+        wanted = Blocks(solver.covariances.factored()).diagonal()
         np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)
     assert upkeep.whole < upkeep.anew
 

@@ -40,7 +40,7 @@ def assert_fills_little(name: str, steps: Iterable[Batch]) -> None:
     for batch in steps:
         solver.stage(batch)
     solver.step()
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     free, last, recent = (
         fill_in(dims, blocks.rows, blocks.cols, group)[0]

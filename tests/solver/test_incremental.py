@@ -35,7 +35,7 @@ WAYS = {
 
 def assert_is_the_factor(solver: Solver, relative: float = 1e-9) -> bool:
     """RᵀR = PΛPᵀ, d = R⁻ᵀPη, and δ by blocks is the dense solution; False: there is no R in block rows."""
-    factor = solver._system.factor
+    factor = solver._stepper.system.factor
     if factor._have is not Where.ROWS:
         return False
     information, eta = dense_lambda(solver)
@@ -141,7 +141,7 @@ def test_the_old_factor_is_given_up_at_a_new_point_where_the_paper_has_it_so(kee
         report = solver.step()
         counts[report.strategy] += 1
         if report.iterations and not keep:
-            assert not solver._system.factor.have_r
+            assert not solver._stepper.system.factor.have_r
     assert counts["full"] >= (1 if keep else 6)
 
 
@@ -229,7 +229,7 @@ def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) ->
     for batch in read(datasets / f"{name}.g2o").steps():
         solver.stage(batch)
     solver.step()
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     dims = graph.dims[: graph.counts[4]]
     free, bound = (
         fill_in(dims, blocks.rows, blocks.cols, group)[0] for group in (None, constraint(graph, recent_poses=1))

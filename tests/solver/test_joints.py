@@ -91,7 +91,9 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def covariance(solver: Solver, *names: int) -> np.ndarray:
-    return Blocks(solver.factored()).joint(np.array([solver._graph.find(key) for key in x(*names).tolist()]))
+    return Blocks(solver.covariances.factored()).joint(
+        np.array([solver._graph.find(key) for key in x(*names).tolist()])
+    )
 
 
 def marginalise(*names: int) -> list[Change]:
@@ -304,7 +306,7 @@ def test_pieces_stay_together_or_go_together() -> None:
 
 def test_what_asks_about_pieces_gets_an_answer() -> None:
     solver, ids = window()
-    graph, blocks = solver._graph, Blocks(solver.factored())
+    graph, blocks = solver._graph, Blocks(solver.covariances.factored())
     total = 0.0
     for v in range(solver.variable_count):
         account = why_variable(blocks, v, True)
@@ -328,7 +330,7 @@ def test_what_asks_about_pieces_gets_an_answer() -> None:
 
 def test_the_kept_up_covariance_is_that_from_scratch() -> None:
     solver, _ = window()
-    upkeep = solver.try_upkeep()
+    upkeep = solver.covariances.try_upkeep()
     assert upkeep is not None
     upkeep.update()
     rng = np.random.default_rng(1)
@@ -339,7 +341,7 @@ def test_the_kept_up_covariance_is_that_from_scratch() -> None:
         upkeep.update()
         np.testing.assert_allclose(
             upkeep.diagonal()[:, :3, :3],
-            Blocks(solver.factored()).diagonal(),
+            Blocks(solver.covariances.factored()).diagonal(),
             rtol=0,
             atol=1e-8 * upkeep.diagonal().max(),
         )

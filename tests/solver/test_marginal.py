@@ -70,7 +70,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 def covariance(solver: Solver, *names: int) -> np.ndarray:
     """The joint covariance of some poses."""
-    blocks = Blocks(solver.factored())
+    blocks = Blocks(solver.covariances.factored())
     return blocks.joint(np.array([solver._graph.find(symbol("x", n)) for n in names]))
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import MUCH, evaluate_moved
@@ -31,8 +32,8 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
     for step in WORLDS[world](poses, 3):
         solver.stage(step.batch)
         solver.step()
-    assert solver._tree is not None
-    graph, tree = solver._graph, solver._tree.tree
+    assert isinstance(solver._stepper, TreeSteps)
+    graph, tree = solver._graph, solver._stepper.tree
     count = int(tree.state[tl.S_VARIABLES])
     free = np.flatnonzero(graph.var[:count, at.V_COLUMN] >= 0)
     for share, bent in ((0.3, 1e-3), (0.6, 1e-2), (1.0, 0.1)):

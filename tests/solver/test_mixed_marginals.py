@@ -45,7 +45,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
-    return Blocks(solver.factored()).joint(np.array([solver._graph.find(key) for key in keys]))
+    return Blocks(solver.covariances.factored()).joint(np.array([solver._graph.find(key) for key in keys]))
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:

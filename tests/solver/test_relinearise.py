@@ -7,6 +7,7 @@ import pytest
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearise_around
@@ -25,8 +26,8 @@ def driven() -> Solver:
 
 @pytest.mark.parametrize("picked", [[3], [5, 390], list(range(40, 60)), list(range(1, 400))])
 def test_the_factors_of_some_variables_are_linearised(driven: Solver, picked: list[int]) -> None:
-    assert driven._tree
-    tree, graph = driven._tree.tree, driven._graph
+    assert isinstance(driven._stepper, TreeSteps)
+    tree, graph = driven._stepper.tree, driven._graph
     count = int(tree.state[tl.S_FACTORS])
     ends = graph.fac[:count, [at.F_I, at.F_J]]
     around = np.flatnonzero(np.isin(ends, picked).any(axis=1))

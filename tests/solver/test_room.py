@@ -10,6 +10,7 @@ from naive.random_graphs import random_steps
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.graph.factor_graph import Graph, roomy
 from factorbus.solver.kernels.model import layout as at
@@ -22,12 +23,12 @@ TREE |= {"changed": 1, "moved": 1, "marked": 1, "motions": 8}
 def cramped() -> Solver:
     """A solver that has room for one variable and one factor."""
     solver = Solver(Options())
-    assert solver._tree
-    for thing, sizes in ((solver._graph, GRAPH), (solver._tree.tree, TREE)):
+    assert isinstance(solver._stepper, TreeSteps)
+    for thing, sizes in ((solver._graph, GRAPH), (solver._stepper.tree, TREE)):
         for name, size in sizes.items():
             setattr(thing, name, getattr(thing, name)[:size].copy())
     for name in ("lin", "scalars"):
-        setattr(solver._tree.tree, name, getattr(solver._tree.tree, name)[:, :7].copy())
+        setattr(solver._stepper.tree, name, getattr(solver._stepper.tree, name)[:, :7].copy())
     solver._graph.table = np.zeros(2, np.int64)
     return solver
 
@@ -101,7 +102,7 @@ def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None
     assert bits(solver.estimate()) == before
     solver.stage(second)
     assert bits(solver.estimate()) != before
-    solver._graph.forget(solver._tree._mark)  # type: ignore[union-attr]
+    solver._graph.forget(solver._stepper._mark)  # type: ignore[union-attr]
     assert bits(solver.estimate()) == before
     with pytest.raises(errors.DuplicateVariable):
         solver.stage(first)

@@ -9,6 +9,7 @@ from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.inc_l.steps import IncrementalSteps
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.sparse.blocks import Blocks
@@ -170,7 +171,9 @@ def everything(solver: Solver) -> bytes:
                 for a in (graph.counts, graph.keys[:n], graph.stamps[:n], graph.values[:v], *rows(solver, n, m))
             ],
             [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
-            normal_equations(solver._system.blocks, scalars) if solver._tree is None else cliques(solver, n, m, v),
+            normal_equations(solver._stepper.system.blocks, scalars)
+            if isinstance(solver._stepper, IncrementalSteps)
+            else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
         ]
     )
@@ -179,7 +182,7 @@ def everything(solver: Solver) -> bytes:
 def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
     """What the graph says of them; in the mode "bayes-tree" nobody writes where blocks of Λ are."""
     var, fac = solver._graph.var[:variables], solver._graph.fac[:factors]
-    return (var, fac) if solver._tree is None else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
+    return (var, fac) if isinstance(solver._stepper, IncrementalSteps) else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
 
 
 def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:

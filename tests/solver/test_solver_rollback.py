@@ -13,7 +13,7 @@ BATCH = Options(mode="all-batch")
 
 
 def state(solver: Solver) -> list[bytes]:
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     variables, factors, values, payload, columns, scalars, _ = graph.counts.tolist()
     arrays = [
         *(graph.keys[:variables], graph.var[:variables], graph.fac[:factors], graph.values[:values]),

@@ -53,7 +53,7 @@ def test_the_normal_equations_are_the_twins_and_have_the_bits_of_a_fresh_sum(see
         twin.add(batch)
     solver.step()
     twin.put(solver.estimate())
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     starts = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[4]])])
     dense = np.zeros((starts[-1], starts[-1]))
     for row, col, offset in zip(blocks.rows, blocks.cols, blocks.offsets, strict=True):

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
+from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import Tree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.allocator import (
@@ -97,8 +98,8 @@ def blocks_of(tree: Tree) -> list[tuple[int, int]]:
 
 def test_what_a_drive_leaves_free_is_used_again() -> None:
     solver = Solver(Options())
-    assert solver._tree
-    tree, most = solver._tree.tree, 0.0
+    assert isinstance(solver._stepper, TreeSteps)
+    tree, most = solver._stepper.tree, 0.0
     for n, step in enumerate(manhattan(4000, 3), start=1):
         solver.stage(step.batch)
         solver.step()
@@ -149,8 +150,8 @@ def test_pages_ahead_end_with_the_arena() -> None:
 
 def test_a_drive_has_its_pages_before_it_needs_them() -> None:
     solver = Solver(Options())
-    assert solver._tree
-    tree = solver._tree.tree
+    assert isinstance(solver._stepper, TreeSteps)
+    tree = solver._stepper.tree
     for step in manhattan(1500, 3):
         solver.stage(step.batch)
         solver.step()
@@ -160,8 +161,8 @@ def test_a_drive_has_its_pages_before_it_needs_them() -> None:
 
 def test_a_step_of_many_flops_has_no_time_for_pages() -> None:
     solver = Solver(Options())
-    assert solver._tree
-    state = solver._tree.tree.state
+    assert isinstance(solver._stepper, TreeSteps)
+    state = solver._stepper.tree.state
     for step in manhattan(3000, 3):
         solver.stage(step.batch)
     assert solver.step(settle=True).flops >= LIGHT
@@ -177,8 +178,8 @@ def test_what_only_the_original_has_written_to_is_written_to_again() -> None:
         solver.stage(step.batch)
         solver.step()
     copied.load(solver.dump())
-    assert copied._tree
-    tree = copied._tree.tree
+    assert isinstance(copied._stepper, TreeSteps)
+    tree = copied._stepper.tree
     had, pose = tree.numbers.size, 0
     assert tree.state[tl.S_FRESH] > had + 2 * AHEAD * PAGE
     while tree.numbers.size == had:

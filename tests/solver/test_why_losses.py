@@ -39,7 +39,7 @@ def fall(solver: Solver, factor: int) -> float:
 
 
 def account_of(solver: Solver, factor: int) -> FactorAccount:
-    return why_factor(Blocks(solver.factored()), factor)
+    return why_factor(Blocks(solver.covariances.factored()), factor)
 
 
 @pytest.mark.parametrize("loss", OUTLIER)

@@ -70,7 +70,7 @@ def index(twin: Solver, *names: str) -> np.ndarray:
 
 def test_covariances_are_those_of_the_solver(square: tuple[Map, Solver]) -> None:
     joined, twin = square
-    blocks, revision = Blocks(twin.factored()), joined.stats()["revision"]
+    blocks, revision = Blocks(twin.covariances.factored()), joined.stats()["revision"]
     every = joined.doubt.covariance()
     assert every.revision == revision
     assert sum(len(group.keys) for group in every.groups) == twin.variable_count
@@ -99,7 +99,7 @@ def test_candidates_are_gated_and_weighed(square: tuple[Map, Solver]) -> None:
     found, gain = joined.doubt.gate(draft), joined.doubt.gain(draft)
     assert found.plausible.tolist() == [True, False]
     assert found.dims.tolist() == [3, 3]
-    wanted = judge_candidates(Blocks(twin.factored()), draft.batch().factors)
+    wanted = judge_candidates(Blocks(twin.covariances.factored()), draft.batch().factors)
     np.testing.assert_allclose(found.distance, wanted.distance, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(gain.gain, wanted.gain, rtol=1e-6)
     many = Batch(factors=tuple(draft.batch().factors) * 40)  # no longer between two steps

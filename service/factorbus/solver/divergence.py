@@ -52,7 +52,7 @@ def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:
 
 def unstage(solver: Solver) -> None:
     """Forget what was staged since the last step."""
-    solver._graph.forget(solver._done.graph if solver._tree is None else solver._tree.mark)
+    solver._graph.forget(solver._stepper.mark)
 
 
 def copied(solver: Solver) -> Solver:
@@ -69,22 +69,8 @@ def undone(solver: Solver, report: StepReport, variables: int, factors: int) -> 
 
     `solver` is of no use then.  Raises SolverError.
     """
-    _restore(solver, report)
+    solver._stepper.restore(report)
     made = Solver(solver._options)
     report = made.renew(solver, variables, factors)
     check_step(made, report)
     return made, report
-
-
-def _restore(solver: Solver, report: StepReport) -> None:
-    """The values from before the last step, in the arena of the graph."""
-    graph, before = solver._graph, None
-    if solver._tree is None:
-        before = None if report.strategy == "extend" else solver._system._before
-    elif report.strategy == "batch":
-        before = solver._tree.before_batch
-    else:
-        solver._tree.tree.exchange()
-    if before is not None:
-        used = int(graph.counts[at.VALUES])
-        graph.values[:used] = before[:used]

@@ -72,7 +72,7 @@ class OurPass:
     """The batch pass of our solver on one graph."""
 
     def __init__(self, solver: Solver) -> None:
-        self._graph, self._blocks = solver._graph, solver._system.blocks
+        self._graph, self._blocks = solver._graph, solver._stepper.system.blocks
         self._dims = self._graph.dims[: self._graph.counts[at.COLUMNS]].copy()
         self._cholesky = Cholesky()
         # At the optimum η is 0 but for rounding; any other right-hand side tells more.
@@ -118,7 +118,7 @@ def whole(steps: Sequence[Batch], columns: Columns, values: dict[str, F64]) -> B
 
 def system_of(solver: Solver) -> BlockSystem:
     """Λ as the solver holds it."""
-    graph, blocks = solver._graph, solver._system.blocks
+    graph, blocks = solver._graph, solver._stepper.system.blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]].copy()
     return BlockSystem(dims, blocks.rows.copy(), blocks.cols.copy(), blocks.data.copy(), blocks.offsets.copy())
 

@@ -105,7 +105,7 @@ def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
     solver = Solver(Options(mode="inc-l", max_iterations=0))
     solver.stage(graph)
     solver.step()
-    blocks = Blocks(solver.factored())
+    blocks = Blocks(solver.covariances.factored())
     place = {key: at for at, key in enumerate(blocks.factored.graph.keys[: blocks.factored.count].tolist())}
     found = blocks.of(np.array([place[key] for key in keys.tolist()], np.int64))
     dims = blocks.factored.dims

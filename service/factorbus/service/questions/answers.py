@@ -143,14 +143,14 @@ def snapshot(
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
     asked = [question for question in questions if question.name in DECODE]
-    view = solver.try_view() if any(near_variables(question.ask) for question in asked) else None
+    view = solver.covariances.try_view() if any(near_variables(question.ask) for question in asked) else None
     near = [question for question in asked if view is not None and near_variables(question.ask)]
     if view is not None:
         here = Uncertain(lambda: view, epoch, revision, True, account, room)
         ready |= {id(question): _answer_or_problem(here, question) for question in near}
     if uncertain is None and len(near) < len(asked):
-        keeps_steps = view is not None or solver.try_view() is not None
-        uncertain = Uncertain(solver.factoring(), epoch, revision, keeps_steps, account, room)
+        keeps_steps = view is not None or solver.covariances.try_view() is not None
+        uncertain = Uncertain(solver.covariances.factoring(), epoch, revision, keeps_steps, account, room)
     content = solver.content() if "repair" in names else None
     groups = as_variables(variables), as_factors(factors)
     return QuestionCopies(epoch, revision, *groups, chi2, uncertain, ready, content, room=room)
@@ -180,8 +180,8 @@ def _check(solver: Any, question: Question, has_copy: bool, room: Room) -> None:
         room.check(_REPAIR * solver.memory_bytes())
     elif name in DECODE:
         check_keys(question.ask, room)
-        if not has_copy and not (near_variables(question.ask) and solver.try_view() is not None):
-            room.check((1 if solver.try_view() is not None else _FRESH) * solver.memory_bytes())
+        if not has_copy and not (near_variables(question.ask) and solver.covariances.try_view() is not None):
+            room.check((1 if solver.covariances.try_view() is not None else _FRESH) * solver.memory_bytes())
 
 
 def as_variables(groups: Iterable[Any]) -> tuple[Variables, ...]:

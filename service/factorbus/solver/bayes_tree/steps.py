@@ -93,6 +93,23 @@ class TreeSteps:
         course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._account(started, compiled, course, because)
 
+    def resume(self, settle: bool) -> StepReport:
+        """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
+        with self._tree.placing_none():
+            return self.step(settle)
+
+    def restore(self, report: StepReport) -> None:
+        """Put the values from before the last step, which gave `report`, back into the graph."""
+        if report.strategy != "batch":
+            self._tree.exchange()
+            return
+        used = int(self._graph.counts[at.VALUES])
+        self._graph.values[:used] = self.before_batch[:used]
+
+    def memory_bytes(self) -> int:
+        """Bytes in use for the tree."""
+        return self._tree.memory_bytes()
+
     def rebase(self, fewer: int) -> None:
         """So many of the factors that were there after the last step are gone."""
         mark = list(self._mark)

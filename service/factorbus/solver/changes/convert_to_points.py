@@ -7,6 +7,7 @@ measured of it.  What goes is the tie to the anchor and the first guess of the d
 
 import numpy as np
 
+from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import Graph, table_size
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -16,6 +17,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.lenses.layout import LENS_SIZE
 
+_TURNING = "turning features into points"
 # Of a first sight's payload: where the lens is, and the pixel's block in the upper triangle of a 6 × 6 matrix.
 _LENS = np.arange(3, 4 + LENS_SIZE)
 _PIXEL_BLOCK = np.array([15, 16, 18])
@@ -39,6 +41,19 @@ def find_ripe(graph: Graph, below: float) -> I64:
     found[features[guessed < _SURER * known]] = np.inf
     found[is_held(graph)] = np.inf
     return np.flatnonzero(found < below)
+
+
+def pick_features(graph: Graph, keys: I64) -> I64:
+    """These features as variables.  Raises UnknownVariable; KindMismatch for what is none, or has to stay one."""
+    picked = np.array([graph.find(key) for key in keys.tolist()], np.int64)
+    for key, v in zip(keys.tolist(), picked.tolist(), strict=True):
+        if v < 0:
+            raise errors.UnknownVariable(key, _TURNING)
+        if (kind := int(graph.var[v, at.V_KIND])) != at.IDP:
+            raise errors.KindMismatch(key, _TURNING, VARIABLE_KIND_OF_CODE[kind].name, "idp")
+        if is_held(graph)[v]:
+            raise errors.KindMismatch(key, _TURNING, "idp with a linear factor", "idp that cameras see")
+    return picked
 
 
 def is_held(graph: Graph) -> np.ndarray:

@@ -10,19 +10,20 @@ from factorbus.solver.changes.requested import Edits
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import find_escaped
 from factorbus.solver.report import StepReport
+from factorbus.solver.stepper import Stepper
 from factorbus.wording import counted
 
 
-def try_in_place(
-    graph: Graph, steps: TreeSteps, edits: Edits, stage: Callable[[], int]
-) -> tuple[int, StepReport] | None:
+def try_in_place(graph: Graph, steps: Stepper, edits: Edits, stage: Callable[[], int]) -> tuple[int, StepReport] | None:
     """Make `edits`, add what `stage` brings, and step: the id of the first new factor, and the report.
 
-    None: this is no change for a step, or one that failed; then everything is as it was.  Raises the errors of `stage`.
+    None: this is no change for a step, or one that failed, or in another mode than "bayes-tree"; then everything is as
+    it was.  Raises the errors of `stage`.
     """
+    if not isinstance(steps, TreeSteps):
+        return None
     edit = FactorEdit(graph, steps.tree, edits)
     if not edit.is_possible:
         return None
@@ -34,7 +35,7 @@ def try_in_place(
             report = steps.step(settle=False)
             if _is_sound(graph, steps, report):
                 return first, report._replace(because=f"{_told(edit)}; {report.because}")
-            _put_back(graph, steps, report)
+            steps.restore(report)
     except SolverError:
         pass  # whether it can be made at all, and why not, is for a solver of what is left to say
     except BaseException:
@@ -57,15 +58,6 @@ def _is_sound(graph: Graph, steps: TreeSteps, report: StepReport) -> bool:
     """Whether everything that the step moved, and χ², is within bounds."""
     escaped = find_escaped(steps.changed(), graph.places) >= 0
     return not escaped and bool(np.isfinite(report.chi2) and np.isfinite(report.chi2_before))
-
-
-def _put_back(graph: Graph, steps: TreeSteps, report: StepReport) -> None:
-    """The values from before the step; the graph is as large as it was then."""
-    if report.strategy != "batch":
-        steps.tree.exchange()
-        return
-    used = int(graph.counts[at.VALUES])
-    graph.values[:used] = steps.before_batch[:used]
 
 
 def _told(edit: FactorEdit) -> str:

@@ -1,28 +1,32 @@
 """The least-squares problem of a graph as Gauss-Newton sees it: a point, normal equations, a step, a trial."""
 
+from typing import Generic, TypeVar
+
 import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import Graph
-from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import differing, move
+from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_loose
 from factorbus.solver.sparse.blocks import Blocks
+
+R = TypeVar("R", bound=Factor)
 
 _FREE_DIRECTION = (
     "together they leave it a direction to move in; add a prior, or a factor that measures what these do not"
 )
 
 
-class System:
+class System(Generic[R]):
     """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
 
     NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
 
-    def __init__(self, graph: Graph, factor: Incremental) -> None:
+    def __init__(self, graph: Graph, factor: R) -> None:
         self.graph = graph
         self.blocks = Blocks()
         self.factor = factor
@@ -134,11 +138,15 @@ class System:
         self._watch.lap("compare")
         return changed
 
+    def restore(self) -> None:
+        """Put the values as at the last `begin` back into the graph."""
+        used = int(self.graph.counts[at.VALUES])
+        self.graph.values[:used] = self._before[:used]
+
     def take_back(self, fill: tuple[int, int]) -> None:
         """Values as at `begin`, Λ and η as when the pattern had `fill`; the graph is back at that moment already."""
         if self._moved:
-            used = int(self.graph.counts[at.VALUES])
-            self.graph.values[:used] = self._before[:used]
+            self.restore()
             self._moved = False
         self.blocks.forget(self.graph, fill)
         self._have_lambda, self.drifted = True, False

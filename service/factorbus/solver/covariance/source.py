@@ -1,0 +1,53 @@
+"""Where the covariances of a solver come from: its R in the mode "bayes-tree", else one that is made for them."""
+
+from collections.abc import Callable
+from functools import partial
+
+from factorbus.solver.bayes_tree.steps import TreeSteps
+from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
+from factorbus.solver.covariance.live import Live
+from factorbus.solver.covariance.upkeep import Upkeep
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import F64, I64
+from factorbus.solver.stepper import Stepper
+
+
+class CovarianceSource:
+    """R of a graph as of the last step, for covariances."""
+
+    def __init__(self, graph: Graph, stepper: Stepper) -> None:
+        self._graph = graph
+        self._tree = stepper.tree if isinstance(stepper, TreeSteps) else None
+        self._live = Live(graph, self._tree) if self._tree else None
+
+    def factored(self) -> Factored:
+        """A copy of R and of all that it is of, for other threads.
+
+        In the mode "bayes-tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        """
+        return factored(self._graph, self._tree) if self._tree else factored_anew(self._graph)
+
+    def factoring(self) -> Callable[[], Factored]:
+        """What gives `factored` as of now, on any thread and later: R is copied here, or else what it is made from."""
+        if self._tree:
+            found = self.factored()
+            return lambda: found
+        return partial(factored_anew, self._graph.copied())
+
+    def try_view(self) -> Factored | None:
+        """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
+
+        None: this mode keeps no R that could be read in place; `factored` makes one.
+        """
+        return viewed(self._graph, self._tree) if self._tree else None
+
+    def try_upkeep(self) -> Upkeep | None:
+        """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""
+        return Upkeep(self._graph, self._tree) if self._tree else None
+
+    def try_joint(self, variables: I64) -> F64 | None:
+        """The joint covariance of a few different free variables (by index) as of the last step, read from R in place.
+
+        None: as for `try_view`.
+        """
+        return self._live.joint(variables) if self._live else None
