@@ -42,7 +42,7 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
     try:
         settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
-        raise JournalOption(str(bad.detail["name"]), bad.message) from None
+        raise JournalOption(str(bad.detail["where"]), bad.message) from None
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
