@@ -16,7 +16,7 @@ TWINS = (
     {"client/aio", "client/map"},
     {"client/aio", "client/features"},
     {"client/aio_uncertainty", "client/uncertainty"},
-    {"solver/kernels/simd_checked", "solver/kernels/simd_llvm", "solver/kernels/simd_plain"},
+    {"solver/kernels/jit/simd_checked", "solver/kernels/jit/simd_llvm", "solver/kernels/jit/simd_plain"},
     {
         "solver/covariance/kernels/tiles_checked",
         "solver/covariance/kernels/tiles_llvm",

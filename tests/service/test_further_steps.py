@@ -118,7 +118,7 @@ def test_further_steps_lead_to_the_optimum_and_tell_what_they_change(tmp_path: P
 @pytest.mark.parametrize("mode", ALL_MODES)
 def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_path: Path, mode: str) -> None:
     """With all tries, as a service has it: where a step says `converged` there is up to a thousandth left."""
-    map_ = Written(tmp_path / "m", mode, max_iterations=10, nonmonotone_steps=20)
+    map_ = Written(tmp_path / "m", mode, max_iterations=10, max_nonmonotone_steps=20)
     world, judge = WORLDS["manhattan"](120, 7), Solver(Options(mode="all-batch"))
     for n, step in enumerate(world):
         (stepped,) = map_.fold(arrived(n + 1, step.batch))
@@ -133,7 +133,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     assert 1 <= len(steps) <= 3
     assert all(step.converged and step.further for step in steps)
     assert map_.folder.chi2() == pytest.approx(judge.step(settle=True).chi2, rel=1e-6)
-    again, late = (folder_in(mode, max_iterations=10, nonmonotone_steps=20) for _ in range(2))
+    again, late = (folder_in(mode, max_iterations=10, max_nonmonotone_steps=20) for _ in range(2))
     assert recover(map_.store, again).same
     late.load(state)
     assert late.unfinished, "a snapshot knows"

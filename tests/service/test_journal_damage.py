@@ -216,7 +216,7 @@ def test_whatever_is_damaged_is_said_or_all_there(tmp_path: Path, left: Callable
         "UPDATE epoch SET epoch = 78",
         "UPDATE epoch SET because = x'ff'",
         "UPDATE header SET value = 'inc-l' WHERE name = 'mode'",
-        """UPDATE header SET value = '{"mode": "bayes-tree", "tol": 6e-5}' WHERE name = 'options'""",
+        """UPDATE header SET value = '{"mode": "bayes-tree", "incremental_tolerance": 6e-5}' WHERE name = 'options'""",
         "UPDATE header SET value = '[1]' WHERE name = 'options'",
         "UPDATE header SET value = CAST(x'ff' AS TEXT) WHERE name = 'mode'",
         "DELETE FROM header WHERE name = 'seal'",

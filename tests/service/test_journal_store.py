@@ -44,7 +44,7 @@ def test_what_was_written_is_there_when_it_is_opened_again(store: Store) -> None
     store.close()
     again = open_store(store.path.parent)
     header = again.header()
-    assert (header.map, header.mode, header.options["tol"], header.epoch) == ("m", "inc-l", 1e-3, 77)
+    assert (header.map, header.mode, header.options["incremental_tolerance"], header.epoch) == ("m", "inc-l", 1e-3, 77)
     assert [(f.number, [(e.client, e.sequence) for e in f.entries]) for f in again.folds(1)] == [
         (2, [("a", 2)]),
         (3, [("a", 3), ("b", 2)]),

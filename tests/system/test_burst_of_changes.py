@@ -94,7 +94,7 @@ def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
         assert np.median([each.report["changed"] for each in reports]) < 1000
         viewer.estimate.wait_for(reports[-1].revision)
         asked = viewer.ask_estimate()
-        assert asked.revision == reports[-1].revision
+        assert asked.revision >= reports[-1].revision, "further steps may lie between"
         for group in asked.variables:
             for key, row in zip(group.keys.tolist(), group.values, strict=True):
                 assert viewer.estimate[key].tobytes() == row.tobytes()

@@ -6,7 +6,7 @@ import secrets
 import shutil
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,14 +35,14 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
 
-    known = tuple(field.name for field in fields(Options) if field.name != "clock")
+    known = tuple(Options().as_dict())
     for name in options:
         if name not in known:
             raise JournalOption(name, "there is no such option here" + nearest(name, known))
     try:
         settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
-        raise JournalOption(str(bad.detail["name"]), bad.message) from None
+        raise JournalOption(str(bad.detail["where"]), bad.message) from None
     return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
