@@ -6,7 +6,7 @@ import numpy as np
 
 from factorbus.solver import Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 
@@ -23,7 +23,7 @@ class Clique:
     children: list[int]
 
 
-def tree_of(solver: Solver) -> Tree:
+def tree_of(solver: Solver) -> CliqueTree:
     """The tree of a solver in the mode "bayes-tree"."""
     assert isinstance(solver._stepper, TreeSteps)
     return solver._stepper.tree

@@ -223,7 +223,7 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
     tried: list[Solver] = []
 
     def refuse(solver: Solver, settle: bool = False) -> Any:
-        if solver._goes_on:
+        if solver._stepper._goes_on:
             tried.append(solver)
             raise NotFinite("χ²")
         return true_step(solver, settle)
@@ -244,11 +244,11 @@ def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
     true_step = Solver.step
 
     def step(solver: Solver, settle: bool = False) -> Any:
-        goes_on = solver._goes_on
+        goes_on = solver._stepper._goes_on
         report = true_step(solver, settle)
         if goes_on:
             solver._graph.values[0] = 2 * MOST_NUMBER
-            solver._changed = np.arange(solver.variable_count)
+            solver._stepper._changed = np.arange(solver.variable_count)
         return report
 
     monkeypatch.setattr(Solver, "step", step)
@@ -329,7 +329,7 @@ class Waiting(Solver):
         self.begun, self.leave = threading.Semaphore(0), threading.Semaphore(0)
 
     def step(self, settle: bool = False) -> Any:
-        if self.factor_count == POSES and not settle and self._done.graph == self._graph.mark():
+        if self.factor_count == POSES and not settle and self._stepper.mark == self._graph.mark():
             self.begun.release()
             assert self.leave.acquire(timeout=PATIENCE_S)
         return super().step(settle)
@@ -420,7 +420,7 @@ def test_a_map_whose_steps_are_of_no_use_does_not_spin() -> None:
             if report.new_factors or report.new_variables:
                 return report._replace(converged=self.factor_count < POSES)
             steps.append(time.monotonic())
-            self._changed = self._changed[:0]
+            self._stepper._changed = self._stepper._changed[:0]
             return report._replace(converged=False, changed=0, damping=0.0)
 
     hosted = Hosted(Stuck(Options(mode="all-batch")))

@@ -202,8 +202,8 @@ def test_a_refused_step_leaves_values_and_graph_and_the_map_goes_on() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cholmod_gives_the_same_r(seed: int) -> None:
-    ours, theirs = Solver(Options.of(incremental_tolerance=0.0, reuse_factor=False)), Solver(
-        Options.of(incremental_tolerance=0.0, reuse_factor=False, backend="cholmod")
+    ours, theirs = Solver(Options.of(mode="inc-l", incremental_tolerance=0.0, reuse_factor=False)), Solver(
+        Options.of(mode="inc-l", incremental_tolerance=0.0, reuse_factor=False, backend="cholmod")
     )  # fmt: skip
     for batch in random_steps(seed, steps=12):
         for one in (ours, theirs):

@@ -8,7 +8,7 @@ import pytest
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import MUCH, evaluate_moved
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL
@@ -49,7 +49,7 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
         np.testing.assert_array_equal(through[4], one_by_one[4])
 
 
-def found(solver: Solver, tree: Tree, moved: np.ndarray, bent: float, variables: int) -> tuple:
+def found(solver: Solver, tree: CliqueTree, moved: np.ndarray, bent: float, variables: int) -> tuple:
     """The largest error, Σ error² by factor, who waits, ascending, how each is marked, and χ² by factor."""
     graph, state, node, account = solver._graph, tree.state.copy(), tree.node.copy(), tree.account.copy()
     pending, listed, stiff = tree.pending.copy(), np.zeros_like(tree.moved), tree.stiff.copy()

@@ -33,10 +33,10 @@ def rows(solver: Solver) -> list[bytes]:
 @pytest.mark.parametrize("seed", range(12))
 def test_the_same_graph(seed: int) -> None:
     packed, plain = Solver(), Solver()
-    plain._packing = Never()
+    plain._staging._packing = Never()
     taken = 0
     for batch in random_steps(seed):
-        taken += packed._packing.pack(batch) is not None
+        taken += packed._staging._packing.pack(batch) is not None
         assert packed.stage(batch) == plain.stage(batch)
         assert rows(packed) == rows(plain)
         packed.step()

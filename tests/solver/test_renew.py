@@ -10,7 +10,7 @@ from naive.tree_solution import assert_solves
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan, sphere
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 
 OFTEN = {
@@ -105,7 +105,7 @@ def unheld(n: int) -> Batch:
     )
 
 
-def used_numbers(tree: Tree) -> int:
+def used_numbers(tree: CliqueTree) -> int:
     """Doubles of blocks in use."""
     return int(tree.state[tl.S_NUMBERS] - tree.state[tl.S_IDLE])
 
@@ -126,18 +126,18 @@ def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> Non
     wide = Solver(Options.of(**OFTEN))
     for where in ("graph.factor_graph", "bayes_tree.tree"):
         monkeypatch.setattr(f"factorbus.solver.{where}.roomy", lambda need, _size: need)
-    grown, make_room = list[int](), Tree._make_room
+    grown, make_room = list[int](), CliqueTree._make_room
     tight = Solver(Options.of(**OFTEN))
     tree = tree_of(tight)
     tree.numbers = tree.numbers[: int(tree.state[tl.S_NUMBERS])].copy()
     tree.link, tree.stiff, tree.hessian = tree.link[:1].copy(), tree.stiff[:1].copy(), tree.hessian[:121].copy()
 
-    def watched(tree: Tree) -> None:
+    def watched(tree: CliqueTree) -> None:
         if tree.state[tl.S_RELINEARISED] > 0:
             grown.append(1)
         make_room(tree)
 
-    monkeypatch.setattr(Tree, "_make_room", watched)
+    monkeypatch.setattr(CliqueTree, "_make_room", watched)
     for batch in steps("manhattan", 200):
         for solver in (wide, tight):
             solver.stage(batch)

@@ -11,7 +11,7 @@ from naive.random_graphs import random_steps
 from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.factor_graph import Graph, roomy
 from factorbus.solver.kernels.model import layout as at
 
@@ -49,8 +49,8 @@ def account(report: Any) -> dict[str, Any]:
 def test_room_makes_no_difference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("factorbus.solver.graph.factor_graph.roomy", lambda need, _size: need)
     monkeypatch.setattr("factorbus.solver.bayes_tree.tree.roomy", lambda need, _size: need)
-    grown, make_room = list[int](), Tree._make_room
-    monkeypatch.setattr(Tree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
+    grown, make_room = list[int](), CliqueTree._make_room
+    monkeypatch.setattr(CliqueTree, "_make_room", lambda tree: (grown.append(1), make_room(tree))[1])
     tight, wide = cramped(), Solver(Options())
     for n, batch in enumerate(random_steps(seed, steps=60)):
         assert tight.stage(batch) == wide.stage(batch)

@@ -19,7 +19,7 @@ def state(solver: Solver) -> list[bytes]:
         *(graph.keys[:variables], graph.var[:variables], graph.fac[:factors], graph.values[:values]),
         *(graph.payload[:payload], graph.dims[:columns], graph.stamps[:variables], graph.counts),
         *(blocks.pattern[:, : blocks.fill[0]], blocks.fill, blocks.data[: blocks.fill[1]], blocks.eta[:scalars]),
-        np.array([solver.chi2(), solver._done.unsolved, solver._done.damping]),
+        np.array([solver.chi2(), solver._stepper._done.unsolved, solver._stepper._done.damping]),
     ]
     return [array.tobytes() for array in arrays]
 
@@ -49,7 +49,7 @@ def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) 
         elif refuse[n]:
             tried.step()
             spared.step()
-        if refuse[n] and tried.variable_count == tried._done.graph[0]:
+        if refuse[n] and tried.variable_count == tried._stepper.mark[0]:
             before = state(tried)
             tried.stage(loose_ends(rng))
             with pytest.raises(errors.Underconstrained) as caught:

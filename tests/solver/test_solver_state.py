@@ -108,7 +108,7 @@ def test_what_no_state_can_hold_is_an_error_and_so_is_a_state_of_something_else(
     with pytest.raises(ValueError, match="no state of Solver: _graph"):
         Solver().load({name: value for name, value in state.items() if name != "_graph"})
     with pytest.raises(ValueError, match="in one of them only"):
-        Solver(Options(mode="bayes-tree")).load(Solver(Options(mode="bayes-tree")).dump() | {"_tree": {"_tree": {}}})
+        Solver(Options(mode="bayes-tree")).load(Solver(Options(mode="bayes-tree")).dump() | {"_stepper": {"_tree": {}}})
 
 
 def test_a_state_with_other_arrays_is_refused() -> None:

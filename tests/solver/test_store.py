@@ -8,7 +8,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.allocator import (
     AHEAD,
@@ -82,7 +82,7 @@ def test_neighbours_that_are_free_serve_a_larger_request() -> None:
     assert state[tl.S_NUMBERS] == before
 
 
-def blocks_of(tree: Tree) -> list[tuple[int, int]]:
+def blocks_of(tree: CliqueTree) -> list[tuple[int, int]]:
     """(start, size) of the blocks of all cliques."""
     gone, c = set[int](), int(tree.state[tl.S_FREE_CLIQUE])
     while c >= 0:
@@ -109,7 +109,7 @@ def test_what_a_drive_leaves_free_is_used_again() -> None:
             most = (int(tree.state[tl.S_NUMBERS]) - fr.SCRATCH) / sum(size for _, size in used)
     # A relinearisation of everything has the old and the new at once, which are two.
     assert most < 2.1
-    kept = solver.dump()["_tree"]["_tree"]["numbers"]
+    kept = solver.dump()["_stepper"]["_tree"]["numbers"]
     assert kept.size == tree.state[tl.S_NUMBERS] < tree.numbers.size
 
 

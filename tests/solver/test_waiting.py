@@ -9,7 +9,7 @@ from naive.tree_records import tree_of
 from factorbus.proto.messages import Batch
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import burden, dearness
 from factorbus.solver.kernels.model import layout as at
@@ -23,12 +23,12 @@ NEVER = {
 }
 
 
-def waiting(tree: Tree) -> np.ndarray:
+def waiting(tree: CliqueTree) -> np.ndarray:
     """The variables that wait."""
     return tree.pending[: tree.state[tl.S_PENDING]].copy()
 
 
-def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[tuple[Tree, np.ndarray, bool]]:
+def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[tuple[CliqueTree, np.ndarray, bool]]:
     """The tree after every step; what waited before it; whether that was due."""
     for batch in steps:
         tree = tree_of(solver)

@@ -25,6 +25,7 @@ from factorbus.solver.kernels.sparse.fronts import LANES
 from factorbus.solver.modes import mode_named
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
+from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.stepper import Stepper
 
@@ -42,6 +43,8 @@ class Solver:
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
+        if self._options.backend == "cholmod":
+            require_cholmod()
         self._graph = Graph()
         steps = TreeSteps if mode_named(self._options.mode).tree else IncrementalSteps
         self._stepper: Stepper = steps(self._graph, self._options)

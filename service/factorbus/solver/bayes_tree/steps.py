@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -52,7 +52,7 @@ class TreeSteps:
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._options = graph, options
-        self._tree = Tree(graph, options)
+        self._tree = CliqueTree(graph, options)
         self._mark = graph.mark()
         self._first_new, self._batched, self._held = 0, False, False
         self._bounded = True  # whether the last step ended within its bound
@@ -60,7 +60,7 @@ class TreeSteps:
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
     @property
-    def tree(self) -> Tree:
+    def tree(self) -> CliqueTree:
         """For tests."""
         return self._tree
 

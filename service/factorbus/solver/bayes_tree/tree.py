@@ -27,7 +27,7 @@ from factorbus.solver.sparse.lending import BOARD
 _FEW = 8  # new variables for which good first values are looked for
 
 
-class Tree(Arenas):
+class CliqueTree(Arenas):
     """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = records.Tree._fields

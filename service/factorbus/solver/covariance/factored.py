@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.recursion import list_cliques
 from factorbus.solver.covariance.kernels.rows import copy_rows, rows_size
 from factorbus.solver.graph.factor_graph import Graph
@@ -45,12 +45,12 @@ class Factored:
         return len(self.node)
 
 
-def factored(graph: Graph, tree: Tree) -> Factored:
+def factored(graph: Graph, tree: CliqueTree) -> Factored:
     """A copy of what `tree` has of `graph`, as of its last step."""
     return _copied(graph.copied(), tree)
 
 
-def viewed(graph: Graph, tree: Tree) -> Factored:
+def viewed(graph: Graph, tree: CliqueTree) -> Factored:
     """The same in place, until the next step: for what goes up from a few variables."""
     count = int(graph.counts[at.VARIABLES])
     return Factored(
@@ -65,7 +65,7 @@ def factored_anew(graph: Graph) -> Factored:
     values = copy.values.copy()
     # The graph is solved, so all of it is held; and the linearisation points are the estimate.  They stay there, in one
     # round, wherever what is left of the gradient leads.
-    tree = Tree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1, converged_share=np.inf))
+    tree = CliqueTree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1, converged_share=np.inf))
     if tree.step(sure=True) == tl.FAILED:
         key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
         raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")
@@ -78,7 +78,7 @@ def dims_of(var: I64) -> I64:
     return DIMS[var[:, at.V_KIND]]
 
 
-def _copied(graph: Graph, tree: Tree) -> Factored:
+def _copied(graph: Graph, tree: CliqueTree) -> Factored:
     count, state = int(graph.counts[at.VARIABLES]), tree.state
     node, clique = tree.node[:count].copy(), tree.clique[: state[tl.S_CLIQUES]].copy()
     order = np.empty(int(state[tl.S_ALIVE]), np.int64)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.factored import DIMS
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.graph.factor_graph import Graph
@@ -13,7 +13,7 @@ from factorbus.solver.kernels.model import layout as at
 class Live:
     """What the last step left.  For the thread that steps."""
 
-    def __init__(self, graph: Graph, tree: Tree) -> None:
+    def __init__(self, graph: Graph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
     def joint(self, variables: I64) -> F64:

@@ -8,7 +8,7 @@ negligible; so that this and rounding errors do not add up, all blocks are compu
 
 import numpy as np
 
-from factorbus.solver.bayes_tree.tree import Tree
+from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.factored import DIMS, LARGEST
 from factorbus.solver.covariance.kernels.loops import DONE, work_in
 from factorbus.solver.covariance.kernels.paths import joint_block
@@ -39,7 +39,7 @@ _SIZES = _RESIDUAL.tolist()
 class Upkeep:
     """Diagonal blocks of a map, as of the last `update`.  For the thread that steps."""
 
-    def __init__(self, graph: Graph, tree: Tree) -> None:
+    def __init__(self, graph: Graph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
         self._count, self._factors, self._step, self._age = 0, 0, -1, 0
         self._width = 1

@@ -9,7 +9,7 @@ from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.blocks import Blocks
 from factorbus.solver.sparse.cholesky import Cholesky
-from factorbus.solver.sparse.cholmod import factorize_by_cholmod, require_cholmod
+from factorbus.solver.sparse.cholmod import factorize_by_cholmod
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
@@ -24,8 +24,6 @@ class Elimination:
 
     def __init__(self, options: Options) -> None:
         self._options = options
-        if options.backend == "cholmod":
-            require_cholmod()
         self._cholesky = Cholesky()
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
