@@ -9,7 +9,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.graph.factors import FACTOR_KINDS
-from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import FACTOR_MODELS
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 
@@ -23,7 +23,7 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def test_these_are_the_kinds_that_place_nobody() -> None:
-    assert {kind.name for kind in FACTOR_KINDS.values() if kind.code >= at.POSITION_SE2} == set(OTHERS)
+    assert {n for n, model in FACTOR_MODELS.items() if not model.initializes and model.lens_at < 0} == set(OTHERS)
     batches = list(other_steps(1))
     assert {group.kind for batch in batches for group in batch.factors} >= set(OTHERS)
 
