@@ -8,7 +8,10 @@ from pathlib import Path
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS, FactorKind
 
 README = Path(__file__).with_name("README.md")
-_HEAD = "| factor | connects | measured z | residual r (its order is the order of the information matrix) |\n|---|---|---|---|\n"
+_HEAD = """\
+| factor | connects | measured z | residual r (its order is the order of the information matrix) |
+|---|---|---|---|
+"""
 
 
 def main() -> None:
