@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import FACTOR_KINDS, LOSSES
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, FactorKind
 from factorbus.proto.messages import (
     Batch,
     Change,
@@ -48,6 +48,7 @@ _COLUMNS |= {"stamps": "i64"}
 def main() -> None:
     """Write all vectors."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    (folder / "kinds").mkdir(exist_ok=True)
     for name, data in vectors().items():
         (folder / f"{name}.msgpack").write_bytes(data)
         (folder / f"{name}.json").write_text(described(data))
@@ -57,6 +58,10 @@ def vectors() -> dict[str, bytes]:
     """The golden messages by name."""
     return {
         **_KITCHEN["messages"](),
+        **{
+            f"kinds/{name}": codec.encode_insert(Insert(1, _one_of(kind), epoch=7))
+            for name, kind in FACTOR_KINDS.items()
+        },
         "insert_all_kinds": codec.encode_insert(Insert(3, _every_kind(), epoch=7)),
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
@@ -160,6 +165,13 @@ def _other_kinds() -> Batch:
             Factors("linear_pair_se3", np.array([[y, y + 1]]), np.array([[*turned, *turned, *H3, *H3, *b3]]), unit6),
         )
     )
+
+
+def _one_of(kind: FactorKind) -> Batch:
+    """A factor of this kind that measures the example of its declaration."""
+    keys = np.array([[symbol("x", n) for n in range(1, 1 + len(kind.connects))]])
+    unit = np.eye(kind.dim)[np.triu_indices(kind.dim)]
+    return Batch(factors=(Factors(kind.name, keys, np.array([kind.example]), unit[None]),))
 
 
 def _linear_kinds() -> Batch:

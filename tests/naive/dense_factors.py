@@ -48,7 +48,7 @@ def boxplus(kind: str, x: np.ndarray, delta: np.ndarray) -> np.ndarray:
 
 
 def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
-    """r of a kind of factor at the values of its variables."""
+    """r of a kind of factor at the values of its variables.  Raises KeyError: it has no twin yet."""
     if kind in ("idp_first", "idp_seen", "point_seen"):
         return _sight(kind, *ends, z)
     if kind.startswith("linear"):
@@ -62,7 +62,14 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind.startswith("between"):
         relative = np.linalg.inv(pose_matrix(ends[0])) @ pose_matrix(ends[1])
         return _pose_error(np.linalg.inv(pose_matrix(z)) @ relative)
-    seen = (np.linalg.inv(pose_matrix(ends[0])) @ np.append(ends[1], 1.0))[:-1]
+    if kind.startswith(("landmark", "range", "bearing")):
+        return _of_a_point(kind, *ends, z)
+    raise KeyError(f"the kind {kind!r} has no dense twin; write its residual here")
+
+
+def _of_a_point(kind: str, pose: np.ndarray, point: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Of a point as a pose sees it: where, how far, in which direction."""
+    seen = (np.linalg.inv(pose_matrix(pose)) @ np.append(point, 1.0))[:-1]
     if kind.startswith("range"):
         return np.array([np.linalg.norm(seen)]) - z
     if kind == "bearing_se2":

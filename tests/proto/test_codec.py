@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from factorbus.proto import codec
-from factorbus.proto.kinds import CHANGES, FACTOR_KINDS, LOSSES, VARIABLE_KINDS
+from factorbus.proto.kinds import CHANGES, FACTOR_KINDS, LOSSES, VARIABLE_KINDS, FactorKind
 from factorbus.proto.limits import Limits
 from factorbus.proto.messages import (
     Accepted,
@@ -77,8 +77,15 @@ def message_of(vector: str) -> str | None:
 
 
 def test_every_vector_is_in_the_tree_and_no_other() -> None:
-    assert {path.stem for path in VECTORS.glob("*.msgpack")} == set(GOLDEN)
-    assert {path.stem for path in VECTORS.glob("*.json")} == set(GOLDEN)
+    for ending in ("msgpack", "json"):
+        files = (*VECTORS.glob(f"*.{ending}"), *VECTORS.glob(f"kinds/*.{ending}"))
+        assert {str(file.relative_to(VECTORS).with_suffix("")) for file in files} == set(GOLDEN)
+
+
+@pytest.mark.parametrize("kind", FACTOR_KINDS.values(), ids=lambda kind: kind.name)
+def test_every_kind_has_its_golden_message(kind: FactorKind) -> None:
+    (group,) = codec.decode_insert((VECTORS / "kinds" / f"{kind.name}.msgpack").read_bytes()).batch.factors
+    assert (group.kind, tuple(group.measured[0].tolist())) == (kind.name, kind.example)
 
 
 @pytest.mark.parametrize("name", GOLDEN)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,12 @@ def every_problem(base: type[problems.Problem]) -> set[str]:
 def test_every_kind_is_explained() -> None:
     for name in [*VARIABLE_KINDS, *FACTOR_KINDS]:
         assert f"| `{name}` |" in CONTRACT
+
+
+def test_the_table_of_factors_is_written_from_the_declarations() -> None:
+    """`python proto/kinds_table.py` writes it."""
+    script = runpy.run_path(str(Path(__file__).parents[2] / "proto" / "kinds_table.py"))
+    assert script["found"](CONTRACT) == script["table"]()
 
 
 def test_every_code_is_explained() -> None:

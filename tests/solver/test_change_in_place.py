@@ -21,6 +21,7 @@ from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import BOUNDED, LINEAR
 
 WORLDS: dict[str, Callable[[int], Iterator[Batch]]] = {
     "robots": lambda seed: random_steps(seed, steps=9),
@@ -69,7 +70,7 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     assert tree.state[tl.S_FACTORS] == tree.state[tl.S_TAKEN] == count
     assert tree.state[tl.S_EXACT] == np.count_nonzero(tree.link[:count, tl.L_KIND] >= tl.EXACT)
     robust = graph.fac[:count, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
-    exact = robust | (graph.fac[:count, at.F_KIND] >= at.IDP_FIRST)
+    exact = robust | (~BOUNDED[graph.fac[:count, at.F_KIND]])
     assert ((tree.link[:count, tl.L_KIND] >= tl.EXACT) == exact).all()
     ends = graph.fac[:count, [at.F_I, at.F_J]]
     for v in range(solver.variable_count):
@@ -100,7 +101,7 @@ def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
 def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change]) -> list[Change]:
     """One to three changes of factors; `weighed` are those of weights, which may be taken back."""
     fac = solver._graph.fac[: solver.factor_count]
-    able = np.flatnonzero(fac[:, at.F_KIND] < at.LINEAR_SE2)
+    able = np.flatnonzero(~LINEAR[fac[:, at.F_KIND]])
     changes: list[Change] = []
     for _ in range(int(rng.integers(1, 4))):
         rows = rng.choice(able, size=min(int(rng.integers(1, 4)), able.size), replace=False)

@@ -19,6 +19,7 @@ from factorbus.solver.errors import UnknownFactor
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import BOUNDED
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
 DIM = {name: kind.dim for name, kind in VARIABLE_KINDS.items()}
@@ -189,7 +190,7 @@ def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
     for group in solver.estimate():
         of_kind.setdefault(group.kind, []).append(group.keys)
     for kind in FACTOR_KINDS.values():
-        if kind.code >= at.IDP_FIRST:  # what a camera sees is not drawn by chance
+        if not BOUNDED[kind.code]:  # what a camera sees, say, is not drawn by chance
             continue
         ends = [np.concatenate(of_kind[end.name]) for end in kind.connects]
         keys = np.array([[rng.choice(end) for end in ends] for _ in range(3)])

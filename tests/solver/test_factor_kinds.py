@@ -23,8 +23,11 @@ every_kind = pytest.mark.parametrize("kind", FACTOR_KINDS.values(), ids=str)
 
 
 def drawn(kind: FactorKind, rng: np.random.Generator) -> np.ndarray:
-    """A measurement of anything."""
-    return random_value({2: "point2", 3: "se2", 7: "se3"}[kind.size], rng)
+    """A measurement of anything: a pose or a point, or near the example of the declaration."""
+    of = {2: "point2", 3: "se2", 7: "se3"}.get(kind.size)
+    if of is None:
+        return np.array(wire.FACTOR_KINDS[kind.name].example) + rng.normal(0, 0.1, kind.size)
+    return random_value(of, rng)
 
 
 def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Graph]:

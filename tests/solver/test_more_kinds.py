@@ -8,8 +8,11 @@ from naive.random_others import OTHERS, other_steps
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.factors import FACTOR_KINDS
-from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import FACTOR_MODELS
+from factorbus.solver.sparse.elimination import constraint
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 
@@ -23,7 +26,7 @@ def by_key(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def test_these_are_the_kinds_that_place_nobody() -> None:
-    assert {kind.name for kind in FACTOR_KINDS.values() if kind.code >= at.POSITION_SE2} == set(OTHERS)
+    assert {n for n, model in FACTOR_MODELS.items() if not model.initializes and model.lens_at < 0} == set(OTHERS)
     batches = list(other_steps(1))
     assert {group.kind for batch in batches for group in batch.factors} >= set(OTHERS)
 
@@ -109,3 +112,14 @@ def test_what_cannot_be_measured_is_refused(name: str) -> None:
     with pytest.raises(error):
         solver.stage(Batch(ends, (Factors(kind, keys[None], z, _info(of.dim)),)))
     assert (solver.variable_count, solver.factor_count) == (0, 0)
+
+
+def test_a_pose_that_is_joined_to_the_last_one_by_a_linear_factor_is_no_landmark() -> None:
+    """Landmarks seen from the last pose are ordered right before it, and nothing else is."""
+    graph, keys = Graph(), np.arange(1, 5)
+    poses = Variables("se2", keys[:3], np.zeros((3, 3)))
+    point = Variables("point2", keys[3:], np.zeros((1, 2)))
+    pair = Factors("linear_pair_se2", keys[[2, 0]][None], np.zeros((1, 27)), _info(3))
+    seen = Factors("range_se2", keys[[2, 3]][None], np.ones((1, 1)), _info(1))
+    admit(graph, Batch((poses, point), (pair, seen)))
+    assert constraint(graph).tolist() == [0, 0, 2, 1]

@@ -17,9 +17,6 @@ from factorbus.proto.problems import BadInformation, BadLoss, BadShape
 # How far an information matrix may be from symmetric, relative to its largest entry: rounding, not meaning.
 _ASYMMETRY = 1e-9
 
-# Of these the last three rows of the residual are the vector part of a quaternion: half an angle.
-_HALF_ANGLES = ("prior_se3", "between_se3")
-
 # Scales of losses given by name alone, standard deviations.  Those of huber, cauchy and tukey keep 95 % of the
 # efficiency of least squares where one number is measured and its noise is Gaussian.
 DEFAULT_SCALES = types.MappingProxyType(
@@ -134,7 +131,7 @@ def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
         raise BadShape(f"{where}: sigmas", seen, f"({dim},), one for each number of the residual{rows}")
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         raise BadInformation(f"{where}: sigmas", sigmas.tolist(), "positive finite numbers")
-    if kind in _HALF_ANGLES:
+    if kind in FACTOR_KINDS and FACTOR_KINDS[kind].half_angles:
         sigmas = sigmas * (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
     with np.errstate(over="ignore", divide="ignore", under="ignore"):
         information = 1.0 / sigmas**2

@@ -26,6 +26,7 @@ from factorbus.client.frames import (
 from factorbus.client.moved import moved_factors
 from factorbus.client.moved_linear import is_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
+from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
 from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import Problem
@@ -33,10 +34,7 @@ from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
 ABSOLUTE = ("refuse", "leave_out", "keep")
 _PRIORS = ("prior_se2", "prior_se3")
-_OF_THE_WORLD = (
-    *_PRIORS, "prior_point2", "prior_point3", "position_se2", "position_se3", "heading_se2", "attitude_se3",
-    *LINEAR,
-)  # fmt: skip
+_OF_THE_WORLD = tuple(name for name, kind in FACTOR_KINDS.items() if kind.is_absolute)
 _BETWEEN = ("between_se2", "between_se3")
 _SHOWN = 5
 

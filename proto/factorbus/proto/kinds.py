@@ -15,27 +15,54 @@ class VariableKind:
     size: int
     dim: int
     values: str
+    is_pose: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class FactorKind:
-    """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim."""
+    """One kind of factor: `size` numbers measured, a residual of `dim`, an information matrix dim × dim.
+
+    measured, residual: for people, and for the table in proto/README.md.  There the variables are a and b of two poses,
+    l of a point and y of a feature seen from pose a, and x, or x₁ and x₂, of others.  example: a measurement, for the
+    golden message of the kind.  half_angles: the last three rows of the residual are the vector part of a quaternion
+    """
 
     name: str
     connects: tuple[str, ...]
     size: int
     dim: int
     measured: str
+    residual: str
+    example: tuple[float, ...]
+    half_angles: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.example) != self.size:
+            raise ValueError(
+                f"the factor kind {self.name!r} measures {self.size} numbers and its example has {len(self.example)}; "
+                "give an example of a measurement"
+            )
 
     @property
     def information_size(self) -> int:
         """Numbers in the upper triangle of the information matrix, row by row."""
         return self.dim * (self.dim + 1) // 2
 
+    @property
+    def is_absolute(self) -> bool:
+        """Whether it is known in the map's frame, and not of variables relative to each other."""
+        return len(self.connects) == 1
+
+    @property
+    def sees_landmark(self) -> bool:
+        """Whether it connects a pose with what is no pose."""
+        return [VARIABLE_KINDS[end].is_pose for end in self.connects] == [True, False]
+
 
 _POSE2 = "x y (metres), theta (radians)"
 _POSE3 = "x y z (metres), unit quaternion qx qy qz qw"
 _PIXEL = "u v (pixels)"
+_RADTAN = (1.0, 400.0, 401.0, 320.0, 240.0, 0.0, -0.25, 0.125, 0.001, -0.002, 0.0)
 _LENS = "lens (11 numbers: `factorbus.proto.camera.Camera.lens`)"
 
 # What a factor that is far off may count instead of r'Wr, by the name of the loss; its scale is in standard deviations.
@@ -44,8 +71,8 @@ LOSSES = ("huber", "cauchy", "geman-mcclure", "tukey", "dcs")
 VARIABLE_KINDS = {
     kind.name: kind
     for kind in (
-        VariableKind("se2", 3, 3, _POSE2),
-        VariableKind("se3", 7, 6, _POSE3),
+        VariableKind("se2", 3, 3, _POSE2, is_pose=True),
+        VariableKind("se3", 7, 6, _POSE3, is_pose=True),
         VariableKind("point2", 2, 2, "x y (metres)"),
         VariableKind("point3", 3, 3, "x y z (metres)"),
         VariableKind("idp", 6, 6, "x y z of the first camera (metres), theta, phi (radians), rho (1/metre)"),
@@ -60,37 +87,153 @@ def _linear(*ends: str) -> FactorKind:
     rows = min(kind.dim for kind in kinds)
     values, blocks = sum(kind.size for kind in kinds), [f"{rows} x {kind.dim}" for kind in kinds]
     size = values + rows * sum(kind.dim for kind in kinds) + rows
+    y = [number for kind in kinds for number in (*[0.0] * (kind.size - 1), 1.0)]
+    example = (*y, *[0.25] * (size - values))
     if len(ends) == 1:
-        return FactorKind(name, ends, size, rows, f"y ({values}), H ({blocks[0]}), b ({rows})")
+        measured = f"y ({values}), H ({blocks[0]}, row by row), b ({rows})"
+        return FactorKind(name, ends, size, rows, measured, "H (x ⊟ y) + b", example)
     of_both = f"2 x {blocks[0]}" if blocks[0] == blocks[1] else " and ".join(blocks)
-    return FactorKind(name, ends, size, rows, f"y of both ({values}), H of both ({of_both}), b ({rows})")
+    measured = f"y of both ({values}), H of both ({of_both}), b ({rows})"
+    return FactorKind(name, ends, size, rows, measured, "H₁ (x₁ ⊟ y₁) + H₂ (x₂ ⊟ y₂) + b", example)
 
 
 FACTOR_KINDS = {
     kind.name: kind
     for kind in (
-        FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map"),
-        FactorKind("prior_se3", ("se3",), 7, 6, _POSE3 + ", in the map"),
-        FactorKind("prior_point2", ("point2",), 2, 2, "x y (metres), in the map"),
-        FactorKind("prior_point3", ("point3",), 3, 3, "x y z (metres), in the map"),
-        FactorKind("between_se2", ("se2", "se2"), 3, 3, _POSE2 + ": the second pose in the first one's frame"),
-        FactorKind("between_se3", ("se3", "se3"), 7, 6, _POSE3 + ": the second pose in the first one's frame"),
-        FactorKind("landmark_se2", ("se2", "point2"), 2, 2, "x y (metres): the point in the pose's frame"),
-        FactorKind("landmark_se3", ("se3", "point3"), 3, 3, "x y z (metres): the point in the pose's frame"),
-        FactorKind("bearing_range_se2", ("se2", "point2"), 2, 2, "bearing (radians), range (metres), from the pose"),
-        FactorKind("idp_first", ("se3", "idp"), 14, 6, f"{_PIXEL}, rho (1/metre), {_LENS}"),
-        FactorKind("idp_seen", ("se3", "idp"), 13, 2, f"{_PIXEL}, {_LENS}"),
-        FactorKind("point_seen", ("se3", "point3"), 13, 2, f"{_PIXEL}, {_LENS}"),
-        FactorKind("position_se2", ("se2",), 4, 2, "x y in the map, x y of the antenna on the robot (metres)"),
-        FactorKind("position_se3", ("se3",), 6, 3, "x y z in the map, x y z of the antenna on the robot (metres)"),
-        FactorKind("heading_se2", ("se2",), 1, 1, "theta in the map (radians)"),
+        FactorKind("prior_se2", ("se2",), 3, 3, _POSE2 + ", in the map", "z⁻¹ ∘ x as (x, y, wrap θ)", (1.0, 2.0, 0.5)),
         FactorKind(
-            "attitude_se3", ("se3",), 6, 3, "a direction as the robot sees it, the same in the map (any length)"
+            "prior_se3",
+            ("se3",),
+            7,
+            6,
+            _POSE3 + ", in the map",
+            "z⁻¹ ∘ x as (x, y, z, qx, qy, qz), sign with qw ≥ 0",
+            (1.0, 2.0, 3.0, 0.0, 0.0, 0.6, 0.8),
+            half_angles=True,
         ),
-        FactorKind("range_se2", ("se2", "point2"), 1, 1, "distance (metres)"),
-        FactorKind("range_se3", ("se3", "point3"), 1, 1, "distance (metres)"),
-        FactorKind("bearing_se2", ("se2", "point2"), 1, 1, "bearing (radians), from the pose"),
-        FactorKind("bearing_se3", ("se3", "point3"), 3, 3, "direction from the pose (any length)"),
+        FactorKind("prior_point2", ("point2",), 2, 2, "x y (metres), in the map", "x − z", (3.0, 4.0)),
+        FactorKind("prior_point3", ("point3",), 3, 3, "x y z (metres), in the map", "x − z", (3.0, 4.0, 5.0)),
+        FactorKind(
+            "between_se2",
+            ("se2", "se2"),
+            3,
+            3,
+            _POSE2 + ": the second pose in the first one's frame",
+            "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, wrap θ)",
+            (1.0, 0.0, 0.25),
+        ),
+        FactorKind(
+            "between_se3",
+            ("se3", "se3"),
+            7,
+            6,
+            _POSE3 + ": the second pose in the first one's frame",
+            "z⁻¹ ∘ (a⁻¹ ∘ b) as (x, y, z, qx, qy, qz), qw ≥ 0",
+            (1.0, 0.0, 0.5, 0.0, 0.0, 0.6, 0.8),
+            half_angles=True,
+        ),
+        FactorKind(
+            "landmark_se2",
+            ("se2", "point2"),
+            2,
+            2,
+            "x y (metres): the point in the pose's frame",
+            "Rₐᵀ (l − tₐ) − z",
+            (2.0, 1.0),
+        ),
+        FactorKind(
+            "landmark_se3",
+            ("se3", "point3"),
+            3,
+            3,
+            "x y z (metres): the point in the pose's frame",
+            "Rₐᵀ (l − tₐ) − z",
+            (2.0, 1.0, 0.5),
+        ),
+        FactorKind(
+            "bearing_range_se2",
+            ("se2", "point2"),
+            2,
+            2,
+            "bearing (radians), range (metres), from the pose",
+            "u = Rₐᵀ (l − tₐ): (wrap(atan2(u_y, u_x) − z₀), ‖u‖ − z₁)",
+            (0.25, 2.5),
+        ),
+        FactorKind(
+            "idp_first",
+            ("se3", "idp"),
+            14,
+            6,
+            f"{_PIXEL}, rho (1/metre), {_LENS}",
+            "((x, y, z) − tₐ, pixel(Rₐᵀ a) − (u, v), ρ − ρ₀) with a as below",
+            (330.0, 250.0, 0.25, *_RADTAN),
+        ),
+        FactorKind(
+            "idp_seen",
+            ("se3", "idp"),
+            13,
+            2,
+            f"{_PIXEL}, {_LENS}",
+            "pixel(Rₐᵀ a) − (u, v), a = ((x, y, z) − tₐ) ρ + m, m = (cos φ sin θ, −sin φ, cos φ cos θ)",
+            (330.0, 250.0, *_RADTAN),
+        ),
+        FactorKind(
+            "point_seen",
+            ("se3", "point3"),
+            13,
+            2,
+            f"{_PIXEL}, {_LENS}",
+            "pixel(Rₐᵀ (l − tₐ)) − (u, v)",
+            (330.0, 250.0, *_RADTAN),
+        ),
+        FactorKind(
+            "position_se2",
+            ("se2",),
+            4,
+            2,
+            "x y in the map, x y of the antenna on the robot (metres)",
+            "t + R λ − (x y), λ on the robot",
+            (4.0, 5.0, 0.5, 0.25),
+        ),
+        FactorKind(
+            "position_se3",
+            ("se3",),
+            6,
+            3,
+            "x y z in the map, x y z of the antenna on the robot (metres)",
+            "t + R λ − (x y z), λ on the robot",
+            (4.0, 5.0, 6.0, 0.5, 0.25, 0.0),
+        ),
+        FactorKind("heading_se2", ("se2",), 1, 1, "theta in the map (radians)", "wrap(θ_x − θ)", (0.75,)),
+        FactorKind(
+            "attitude_se3",
+            ("se3",),
+            6,
+            3,
+            "a direction as the robot sees it, the same in the map (any length)",
+            "Rᵀ g/‖g‖ − b/‖b‖, b as the robot sees it, g in the map",
+            (0.0, 0.1, -1.0, 0.0, 0.0, -9.81),
+        ),
+        FactorKind("range_se2", ("se2", "point2"), 1, 1, "distance (metres)", "‖l − tₐ‖ − z", (2.5,)),
+        FactorKind("range_se3", ("se3", "point3"), 1, 1, "distance (metres)", "‖l − tₐ‖ − z", (2.5,)),
+        FactorKind(
+            "bearing_se2",
+            ("se2", "point2"),
+            1,
+            1,
+            "bearing (radians), from the pose",
+            "wrap(atan2(u_y, u_x) − z), u = Rₐᵀ (l − tₐ)",
+            (-0.25,),
+        ),
+        FactorKind(
+            "bearing_se3",
+            ("se3", "point3"),
+            3,
+            3,
+            "direction from the pose (any length)",
+            "u/‖u‖ − z/‖z‖, u = Rₐᵀ (l − tₐ)",
+            (2.0, 1.0, 0.5),
+        ),
         *(_linear(kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
         *(_linear(kind, kind) for kind in ("se2", "se3", "point2", "point3", "idp")),
         *(_linear(*b) for b in (("se2", "point2"), ("se3", "point3"), ("se3", "idp"), ("point3", "idp"))),

@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 
-from factorbus.solver.kernels.jit.compile import machine
+from factorbus.solver.kernels.jit.compile import WIRE_KINDS, machine
 
 _LIBRARIES = ("scipy", "scikit-sparse")  # besides those that compile kernels
 
@@ -31,6 +31,7 @@ def _sources() -> str:
     for path in sorted(folder.rglob("*.py")):
         text = path.read_bytes()
         digest.update(f"{path.relative_to(folder).as_posix()} {len(text)}\n".encode() + text)
+    digest.update(WIRE_KINDS.read_bytes())
     return digest.hexdigest()[:12]
 
 

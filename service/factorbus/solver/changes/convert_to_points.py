@@ -15,6 +15,7 @@ from factorbus.solver.kernels.graph.admit import enter_keys
 from factorbus.solver.kernels.graph.linearity_index import linearity
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import LINEAR
 from factorbus.solver.lenses.layout import LENS_SIZE
 
 _TURNING = "turning features into points"
@@ -59,7 +60,7 @@ def pick_features(graph: Graph, keys: I64) -> I64:
 def is_held(graph: Graph) -> np.ndarray:
     """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
     fac, held = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
-    held[fac[fac[:, at.F_KIND] >= at.LINEAR_SE2, at.F_I : at.F_J + 1]] = True
+    held[fac[LINEAR[fac[:, at.F_KIND]], at.F_I : at.F_J + 1]] = True
     return held[:-1]
 
 

@@ -24,6 +24,7 @@ from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
 from factorbus.solver.kernels.bayes_tree.remove_rows import close_gaps, open_gaps
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import LINEAR
 from factorbus.solver.sparse.anchors import find_unheld
 
 # What nobody has any more of the payload or of the Hessians, as a share of all: with more everything is packed anew.
@@ -73,7 +74,7 @@ class FactorEdit:
         graph, state, counted = self._graph, self._tree.state, self._edits.counted
         if any(counted[each] for each in _OTHERS) or not self._rows.size or state[tl.S_RAISED]:
             return False
-        if (graph.fac[self._rows, at.F_KIND] >= at.LINEAR_SE2).any():  # pieces of negative weight among them
+        if LINEAR[graph.fac[self._rows, at.F_KIND]].any():  # pieces of negative weight among them
             return False
         hollow = state[tl.S_HOLES] > _MOST_HOLES * state[tl.S_HESSIAN]
         if hollow or graph.holes > _MOST_HOLES * graph.counts[at.PAYLOAD]:

@@ -20,6 +20,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
+from factorbus.solver.kernels.model.kinds import LINEAR_OF_ONE
 
 # Loops of so many numbers in all, and so many new variables, are worked in; with more all is computed anew.
 _MOST_RANKS, _MOST_NEW = 12, 8
@@ -111,7 +112,7 @@ class Upkeep:
         free = {v for v in range(old, self._count) if self._scalar[v] >= 0}
         loops = []
         for k, row in enumerate(self._graph.fac[first : self._factors].tolist()):
-            if at.LINEAR_SE2 <= row[at.F_KIND] < at.LINEAR_PAIR_SE2 and negative_rows(self._graph, first).size:
+            if LINEAR_OF_ONE[row[at.F_KIND]] and negative_rows(self._graph, first).size:
                 return None
             ends = [v for v in (row[at.F_I], row[at.F_J]) if v in free]
             if not ends:

@@ -26,6 +26,7 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     find_first_outside,
 )
+from factorbus.solver.kernels.model.kinds import LINEAR
 
 _I64 = np.dtype(np.int64)
 _F64 = np.dtype(np.float64)
@@ -213,7 +214,7 @@ def _bad_factor(
 
 def _number_out_of_bounds(kind: FactorKind, where: str, measured: F64, information: F64) -> errors.SolverError:
     """Of a measurement or an information matrix."""
-    plain = sum(end.size for end in kind.connects) if kind.name.startswith("linear") else kind.size
+    plain = sum(end.size for end in kind.connects) if LINEAR[kind.code] else kind.size
     for numbers, most in ((measured[:plain], MOST_NUMBER), (measured[plain:], MOST_LINEAR)):
         if not (np.abs(numbers) <= most).all():
             return out_of_bounds(f"the measurement of {where}", numbers, most)

@@ -23,6 +23,7 @@ from factorbus.solver.kernels.graph.admit import enter_keys, find_variable, remo
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
+from factorbus.solver.kernels.model.kinds import CAMERA
 from factorbus.solver.kernels.model.retract import gather, label_of
 
 Mark: TypeAlias = tuple[int, ...]
@@ -59,7 +60,7 @@ class Graph(Arenas):
     def sights(self) -> bool:
         """Whether any camera has seen anything."""
         kinds = self.fac[: self.counts[at.FACTORS], at.F_KIND]
-        return bool(((kinds >= at.IDP_FIRST) & (kinds < at.POSITION_SE2)).any())
+        return bool(CAMERA[kinds].any())
 
     def mark(self) -> Mark:
         """How much is in use now."""

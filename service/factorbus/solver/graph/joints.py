@@ -21,9 +21,10 @@ from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS
 from factorbus.solver.graph.quadratic import quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import LINEAR, LINEAR_OF_ONE
 from factorbus.wording import counted
 
-SINGLE = {n: k.code for n, k in FACTOR_KINDS.items() if at.LINEAR_SE2 <= k.code < at.LINEAR_PAIR_SE2}
+SINGLE = {name: kind.code for name, kind in FACTOR_KINDS.items() if LINEAR_OF_ONE[kind.code]}
 _MOST_TOGETHER, _MOST_PIECES = 2 * MOST, 32768  # variables and factors of one form
 # Of what the pieces say on the diagonal: a sum of them that is more negative than that is so by more than rounding.
 _ROUNDING = 1e-10
@@ -50,7 +51,7 @@ def negative_rows(graph: Graph, first: int = 0) -> I64:
     """Rows from `first` on of the factors with a negative definite Ω."""
     fac = graph.fac[first : graph.counts[at.FACTORS]]
     kind = fac[:, at.F_KIND]
-    rows = np.flatnonzero((kind >= at.LINEAR_SE2) & (kind < at.LINEAR_PAIR_SE2))
+    rows = np.flatnonzero(LINEAR_OF_ONE[kind])
     return first + rows[graph.payload[fac[rows, at.F_AT] + _SIZE[kind[rows]]] < 0.0]
 
 
@@ -134,7 +135,7 @@ def _linear(graph: Graph, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
     fac = graph.fac[first : graph.counts[at.FACTORS]]
     negative = np.zeros(len(fac), bool)
     negative[negative_rows(graph, first) - first] = True
-    return (fac[:, at.F_KIND] >= at.LINEAR_SE2) & ((fac[:, at.F_FLAGS] >> at.LOSS_SHIFT) == at.NO_LOSS), negative
+    return LINEAR[fac[:, at.F_KIND]] & ((fac[:, at.F_FLAGS] >> at.LOSS_SHIFT) == at.NO_LOSS), negative
 
 
 def _told_apart(graph: Graph, of: np.ndarray, negative: np.ndarray, first: int = 0) -> Iterator[Joint]:
@@ -164,7 +165,7 @@ def _is_number(graph: Graph, f: int) -> bool:
     """Whether a linear factor says nothing of its variable: H = 0."""
     kind, start = graph.fac[f, at.F_KIND], graph.fac[f, at.F_AT]
     begin = start + _H[kind]
-    return bool(kind < at.LINEAR_PAIR_SE2) and not graph.payload[begin : begin + _H_SIZE[kind]].any()
+    return bool(LINEAR_OF_ONE[kind]) and not graph.payload[begin : begin + _H_SIZE[kind]].any()
 
 
 def _connected(fac: I64, of: np.ndarray, negative: np.ndarray) -> list[Joint]:

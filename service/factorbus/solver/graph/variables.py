@@ -22,6 +22,7 @@ vector part (qx, qy, qz) of the error quaternion, its sign chosen so that qw ≥
 
 from dataclasses import dataclass
 
+from factorbus.proto import kinds as wire
 from factorbus.solver.kernels.model import layout
 
 
@@ -38,11 +39,9 @@ class VariableKind:
         return self.name
 
 
-SE2 = VariableKind("se2", layout.SE2, size=3, dim=3)
-SE3 = VariableKind("se3", layout.SE3, size=7, dim=6)
-POINT2 = VariableKind("point2", layout.POINT2, size=2, dim=2)
-POINT3 = VariableKind("point3", layout.POINT3, size=3, dim=3)
-IDP = VariableKind("idp", layout.IDP, size=6, dim=6)
-
-VARIABLE_KINDS = {kind.name: kind for kind in (SE2, SE3, POINT2, POINT3, IDP)}
+VARIABLE_KINDS = {
+    name: VariableKind(name, layout.VARIABLE_CODES[name], kind.size, kind.dim)
+    for name, kind in wire.VARIABLE_KINDS.items()
+}
 VARIABLE_KIND_OF_CODE = {kind.code: kind for kind in VARIABLE_KINDS.values()}
+SE2, SE3, POINT2, POINT3, IDP = (VARIABLE_KINDS[name] for name in ("se2", "se3", "point2", "point3", "idp"))

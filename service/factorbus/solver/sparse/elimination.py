@@ -5,6 +5,7 @@ import numpy as np
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import POSE, SEES_LANDMARK
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.blocks import Blocks
@@ -90,10 +91,10 @@ def constraint(graph: Graph, recent_poses: int = 1) -> I64:
     """
     group = np.zeros(int(graph.counts[at.COLUMNS]), np.int64)
     var = graph.var[: graph.counts[at.VARIABLES]]
-    poses = np.flatnonzero((var[:, at.V_KIND] <= at.SE3) & (var[:, at.V_COLUMN] >= 0))
+    poses = np.flatnonzero(POSE[var[:, at.V_KIND]] & (var[:, at.V_COLUMN] >= 0))
     if poses.size:
         fac = graph.fac[: graph.counts[at.FACTORS]]
-        fac = fac[(fac[:, at.F_KIND] >= at.LANDMARK_SE2) & (fac[:, at.F_J] >= 0)]
+        fac = fac[SEES_LANDMARK[fac[:, at.F_KIND]]]
         seen = fac[np.isin(fac[:, at.F_I], poses[-recent_poses:]), at.F_J]
         columns = var[seen, at.V_COLUMN]
         group[columns[columns >= 0]] = _RECENT_LANDMARK

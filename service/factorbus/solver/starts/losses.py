@@ -19,11 +19,11 @@ def weights_of(loss: I64, s: F64, scale: F64) -> F64:
     over = s > c
     weights = np.ones(s.size)
     for code, values in (
-        (at.HUBER, np.where(over, scale / np.sqrt(np.maximum(s, c)), 1.0)),
-        (at.CAUCHY, share),
-        (at.GEMAN_MCCLURE, share**2),
-        (at.TUKEY, np.where(over, 0.0, 1.0 - np.minimum(s / c, 1.0)) ** 2),
-        (at.DCS, np.where(over, (2.0 * share) ** 2, 1.0)),
+        (at.LOSS_CODES["huber"], np.where(over, scale / np.sqrt(np.maximum(s, c)), 1.0)),
+        (at.LOSS_CODES["cauchy"], share),
+        (at.LOSS_CODES["geman-mcclure"], share**2),
+        (at.LOSS_CODES["tukey"], np.where(over, 0.0, 1.0 - np.minimum(s / c, 1.0)) ** 2),
+        (at.LOSS_CODES["dcs"], np.where(over, (2.0 * share) ** 2, 1.0)),
     ):
         weights = np.where(loss == code, values, weights)
     return np.maximum(weights, 1e-6)

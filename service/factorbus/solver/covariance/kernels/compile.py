@@ -9,13 +9,13 @@ anything else there does not compile these anew.
 from pathlib import Path
 
 from factorbus.solver.kernels import jit
-from factorbus.solver.kernels.jit.compile import BOUNDSCHECK, DISABLED, F64, I64, KernelFolder
+from factorbus.solver.kernels.jit.compile import BOUNDSCHECK, DISABLED, F64, I64, WIRE_KINDS, KernelFolder
 
 __all__ = ["BOUNDSCHECK", "DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
 
 _KERNELS = Path(jit.__file__).parents[1]
 _BORROWED = ("model/layout", "bayes_tree/layout", "jit/simd", "jit/simd_llvm", "jit/simd_checked", "jit/simd_plain")
 _FOLDER = KernelFolder(
-    Path(__file__).parent, "kernels-covariance", also=tuple(_KERNELS / f"{name}.py" for name in _BORROWED)
+    Path(__file__).parent, "kernels-covariance", also=(*(_KERNELS / f"{name}.py" for name in _BORROWED), WIRE_KINDS)
 )
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

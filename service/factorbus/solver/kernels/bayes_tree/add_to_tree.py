@@ -10,6 +10,7 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
@@ -64,7 +65,7 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         link[f, tl.L_OWN] = link[f, tl.L_STAMP] = -1
         link[f, tl.L_KIND] = fac[f, at.F_KIND]
-        if fac[f, at.F_KIND] >= at.IDP_FIRST or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+        if not is_bounded(fac[f, at.F_KIND]) or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
             link[f, tl.L_KIND] = tl.EXACT
             state[tl.S_EXACT] += 1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]

@@ -20,6 +20,7 @@ from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.records import Graph, graph_at
 
 # Columns of the log of links that were changed: which one, of what, and the factor or incidence that it was.
@@ -169,7 +170,7 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
         di, dj = dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0
         last = link[f, tl.L_AT] + hessian_size(di, dj) - 1
         was, linear_was = stiff[f, tl.B_CHI2], hessian[last]
-        if fac[f, at.F_KIND] < at.IDP_FIRST:
+        if is_bounded(fac[f, at.F_KIND]):
             note_loss(f, fac, link, state)
         linearise_factor(graph, tree, f, scratch)
         weigh_factor(graph, tree, f, scratch)

@@ -48,6 +48,7 @@ import math
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_camera, lens_at
 from factorbus.solver.kernels.model.se3 import quat_product
 from factorbus.solver.lenses.layout import FU
 
@@ -135,8 +136,8 @@ def lever_of(kind: int, p: F64, k: int) -> float:
         return math.sqrt(p[k] * p[k] + p[k + 1] * p[k + 1] + p[k + 2] * p[k + 2])
     if kind == at.BEARING_RANGE_SE2:
         return p[k + 1]
-    if at.IDP_FIRST <= kind < at.POSITION_SE2:  # of a pixel: how many a radian has
-        return p[k + (4 if kind == at.IDP_FIRST else 3) + FU]
+    if is_camera(kind):  # of a pixel: how many a radian has
+        return p[k + lens_at(kind) + 1 + FU]
     return 0.0
 
 
@@ -149,7 +150,7 @@ def root_weight(kind: int, w: F64, d: float) -> float:
         return math.sqrt(max(w[0, 0], w[1, 1]))
     if kind == at.BETWEEN_SE3 or kind == at.LANDMARK_SE3:
         return math.sqrt(max(w[0, 0], w[1, 1], w[2, 2]))
-    if at.IDP_FIRST <= kind < at.POSITION_SE2:
+    if is_camera(kind):
         a = 3 if kind == at.IDP_FIRST else 0
         return math.sqrt(max(w[a, a], w[a + 1, a + 1]))
     return 0.0

@@ -8,6 +8,7 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
@@ -29,7 +30,7 @@ def exact_error(
     kind = fac[f, at.F_KIND]
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
     # It has fallen asleep, or woken.
-    switched = kind >= at.IDP_FIRST and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD)
+    switched = is_camera(kind) and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD)
     add_slope(fac[f, at.F_I], dim, var, delta, A, r)
     if fac[f, at.F_J] >= 0:
         add_slope(fac[f, at.F_J], dim, var, delta, B, r)

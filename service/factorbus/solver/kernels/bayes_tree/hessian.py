@@ -13,6 +13,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, six
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_camera
 from factorbus.solver.kernels.model.linearize import evaluate_apart, multiply
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
@@ -59,7 +60,7 @@ def linearise_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
         stiff[f, tl.B_PULL] = gradient_norm(3, h + 36 + 18 + 9, hessian)
     else:
         _write_other(graph, tree, f, more, scratch)
-        if kind >= at.IDP_FIRST:
+        if is_camera(kind):
             note_sleep(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
 
 

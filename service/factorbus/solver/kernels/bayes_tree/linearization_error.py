@@ -28,6 +28,7 @@ from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.records import Graph
 
 LEAST_BURDEN = 0.02
@@ -133,7 +134,7 @@ def evaluate_factor(
     node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
     lin, delta, error, full = tree.lin[0], tree.scalars[0], 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
-    if kind >= at.IDP_FIRST or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
+    if not is_bounded(kind) or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
         if how < MODEL:
             chi2 = any_chi2(f, var, fac, values, payload)
         else:

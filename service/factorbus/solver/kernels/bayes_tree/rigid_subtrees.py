@@ -23,6 +23,7 @@ from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.kinds import is_rigid
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se3 import rotation
 
@@ -41,11 +42,7 @@ def is_relative(f: int, var: I64, fac: I64) -> bool:
     kind, j = fac[f, at.F_KIND], fac[f, at.F_J]
     if j < 0 or var[j, at.V_COLUMN] < 0 or var[fac[f, at.F_I], at.V_COLUMN] < 0:
         return False
-    return (
-        at.BETWEEN_SE2 <= kind <= at.BEARING_RANGE_SE2
-        or kind == at.POINT_SEEN
-        or at.RANGE_SE2 <= kind <= at.BEARING_SE3
-    )
+    return is_rigid(kind)
 
 
 @part

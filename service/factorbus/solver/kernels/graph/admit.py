@@ -19,8 +19,9 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     are_within,
 )
+from factorbus.solver.kernels.model.kinds import direction_at, is_checked, is_linear, positive_at, quaternion_at
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.sizes import dim_of, kinds_of_ends, linear_ends, residual_dim, size_of
+from factorbus.solver.kernels.model.sizes import dim_of, kinds_of_ends, residual_dim, values_of_ends
 
 # A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
 _QUATERNION_TOLERANCE = 1e-3
@@ -182,12 +183,8 @@ def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scr
     """What is wrong with the new measurement that starts at p, or with its information."""
     if not (are_within_kind(kind, p, size, payload) and are_within(MOST_INFORMATION, p + size, triangle, payload)):
         return at.OUT_OF_BOUNDS
-    if size == 7 and not make_unit(payload, p + 3):
-        return at.BAD_QUATERNION
-    if kind == at.BEARING_RANGE_SE2 and not payload[p + 1] > 0.0:
-        return at.BAD_RANGE
-    if kind >= at.POSITION_SE2:
-        wrong = check_other(kind, p, payload)
+    if is_checked(kind):
+        wrong = check_measurement(kind, p, payload)
         if wrong != at.GOOD:
             return wrong
     dim = residual_dim(kind)
@@ -204,28 +201,24 @@ def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scr
 @inline_kernel
 def are_within_kind(kind: int, p: int, size: int, payload: F64) -> bool:
     """Whether the measurement that starts at p is within bounds; H and b of a linear factor are what R may hold."""
-    if kind < at.LINEAR_SE2:
+    if not is_linear(kind):
         return are_within(MOST_NUMBER, p, size, payload)
-    first, second = linear_ends(kind)
-    y = size_of(first) + (size_of(second) if second >= 0 else 0)
+    y = values_of_ends(kind)
     return are_within(MOST_NUMBER, p, y, payload) and are_within(MOST_LINEAR, p + y, size - y, payload)
 
 
 @part
-def check_other(kind: int, p: int, payload: F64) -> int:
-    """What is wrong with a measurement of the kinds from POSITION_SE2 on; directions and quaternions become unit."""
-    if (kind == at.RANGE_SE2 or kind == at.RANGE_SE3) and not payload[p] > 0.0:
+def check_measurement(kind: int, p: int, payload: F64) -> int:
+    """What is wrong with a measurement whose numbers are within bounds; directions and quaternions become unit."""
+    n = positive_at(kind)
+    if n >= 0 and not payload[p + n] > 0.0:
         return at.BAD_RANGE
-    attitude = kind == at.ATTITUDE_SE3
-    if (attitude or kind == at.BEARING_SE3) and not make_direction(payload, p):
-        return at.BAD_DIRECTION
-    if attitude and not make_direction(payload, p + 3):
-        return at.BAD_DIRECTION
-    if kind >= at.LINEAR_SE2:
-        first, second = linear_ends(kind)
-        if first == at.SE3 and not make_unit(payload, p + 3):
-            return at.BAD_QUATERNION
-        if second == at.SE3 and not make_unit(payload, p + size_of(first) + 3):
+    for e in range(2):
+        n = direction_at(kind, e)
+        if n >= 0 and not make_direction(payload, p + n):
+            return at.BAD_DIRECTION
+        n = quaternion_at(kind, e)
+        if n >= 0 and not make_unit(payload, p + n):
             return at.BAD_QUATERNION
     return at.GOOD
 

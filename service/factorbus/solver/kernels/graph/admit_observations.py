@@ -7,6 +7,7 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.kernels.model.kinds import is_camera, lens_at
 from factorbus.solver.lenses.layout import GOOD, VERTICAL
 from factorbus.solver.lenses.models import ray
 
@@ -22,7 +23,7 @@ def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payl
     r, A, B = np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         kind = fac[f, at.F_KIND]
-        if at.IDP_FIRST <= kind < at.POSITION_SE2:
+        if is_camera(kind):
             x, y, p = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
             status = status_of_pixel(kind, payload, p) if new else GOOD
             if status == GOOD:
@@ -38,6 +39,6 @@ def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payl
 @inline_kernel
 def status_of_pixel(kind: int, payload: F64, p: int) -> int:
     """GOOD where a ray belongs to the measured pixel."""
-    n = p + (3 if kind == at.IDP_FIRST else 2)
+    n = p + lens_at(kind)
     status, _, _, _, _, _, _, _, _, _ = ray(int(payload[n]), payload[n + 1 :], payload[p], payload[p + 1])
     return int(status)

@@ -9,6 +9,7 @@ import numpy as np
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
+from factorbus.solver.kernels.model.kinds import initializes
 from factorbus.solver.kernels.model.se2 import (
     compose_inverse_se2,
     compose_se2,
@@ -80,7 +81,7 @@ def reach_on(
 def follow(compose: bool, f: int, v0: int, var: I64, fac: I64, x: F64, p: F64, reached: I64) -> int:
     """The variable that factor `f` reaches now, or _NOTHING, or _WAITS: both ends are still out of reach."""
     kind, i, j, z = fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT]
-    if kind == at.IDP_SEEN or kind >= at.POINT_SEEN:  # a pixel alone places nothing, nor what is behind it in the list
+    if not initializes(kind):  # a pixel alone, say
         return _NOTHING
     has_i = i < v0 or reached[i - v0] != 0
     if j < 0:

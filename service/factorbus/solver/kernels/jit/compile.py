@@ -54,6 +54,7 @@ from numba.core.typing.templates import AttributeTemplate
 from numpy.typing import NDArray
 
 from factorbus.ownership import check_file, make_private
+from factorbus.proto import kinds
 
 # From beside this file: a copy of all three elsewhere is one by itself.
 from . import compile_time, lowering
@@ -64,6 +65,7 @@ __all__ = [
     "DISABLED",
     "F64",
     "I64",
+    "WIRE_KINDS",
     "AttributeTemplate",
     "KernelFolder",
     "cache_folder",
@@ -391,5 +393,6 @@ event.register("numba:compile", _COMPILATIONS)
 
 _KERNELS = Path(__file__).parents[1]
 _LENSES = _KERNELS.with_name("lenses")
-_FOLDER = KernelFolder(_KERNELS, "kernels", also=tuple(_LENSES.glob("*.py")))
+WIRE_KINDS = Path(kinds.__file__)  # kernels have its names and sizes as constants
+_FOLDER = KernelFolder(_KERNELS, "kernels", also=(*_LENSES.glob("*.py"), WIRE_KINDS))
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -3,6 +3,8 @@
 The arrays are those of `records.Graph`.
 """
 
+from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
+
 # Columns of `var`.
 V_KIND = 0
 V_AT = 1  # where its value starts in `values`
@@ -38,56 +40,42 @@ COUNTS = 7
 
 NO_STAMP = -(2**63)
 
-# Codes of the kinds of variables.
-SE2 = 0
-SE3 = 1
-POINT2 = 2
-POINT3 = 3
-IDP = 4
+# Codes of the kinds of variables and factors: their places in the wire's tables, whose order means nothing.  Named
+# here are kinds that the solver has code of its own for; what it has to know of any kind is in `kinds` and `sizes`.
+VARIABLE_CODES = {name: code for code, name in enumerate(VARIABLE_KINDS)}
+FACTOR_CODES = {name: code for code, name in enumerate(FACTOR_KINDS)}
+SE2 = VARIABLE_CODES["se2"]
+SE3 = VARIABLE_CODES["se3"]
+POINT2 = VARIABLE_CODES["point2"]
+POINT3 = VARIABLE_CODES["point3"]
+IDP = VARIABLE_CODES["idp"]
 
-# Codes of the kinds of factors.
-PRIOR_SE2 = 0
-PRIOR_SE3 = 1
-PRIOR_POINT2 = 2
-PRIOR_POINT3 = 3
-BETWEEN_SE2 = 4
-BETWEEN_SE3 = 5
-LANDMARK_SE2 = 6
-LANDMARK_SE3 = 7
-BEARING_RANGE_SE2 = 8
-IDP_FIRST = 9  # from here on: how far it is bent is computed, (9.11); and these three are what a camera sees
-IDP_SEEN = 10
-POINT_SEEN = 11
-POSITION_SE2 = 12  # from here on: kinds that nobody is placed by
-POSITION_SE3 = 13
-HEADING_SE2 = 14
-ATTITUDE_SE3 = 15
-RANGE_SE2 = 16
-RANGE_SE3 = 17
-BEARING_SE2 = 18
-BEARING_SE3 = 19
-LINEAR_SE2 = 20  # linear factors of one variable from here on, in the order of the codes of these
-LINEAR_SE3 = 21
-LINEAR_POINT2 = 22
-LINEAR_POINT3 = 23
-LINEAR_IDP = 24
-LINEAR_PAIR_SE2 = 25  # from here on: of two
-LINEAR_PAIR_SE3 = 26
-LINEAR_PAIR_POINT2 = 27
-LINEAR_PAIR_POINT3 = 28
-LINEAR_PAIR_IDP = 29
-LINEAR_PAIR_SE2_POINT2 = 30
-LINEAR_PAIR_SE3_POINT3 = 31
-LINEAR_PAIR_SE3_IDP = 32
-LINEAR_PAIR_POINT3_IDP = 33
+PRIOR_SE2 = FACTOR_CODES["prior_se2"]
+PRIOR_SE3 = FACTOR_CODES["prior_se3"]
+PRIOR_POINT2 = FACTOR_CODES["prior_point2"]
+PRIOR_POINT3 = FACTOR_CODES["prior_point3"]
+BETWEEN_SE2 = FACTOR_CODES["between_se2"]
+BETWEEN_SE3 = FACTOR_CODES["between_se3"]
+LANDMARK_SE2 = FACTOR_CODES["landmark_se2"]
+LANDMARK_SE3 = FACTOR_CODES["landmark_se3"]
+BEARING_RANGE_SE2 = FACTOR_CODES["bearing_range_se2"]
+IDP_FIRST = FACTOR_CODES["idp_first"]
+IDP_SEEN = FACTOR_CODES["idp_seen"]
+POINT_SEEN = FACTOR_CODES["point_seen"]
+POSITION_SE2 = FACTOR_CODES["position_se2"]
+POSITION_SE3 = FACTOR_CODES["position_se3"]
+HEADING_SE2 = FACTOR_CODES["heading_se2"]
+ATTITUDE_SE3 = FACTOR_CODES["attitude_se3"]
+BEARING_SE2 = FACTOR_CODES["bearing_se2"]
+BEARING_SE3 = FACTOR_CODES["bearing_se3"]
+LINEAR_SE2 = FACTOR_CODES["linear_se2"]
+LINEAR_SE3 = FACTOR_CODES["linear_se3"]
+LINEAR_PAIR_SE2 = FACTOR_CODES["linear_pair_se2"]
+LINEAR_PAIR_SE3 = FACTOR_CODES["linear_pair_se3"]
 
-# Codes of losses.
+# Codes of losses; 0: none.
 NO_LOSS = 0
-HUBER = 1
-CAUCHY = 2
-GEMAN_MCCLURE = 3
-TUKEY = 4
-DCS = 5
+LOSS_CODES = {name: 1 + code for code, name in enumerate(LOSSES)}
 
 # Scratch for a residual: six numbers at most, then what became of a sight (`factorbus.solver.lenses.layout`).
 R_STATUS = 6

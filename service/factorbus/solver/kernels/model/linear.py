@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.se2 import wrap
 from factorbus.solver.kernels.model.se3 import quat_product, rotation, turn_slope
-from factorbus.solver.kernels.model.sizes import dim_of, linear_dim, linear_ends, size_of
+from factorbus.solver.kernels.model.sizes import dim_of, kinds_of_ends, residual_dim, size_of
 
 
 @part
@@ -31,8 +31,8 @@ def linear_se2(x: F64, i: int, j: int, ends: int, p: F64, k: int, r: F64, A: F64
 @part
 def linear(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
     """Of any variables.  Payload: y of each end, H of each (rows × its tangent), b (rows)."""
-    first, second = linear_ends(kind)
-    rows, d, h = linear_dim(kind), dim_of(first), k + size_of(first)
+    first, second = kinds_of_ends(kind)
+    rows, d, h = residual_dim(kind), dim_of(first), k + size_of(first)
     b = h + rows * d
     if second >= 0:
         h += size_of(second)

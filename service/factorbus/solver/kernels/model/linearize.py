@@ -12,16 +12,9 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import sight
-from factorbus.solver.kernels.model.linear import linear, linear_se2
+from factorbus.solver.kernels.model.kinds import residual_of
 from factorbus.solver.kernels.model.losses import soften
-from factorbus.solver.kernels.model.points import prior_point2, prior_point3
-from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
-from factorbus.solver.kernels.model.range_bearing import bearing_se2, bearing_se3, range_se2, range_se3
-from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
-from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
 from factorbus.solver.kernels.model.sizes import end_dims, information_at, residual_dim
-from factorbus.solver.lenses.layout import GOOD
 
 
 @kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
@@ -58,62 +51,14 @@ def evaluate_apart(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: 
 @inline_kernel
 def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B: F64) -> float:
     """The residual kernel of the kind of factor `f`, and its loss; gives what χ² has beside rᵀ Ω r."""
-    more = 0.0
     kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
     i = var[fac[f, at.F_I], at.V_AT]
     j = var[max(fac[f, at.F_J], 0), at.V_AT]
-    if kind == at.BETWEEN_SE2:
-        between_se2(x, i, j, payload, p, r, A, B)
-    elif kind == at.LANDMARK_SE2:
-        landmark_se2(x, i, j, payload, p, r, A, B)
-    elif kind == at.BEARING_RANGE_SE2:
-        bearing_range_se2(x, i, j, payload, p, r, A, B)
-    elif kind == at.PRIOR_SE2:
-        prior_se2(x, i, j, payload, p, r, A, B)
-    elif kind == at.BETWEEN_SE3:
-        between_se3(x, i, j, payload, p, r, A, B)
-    elif kind == at.LANDMARK_SE3:
-        landmark_se3(x, i, j, payload, p, r, A, B)
-    elif kind == at.PRIOR_SE3:
-        prior_se3(x, i, j, payload, p, r, A, B)
-    elif kind == at.PRIOR_POINT2:
-        prior_point2(x, i, j, payload, p, r, A, B)
-    elif kind == at.PRIOR_POINT3:
-        prior_point3(x, i, j, payload, p, r, A, B)
-    elif kind < at.POSITION_SE2:
-        more = sight(kind, x, i, j, payload, p, r, A, B)
-    else:
-        evaluate_other(kind, x, i, j, payload, p, r, A, B)
+    more = residual_of(kind, x, i, j, payload, p, r, A, B)
     loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
     if loss != at.NO_LOSS:
         more = soften(kind, loss, p, payload, more, r, A, B)
     return more
-
-
-@part
-def evaluate_other(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
-    """The kinds from POSITION_SE2 on."""
-    r[at.R_STATUS] = GOOD
-    if kind == at.POSITION_SE2:
-        position_se2(x, i, p, k, r, A)
-    elif kind == at.POSITION_SE3:
-        position_se3(x, i, p, k, r, A)
-    elif kind == at.HEADING_SE2:
-        heading_se2(x, i, p, k, r, A)
-    elif kind == at.ATTITUDE_SE3:
-        attitude_se3(x, i, p, k, r, A)
-    elif kind == at.RANGE_SE2:
-        range_se2(x, i, j, p, k, r, A, B)
-    elif kind == at.RANGE_SE3:
-        range_se3(x, i, j, p, k, r, A, B)
-    elif kind == at.BEARING_SE2:
-        bearing_se2(x, i, j, p, k, r, A, B)
-    elif kind == at.BEARING_SE3:
-        bearing_se3(x, i, j, p, k, r, A, B)
-    elif kind == at.LINEAR_SE2 or kind == at.LINEAR_PAIR_SE2:
-        linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
-    else:
-        linear(kind, x, i, j, p, k, r, A, B)
 
 
 @part

@@ -9,6 +9,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.dispatch import check_same, returning
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim, scale_at
 
 
@@ -37,27 +38,58 @@ def soften(kind: int, loss: int, p: int, payload: F64, more: float, r: F64, A: F
 
 
 @inline_kernel
-def loss_of(loss: int, s: float, k: float) -> tuple:
-    """(ρ(s), ρ'(s)) of a loss with scale k, in standard deviations.  (3.9) to (3.13)"""
+def huber(s: float, k: float) -> tuple:
+    """(ρ(s), ρ'(s)) of a loss with scale k, in standard deviations; likewise below.  (3.9)"""
     c = k * k
-    if loss == at.HUBER:
-        if s <= c:
-            return s, 1.0
-        root = math.sqrt(s)
-        return 2.0 * k * root - c, k / root
-    if loss == at.CAUCHY:
-        return c * math.log1p(s / c), 1.0 / (1.0 + s / c)
-    if loss == at.GEMAN_MCCLURE:
-        w = c / (c + s)
-        return s * w, w * w
-    if loss == at.TUKEY:
-        if s >= c:
-            return c / 3.0, 0.0
-        w = 1.0 - s / c
-        return c * (1.0 - w * w * w) / 3.0, w * w
-    if loss == at.DCS:
-        if s <= c:
-            return s, 1.0
-        w = 2.0 * c / (c + s)
-        return c * (3.0 - 2.0 * w), w * w
+    if s <= c:
+        return s, 1.0
+    root = math.sqrt(s)
+    return 2.0 * k * root - c, k / root
+
+
+@inline_kernel
+def cauchy(s: float, k: float) -> tuple:
+    """(3.10)"""
+    c = k * k
+    return c * math.log1p(s / c), 1.0 / (1.0 + s / c)
+
+
+@inline_kernel
+def geman_mcclure(s: float, k: float) -> tuple:
+    """(3.11)"""
+    c = k * k
+    w = c / (c + s)
+    return s * w, w * w
+
+
+@inline_kernel
+def tukey(s: float, k: float) -> tuple:
+    """(3.12)"""
+    c = k * k
+    if s >= c:
+        return c / 3.0, 0.0
+    w = 1.0 - s / c
+    return c * (1.0 - w * w * w) / 3.0, w * w
+
+
+@inline_kernel
+def dcs(s: float, k: float) -> tuple:
+    """(3.13)"""
+    c = k * k
+    if s <= c:
+        return s, 1.0
+    w = 2.0 * c / (c + s)
+    return c * (3.0 - 2.0 * w), w * w
+
+
+@inline_kernel
+def no_loss(s: float, _k: float) -> tuple:
+    """ρ(s) = s."""
     return s, 1.0
+
+
+# The function of every loss of the wire, `factorbus.proto.kinds.LOSSES`.
+LOSS_MODELS = {"huber": huber, "cauchy": cauchy, "geman-mcclure": geman_mcclure, "tukey": tukey, "dcs": dcs}
+check_same("loss", at.LOSS_CODES, LOSS_MODELS, __name__)
+# (ρ(s), ρ'(s)) of a loss by its code: loss_of(loss, s, k).
+loss_of = inline_kernel(returning("loss_of", "s, k", at.LOSS_CODES, LOSS_MODELS, no_loss))

@@ -1,6 +1,6 @@
 """What a pose knows of the map without a landmark: its position, its heading, which way is down.  MATH §3.4.
 
-Arguments as in `se2`; the payload begins with the measurement at k.
+Arguments as in `se2`.
 """
 
 import math
@@ -11,7 +11,7 @@ from factorbus.solver.kernels.model.se3 import rotation
 
 
 @inline_kernel
-def position_se2(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
+def position_se2(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """r = t + R l − z, l where the antenna is on the robot, (z, l) measured.  (3.20)
 
     A = [ R | R (−l_y, l_x)ᵀ ]
@@ -24,7 +24,7 @@ def position_se2(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
 
 
 @inline_kernel
-def position_se3(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
+def position_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """r = t + R l − z,  A = [ R | −R ⌊l⌋ ].  (3.20)"""
     q = rotation(x, i + 3)
     l0, l1, l2 = p[k + 3], p[k + 4], p[k + 5]
@@ -36,14 +36,14 @@ def position_se3(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
 
 
 @inline_kernel
-def heading_se2(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
+def heading_se2(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """r = wrap(θ − z),  A = [ 0 0 1 ].  (3.21)"""
     r[0] = wrap(x[i + 2] - p[k])
     A[0, 0], A[0, 1], A[0, 2] = 0.0, 0.0, 1.0
 
 
 @inline_kernel
-def attitude_se3(x: F64, i: int, p: F64, k: int, r: F64, A: F64) -> None:
+def attitude_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """A direction g of the map as the robot sees it: r = b − z, b = Rᵀ g;  A = [ 0 | ⌊b⌋ ].  (3.22)"""
     q = rotation(x, i + 3)
     g0, g1, g2 = p[k + 3], p[k + 4], p[k + 5]

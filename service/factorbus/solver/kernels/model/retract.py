@@ -3,11 +3,24 @@
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
+from factorbus.solver.kernels.model.dispatch import check_same, returning
 from factorbus.solver.kernels.model.points import move_point2, move_point3
 from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
 from factorbus.solver.kernels.model.se3 import move_se3
 from factorbus.solver.kernels.model.sizes import size_of
+
+# x ⊞ δ of every kind of variables of the wire, `factorbus.proto.kinds`.
+MOVES = {"se2": move_se2, "se3": move_se3, "point2": move_point2, "idp": move_idp, "point3": move_point3}
+check_same("variable kind", at.VARIABLE_CODES, MOVES, __name__)
+
+
+@inline_kernel
+def _no_move(_values: F64, _x: int, _step: F64, _d: int, _out: F64) -> None:
+    """Of no kind: there is none."""
+
+
+move_value = inline_kernel(returning("move_value", "values, x, step, d, out", at.VARIABLE_CODES, MOVES, _no_move))
 
 
 @kernel("void(int64, int64[:,::1], float64[::1], float64[::1], float64[::1])")
@@ -18,16 +31,8 @@ def move(count: int, var: I64, values: F64, step: F64, out: F64) -> None:
         if d < 0:
             for c in range(size_of(kind)):
                 out[x + c] = values[x + c]
-        elif kind == at.SE2:
-            move_se2(values, x, step, d, out)
-        elif kind == at.SE3:
-            move_se3(values, x, step, d, out)
-        elif kind == at.POINT2:
-            move_point2(values, x, step, d, out)
-        elif kind == at.IDP:
-            move_idp(values, x, step, d, out)
         else:
-            move_point3(values, x, step, d, out)
+            move_value(kind, values, x, step, d, out)
 
 
 @kernel("int64(int64, int64, int64[:,::1], int64[::1], int64[::1], int64[::1])")

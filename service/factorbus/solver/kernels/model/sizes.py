@@ -1,55 +1,48 @@
-"""How many numbers the kinds have: values and tangents of variables, residuals and measurements of factors."""
+"""How many numbers the kinds have: values and tangents of variables, residuals and measurements of factors.
 
-from factorbus.solver.kernels.jit.compile import inline_kernel, part
+All of it is the wire's table, as arrays that are indexed by the code of a kind: constants in compiled code.
+"""
+
+import numpy as np
+
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.solver.kernels.jit.compile import inline_kernel
 from factorbus.solver.kernels.model import layout as at
+
+_FACTORS, _VARIABLES = tuple(FACTOR_KINDS.values()), tuple(VARIABLE_KINDS.values())
+_SIZE = np.array([kind.size for kind in _VARIABLES], np.int64)
+_DIM = np.array([kind.dim for kind in _VARIABLES], np.int64)
+_RESIDUAL_DIM = np.array([kind.dim for kind in _FACTORS], np.int64)
+_MEASURED = np.array([kind.size for kind in _FACTORS], np.int64)
+_FIRST = np.array([at.VARIABLE_CODES[kind.connects[0]] for kind in _FACTORS], np.int64)
+_SECOND = np.array([at.VARIABLE_CODES[kind.connects[1]] if kind.connects[1:] else -1 for kind in _FACTORS], np.int64)
+_FIRST_DIM = _DIM[_FIRST]
+_SECOND_DIM = np.where(_SECOND >= 0, _DIM[_SECOND], 0)
+_LINEARISED = _SIZE[_FIRST] + np.where(_SECOND >= 0, _SIZE[_SECOND], 0)
 
 
 @inline_kernel
 def size_of(kind: int) -> int:
     """Numbers of a value of a kind of variable."""
-    if kind == at.SE3:
-        return 7
-    if kind == at.IDP:
-        return 6
-    return 2 if kind == at.POINT2 else 3
+    return _SIZE[kind]
 
 
 @inline_kernel
 def dim_of(kind: int) -> int:
     """Scalars in the tangent of a kind of variable."""
-    if kind == at.SE3 or kind == at.IDP:
-        return 6
-    return 2 if kind == at.POINT2 else 3
+    return _DIM[kind]
 
 
 @inline_kernel
 def residual_dim(kind: int) -> int:
     """Numbers in the residual of a kind of factor."""
-    if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2 or kind == at.LANDMARK_SE3 or kind == at.PRIOR_POINT3:
-        return 3
-    if kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3 or kind == at.IDP_FIRST:
-        return 6
-    return other_dim(kind) if kind >= at.POSITION_SE2 else 2
-
-
-@inline_kernel
-def other_dim(kind: int) -> int:
-    """The same of the kinds from POSITION_SE2 on."""
-    if kind >= at.LINEAR_SE2:
-        return linear_dim(kind)
-    if kind == at.POSITION_SE3 or kind == at.ATTITUDE_SE3 or kind == at.BEARING_SE3:
-        return 3
-    return 2 if kind == at.POSITION_SE2 else 1
+    return _RESIDUAL_DIM[kind]
 
 
 @inline_kernel
 def information_at(kind: int) -> int:
     """Where in a factor's payload its information starts: the size of its measurement."""
-    if kind >= at.POSITION_SE2:
-        return other_size(kind)
-    if kind >= at.IDP_FIRST:
-        return 14 if kind == at.IDP_FIRST else 13
-    return 7 if kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3 else residual_dim(kind)
+    return _MEASURED[kind]
 
 
 @inline_kernel
@@ -60,71 +53,18 @@ def scale_at(kind: int) -> int:
 
 
 @inline_kernel
-def other_size(kind: int) -> int:
-    """Numbers measured by the kinds from POSITION_SE2 on."""
-    if kind >= at.LINEAR_SE2:
-        return linear_size(kind)
-    if kind == at.POSITION_SE3 or kind == at.ATTITUDE_SE3:
-        return 6
-    return 4 if kind == at.POSITION_SE2 else other_dim(kind)
-
-
-@part
-def linear_dim(kind: int) -> int:
-    """Rows of a linear factor: as many as the smaller of its variables has scalars."""
-    first, second = linear_ends(kind)
-    return dim_of(first) if second < 0 else min(dim_of(first), dim_of(second))
-
-
-@part
-def linear_size(kind: int) -> int:
-    """Numbers of a linear factor: y of its variables, H of each, b."""
-    first, second = linear_ends(kind)
-    rows, numbers, columns = linear_dim(kind), size_of(first), dim_of(first)
-    if second >= 0:
-        numbers += size_of(second)
-        columns += dim_of(second)
-    return numbers + rows * (columns + 1)
-
-
-@part
-def linear_ends(kind: int) -> tuple:
-    """`kinds_of_ends` of the kinds from LINEAR_SE2 on."""
-    if kind < at.LINEAR_PAIR_SE2:
-        return kind - at.LINEAR_SE2, -1
-    if kind < at.LINEAR_PAIR_SE2_POINT2:
-        return kind - at.LINEAR_PAIR_SE2, kind - at.LINEAR_PAIR_SE2
-    if kind == at.LINEAR_PAIR_SE2_POINT2:
-        return at.SE2, at.POINT2
-    if kind == at.LINEAR_PAIR_SE3_POINT3:
-        return at.SE3, at.POINT3
-    return at.SE3 if kind == at.LINEAR_PAIR_SE3_IDP else at.POINT3, at.IDP
-
-
-@inline_kernel
 def kinds_of_ends(kind: int) -> tuple:
     """The kinds of variables that a kind of factor connects; −1: no second one."""
-    if kind <= at.PRIOR_POINT3:
-        return kind, -1
-    if kind >= at.LINEAR_SE2:
-        return linear_ends(kind)
-    if kind == at.BETWEEN_SE2:
-        return at.SE2, at.SE2
-    if kind == at.BETWEEN_SE3:
-        return at.SE3, at.SE3
-    if kind == at.LANDMARK_SE3 or kind == at.POINT_SEEN or kind == at.RANGE_SE3 or kind == at.BEARING_SE3:
-        return at.SE3, at.POINT3
-    if kind == at.IDP_FIRST or kind == at.IDP_SEEN:
-        return at.SE3, at.IDP
-    if kind == at.POSITION_SE2 or kind == at.HEADING_SE2:
-        return at.SE2, -1
-    if kind == at.POSITION_SE3 or kind == at.ATTITUDE_SE3:
-        return at.SE3, -1
-    return at.SE2, at.POINT2
+    return _FIRST[kind], _SECOND[kind]
 
 
 @inline_kernel
 def end_dims(kind: int) -> tuple:
     """Scalars in the tangents of the ends of a kind of factor; 0: no second one."""
-    first, second = kinds_of_ends(kind)
-    return dim_of(first), dim_of(second) if second >= 0 else 0
+    return _FIRST_DIM[kind], _SECOND_DIM[kind]
+
+
+@inline_kernel
+def values_of_ends(kind: int) -> int:
+    """Numbers of the values of the ends of a kind of factor together."""
+    return _LINEARISED[kind]

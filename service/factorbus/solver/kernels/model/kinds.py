@@ -1,0 +1,239 @@
+"""The kinds of factors: the residual of each, and what kernels have to know of it.  MATH §3.
+
+Names, ends and sizes are the wire's, `factorbus.proto.kinds`.  Here each kind has its residual function, called as
+residual(x, i, j, p, k, r, A, B): see `se2`.  From these declarations follow `residual_of`, which calls the function of
+a kind, and the predicates.  The order of codes means nothing.  A kind that is in one list and not in the other is an
+error when this file is imported.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
+from factorbus.solver.kernels.model.linear import linear, linear_se2
+from factorbus.solver.kernels.model.points import prior_point2, prior_point3
+from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
+from factorbus.solver.kernels.model.range_bearing import bearing_se2, bearing_se3, range_se2, range_se3
+from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
+from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
+from factorbus.solver.lenses.layout import GOOD
+
+_MOST = 6  # numbers of a residual and of a tangent: the size of the scratch that kernels have for a factor
+_MOST_UNITS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class FactorModel:
+    """What the solver has for a kind of factor, beside what the wire says.
+
+    residual:     r, A = ∂r/∂xᵢ, B = ∂r/∂xⱼ of one factor.  equation: where MATH has it
+    of_kinds:     the function is that of several kinds, and takes the code of the kind first
+    common:       it melts into the kernels, which costs time to compile; others are called
+    initializes:  an end without a value gets one from it (`graph.initialize`)
+    rigid:        r is the same where both ends move as one body, and that is made use of (`bayes_tree.rigid_subtrees`)
+    bounded:      its linearization error has a closed form, (9.4) to (9.13); of others it is computed, (9.11)
+    linear:       a linear model, (3.26): y of its ends is measured first, and Ω may be negative definite
+    lens_at:      where in the measurement the lens is; −1: no camera saw it.  The function of what a camera sees
+                  returns what χ² has beside rᵀ Ω r
+    positive_at:  where in the measurement a number has to be above zero
+    quaternions:  where in the measurement quaternions begin.  directions: and directions.  Both become unit
+    """
+
+    residual: Callable[..., Any]
+    equation: str
+    of_kinds: bool = False
+    common: bool = False
+    initializes: bool = False
+    rigid: bool = False
+    bounded: bool = False
+    linear: bool = False
+    lens_at: int = -1
+    positive_at: int = -1
+    quaternions: tuple[int, ...] = ()
+    directions: tuple[int, ...] = ()
+
+
+@inline_kernel
+def linear_plane(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
+    """Linear factors of one pose in the plane, or two."""
+    linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
+
+
+def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **more: Any) -> FactorModel:
+    """A kind that places new variables, and that most graphs are of."""
+    return FactorModel(residual, equation, common=True, initializes=True, bounded=True, rigid=rigid, **more)
+
+
+def _seen(equation: str, lens_at: int, **more: Any) -> FactorModel:
+    """What a camera sees."""
+    return FactorModel(sight, equation, of_kinds=True, common=True, lens_at=lens_at, **more)
+
+
+def _linear_model(name: str) -> FactorModel:
+    """What is known of one variable, or of two together."""
+    ends, quaternions, start = FACTOR_KINDS[name].connects, [], 0
+    for end in ends:
+        if end == "se3":
+            quaternions.append(start + 3)
+        start += VARIABLE_KINDS[end].size
+    function = linear_plane if set(ends) == {"se2"} else linear
+    return FactorModel(function, "MATH (3.26)", of_kinds=True, linear=True, quaternions=tuple(quaternions))
+
+
+# Kinds are looked for in this order.
+FACTOR_MODELS = {
+    "between_se2": _usual(between_se2, "MATH (3.2)", rigid=True),
+    "landmark_se2": _usual(landmark_se2, "MATH (3.3)", rigid=True),
+    "bearing_range_se2": _usual(bearing_range_se2, "MATH (3.4)", rigid=True, positive_at=1),
+    "prior_se2": _usual(prior_se2, "MATH (3.1)"),
+    "between_se3": _usual(between_se3, "MATH (3.6)", rigid=True, quaternions=(3,)),
+    "landmark_se3": _usual(landmark_se3, "MATH (3.7)", rigid=True),
+    "prior_se3": _usual(prior_se3, "MATH (3.5)", quaternions=(3,)),
+    "prior_point2": _usual(prior_point2, "MATH (3.8)"),
+    "prior_point3": _usual(prior_point3, "MATH (3.8)"),
+    "idp_first": _seen("MATH (3.15)", 3, initializes=True),
+    "idp_seen": _seen("MATH (3.16)", 2),
+    "point_seen": _seen("MATH (3.17)", 2, rigid=True),
+    "position_se2": FactorModel(position_se2, "MATH (3.20)"),
+    "position_se3": FactorModel(position_se3, "MATH (3.20)"),
+    "heading_se2": FactorModel(heading_se2, "MATH (3.21)"),
+    "attitude_se3": FactorModel(attitude_se3, "MATH (3.22)", directions=(0, 3)),
+    "range_se2": FactorModel(range_se2, "MATH (3.23)", rigid=True, positive_at=0),
+    "range_se3": FactorModel(range_se3, "MATH (3.23)", rigid=True, positive_at=0),
+    "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
+    "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
+    **{name: _linear_model(name) for name in FACTOR_KINDS if name.startswith("linear_")},
+}
+
+
+def check_kinds() -> None:
+    """Every kind of the wire has a model that fits it.  Raises ImportError."""
+    check_same("factor kind", FACTOR_KINDS, FACTOR_MODELS, __name__)
+    for name, model in FACTOR_MODELS.items():
+        kind = FACTOR_KINDS[name]
+        ends = [VARIABLE_KINDS[end] for end in kind.connects]
+        if not 1 <= len(ends) <= 2 or max(kind.dim, *(end.dim for end in ends)) > _MOST:
+            raise ImportError(
+                f"the factor kind {name!r} connects {len(ends)} variables and has {kind.dim} numbers in its residual; "
+                f"kernels have room for 1 or 2 variables and {_MOST} numbers"
+            )
+        starts = (*model.quaternions, *model.directions, model.positive_at)
+        units = max(len(model.quaternions), len(model.directions))
+        if max(starts) >= kind.size or units > _MOST_UNITS:
+            raise ImportError(
+                f"the factor kind {name!r} has {kind.size} numbers measured and declares checks at {starts}; "
+                f"declare positions in the measurement, at most {_MOST_UNITS} quaternions and directions"
+            )
+
+
+check_kinds()
+_MODELS = tuple(FACTOR_MODELS[name] for name in FACTOR_KINDS)
+
+
+def _table(values: Any) -> I64:
+    """By the code of a kind."""
+    return np.array([int(value) for value in values], np.int64)
+
+
+def _starts(lists: Any) -> I64:
+    """The same of up to _MOST_UNITS positions a kind; −1: no more."""
+    return np.array([(*starts, *[-1] * (_MOST_UNITS - len(starts))) for starts in lists], np.int64)
+
+
+_INITIALIZES = np.array([model.initializes for model in _MODELS])
+_RIGID = np.array([model.rigid for model in _MODELS])
+_LENS_AT = _table(model.lens_at for model in _MODELS)
+_POSITIVE_AT = _table(model.positive_at for model in _MODELS)
+_QUATERNIONS = _starts(model.quaternions for model in _MODELS)
+_DIRECTIONS = _starts(model.directions for model in _MODELS)
+_CHECKED = (_POSITIVE_AT >= 0) | (_QUATERNIONS[:, 0] >= 0) | (_DIRECTIONS[:, 0] >= 0)
+# For Python, which asks for many factors at once: by the code of a kind.
+LINEAR = np.array([model.linear for model in _MODELS])
+LINEAR_OF_ONE = LINEAR & np.array([len(kind.connects) == 1 for kind in FACTOR_KINDS.values()])
+CAMERA = _LENS_AT >= 0
+BOUNDED = np.array([model.bounded for model in _MODELS])
+POSE = np.array([kind.is_pose for kind in VARIABLE_KINDS.values()])  # by the code of a kind of variables
+SEES_LANDMARK = np.array([kind.sees_landmark for kind in FACTOR_KINDS.values()])
+
+
+@inline_kernel
+def is_camera(kind: int) -> bool:
+    """Whether a kind of factor is what a camera sees."""
+    return _LENS_AT[kind] >= 0
+
+
+@inline_kernel
+def lens_at(kind: int) -> int:
+    """Where in the measurement its lens is; −1: no camera saw it."""
+    return _LENS_AT[kind]
+
+
+@inline_kernel
+def is_linear(kind: int) -> bool:
+    """Whether it is a linear model of its variables."""
+    return LINEAR[kind]
+
+
+@inline_kernel
+def initializes(kind: int) -> bool:
+    """Whether it gives a value to an end that has none."""
+    return _INITIALIZES[kind]
+
+
+@inline_kernel
+def is_rigid(kind: int) -> bool:
+    """Whether its residual stays as its ends move as one body."""
+    return _RIGID[kind]
+
+
+@inline_kernel
+def is_bounded(kind: int) -> bool:
+    """Whether a closed form bounds its linearization error."""
+    return BOUNDED[kind]
+
+
+@inline_kernel
+def is_checked(kind: int) -> bool:
+    """Whether its measurement has to be more than within bounds: positive, a quaternion, a direction."""
+    return _CHECKED[kind]
+
+
+@inline_kernel
+def positive_at(kind: int) -> int:
+    """Which number of its measurement has to be above zero; −1: none."""
+    return _POSITIVE_AT[kind]
+
+
+@inline_kernel
+def quaternion_at(kind: int, n: int) -> int:
+    """Where its n-th measured quaternion begins; −1: there is none."""
+    return _QUATERNIONS[kind, n]
+
+
+@inline_kernel
+def direction_at(kind: int, n: int) -> int:
+    """Where its n-th measured direction begins; −1: there is none."""
+    return _DIRECTIONS[kind, n]
+
+
+_common = {name: model for name, model in FACTOR_MODELS.items() if model.common}
+_others = {name: model for name, model in FACTOR_MODELS.items() if not model.common}
+_other_residual_of = inline_kernel(dispatcher("other_residual_of", _others))
+
+
+@part
+def _other_residual(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
+    """Of the kinds that are not common."""
+    r[at.R_STATUS] = GOOD
+    return _other_residual_of(kind, x, i, j, p, k, r, A, B)
+
+
+# The residual function of a kind: residual_of(kind, x, i, j, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
+residual_of = inline_kernel(dispatcher("residual_of", _common, _other_residual))
