@@ -137,7 +137,7 @@ def lever_of(kind: int, p: F64, k: int) -> float:
     if kind == at.BEARING_RANGE_SE2:
         return p[k + 1]
     if is_camera(kind):  # of a pixel: how many a radian has
-        return p[k + lens_at(kind) + 1 + FU]
+        return float(p[k + lens_at(kind) + 1 + FU])
     return 0.0
 
 
