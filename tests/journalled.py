@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from factorbus.client.pending_insert import PendingInsert
 from processes import PATIENCE_S, Process
 
 from factorbus.client import Draft
 from factorbus.client.map import Map
-from factorbus.client.ticket import Ticket
 from factorbus.journal.store import open_store
 from factorbus.proto.messages import Batch
 from factorbus.proto.stamps import NO_STAMP
@@ -102,7 +102,7 @@ class Stream(threading.Thread):
     def __init__(self, driven: Map, batches: list[Batch]) -> None:
         super().__init__(daemon=True)
         self._driven, self._batches = driven, batches
-        self.stop, self.tickets, self.fault = threading.Event(), list[Ticket](), list[BaseException]()
+        self.stop, self.pending_inserts, self.fault = threading.Event(), list[PendingInsert](), list[BaseException]()
         self.acknowledged: set[int] = set()
         self._allowed, self._more = threading.Semaphore(0), threading.Condition()
 
@@ -122,9 +122,9 @@ class Stream(threading.Thread):
                 self._allowed.acquire()
                 if self.stop.is_set():
                     break
-                ticket = self._driven.send(batch, timeout_s=PATIENCE_S)
-                ticket.future.add_done_callback(lambda done, n=ticket.sequence: self._answered(done, n))
-                self.tickets.append(ticket)
+                pending_insert = self._driven.send(batch, timeout_s=PATIENCE_S)
+                pending_insert.future.add_done_callback(lambda done, n=pending_insert.sequence: self._answered(done, n))
+                self.pending_inserts.append(pending_insert)
         except BaseException as fault:
             self.fault.append(fault)
 
@@ -136,11 +136,11 @@ class Stream(threading.Thread):
 
 
 def check_journal(folder: Path, sent: int) -> list[list[int]]:
-    """Nothing is wrong with it, every insert is there once, in order; gives those that were folded together."""
+    """Nothing is wrong with it, every insert is there once, in order; gives those that were applied together."""
     store = open_store(folder, read_only=True)
     try:
         assert list(store.check()) == []
-        groups = [[entry.sequence for entry in fold.entries] for fold in store.folds()]
+        groups = [[entry.sequence for entry in record.entries] for record in store.records()]
     finally:
         store.close()
     assert [number for group in groups for number in group] == list(range(1, sent + 1))

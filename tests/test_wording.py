@@ -56,7 +56,7 @@ def test_no_count_stands_before_a_bare_plural() -> None:
     plural = re.compile(
         r"\{(?:len\([^{}]*\)|[^{}]*(?:\.size|count|\.sum\(\)|\['[a-z_]+'\]))(?::,)?\} (?:[a-z-]+ )?"
         r"(?:bytes|numbers|poses|points|variables|factors|steps|maps|inserts|clients|workers|records|lines|features|keys|"
-        r"landmarks|closures|rows|fields|folds|revisions|deltas|kernels|iterations|nonzeros|blocks)\b"
+        r"landmarks|closures|rows|fields|records|revisions|deltas|kernels|iterations|nonzeros|blocks)\b"
     )
     found = []
     for root in ("proto", "service", "workers", "clients"):

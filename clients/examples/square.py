@@ -22,5 +22,5 @@ with connect(ENDPOINT, client="robot1") as bus, bus.map(MAP) as square:
         turn = (10, 0, math.radians(92))
         square.insert(Draft().se2(f"x{i}").between_se2(f"x{i - 1}", f"x{i}", turn, sigmas=SIGMAS))
     print("by odometry the robot is at", square.estimate["x4"].round(3))
-    accepted = square.insert(Draft().between_se2("x0", "x4", (0, 0, 0), sigmas=SIGMAS))  # it recognises its start
+    accepted = square.insert(Draft().between_se2("x0", "x4", (0, 0, 0), sigmas=SIGMAS))  # it recognizes its start
     print("after the loop closure at  ", square.estimate["x4"].round(3), f"(chi2 {accepted.report['chi2']:.3f})")

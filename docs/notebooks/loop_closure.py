@@ -1,7 +1,7 @@
 # %% [markdown]
 # # What a loop closure does
 #
-# A robot drives round a block. Odometry drifts; then it recognises where it began. This uses the solver by itself,
+# A robot drives round a block. Odometry drifts; then it recognizes where it began. This uses the solver by itself,
 # without a bus, so that every step can be looked at.
 
 # %%
@@ -51,7 +51,7 @@ print("now it is at", after[-1, :2].round(2), "χ²", round(report.chi2, 2))
 moved = np.linalg.norm(after[:, :2] - before[:, :2], axis=1)
 print("poses moved by", moved[[10, 20, 30, 40]].round(2), "m: the further along, the more")
 print(
-    f"{report.strategy}, because {report.because}: {report.eliminated} eliminated, {report.relinearised} relinearised"
+    f"{report.strategy}, because {report.because}: {report.eliminated} eliminated, {report.relinearized} relinearized"
 )
 
 # %% [markdown]

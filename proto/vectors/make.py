@@ -66,15 +66,15 @@ def vectors() -> dict[str, bytes]:
         "insert_sights": codec.encode_insert(Insert(5, _sights(), epoch=7)),
         "insert_other_kinds": codec.encode_insert(Insert(8, _other_kinds(), epoch=7)),
         "insert_linear_kinds": codec.encode_insert(Insert(9, _linear_kinds(), epoch=7)),
-        "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, points_below=0.1)),
+        "insert_points": codec.encode_insert(Insert(6, Batch(), epoch=7, convert_below=0.1)),
         "insert_changes": codec.encode_insert(Insert(7, Batch(), settle=True, epoch=7, changes=_changes())),
-        "insert_marginalise": codec.encode_insert(
-            Insert(9, Batch(), epoch=7, changes=(Change("marginalise", keys=np.array([symbol("x", 1)])),))
+        "insert_marginalize": codec.encode_insert(
+            Insert(9, Batch(), epoch=7, changes=(Change("marginalize", keys=np.array([symbol("x", 1)])),))
         ),
         "insert_settle": codec.encode_insert(Insert(4, Batch(), settle=True, epoch=7)),
         # What readers do without: `report` is optional.
         "accepted_without_report": codec.encode_map(
-            {"sequence": 1, "epoch": 7, "revision": 1, "first_factor": 0, "folded": 1}
+            {"sequence": 1, "epoch": 7, "revision": 1, "first_factor": 0, "applied": 1}
         ),
         "insert_losses": codec.encode_insert(Insert(10, Batch(factors=_losses()), epoch=7)),
         "estimate_empty": codec.encode_estimate(Estimate(7, 2, ())),

@@ -5,7 +5,7 @@
 All in this process, CPU time of its thread, on one core:
 
     blocks    all diagonal blocks of the final map of city10000, against a loop over GTSAM's `marginalCovariance`, the
-              whole loop, and against a full batch pass of ours (linearise, order, analyse, factorise, solve)
+              whole loop, and against a full batch pass of ours (linearize, order, analyse, factorize, solve)
     gates     10,000 candidates between its last pose and all others, against the median step
     last      the covariance of the last pose after every step of manhattan3500, against the step
     all       all its diagonal blocks kept up at every step, against the replay alone
@@ -161,7 +161,7 @@ def _gtsam(
 ) -> tuple[float, float]:
     """(milliseconds of a loop over all poses, largest relative difference of a block) of GTSAM's Marginals.
 
-    At the same estimate; R of ours has linearisation points of its own, which is most of the difference, and GTSAM's
+    At the same estimate; R of ours has linearization points of its own, which is most of the difference, and GTSAM's
     own `between` has the logarithm of the relative pose as its residual, where ours has its coordinates.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

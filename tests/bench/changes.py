@@ -45,14 +45,14 @@ def run(poses: int, changes: int, folder: Path) -> dict[str, Any]:
             other = two.map("large", create=False, mirror=False)
             quiet = [_tiny(other, n) for n in range(_INSERTS)]
             begun, before = time.perf_counter(), changer.stats()
-            tickets = [
+            pending_inserts = [
                 changer.send(Batch(), changes=Changes().loss([int(factor)], "huber", 1.5))
                 for factor in np.resize(loops, changes)
             ]
             sent_s = time.perf_counter() - begun
             busy = [_tiny(other, _INSERTS + n) for n in range(_INSERTS)]
-            for ticket in tickets:
-                ticket.result(600)
+            for pending_insert in pending_inserts:
+                pending_insert.result(600)
             burst_s = time.perf_counter() - begun
             after = changer.stats()
         largest = max((path.stat().st_size for path in journal.rglob("snapshot-*.fbs")), default=0)

@@ -60,9 +60,9 @@ def main() -> None:
     options = parser.parse_args()
     core = pin()
     names = options.names or [*GENERATED, *(name for name in DATASETS if find(name))]
-    report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "lanes": LANES, "problems": []}
+    report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "executors": LANES, "problems": []}
     if not options.json:
-        print(f"CHOLMOD uses {', '.join(report['cholmod_blas'])}; one thread on core {core}; {LANES} lanes")
+        print(f"CHOLMOD uses {', '.join(report['cholmod_blas'])}; one thread on core {core}; {LANES} executors")
         print(HEAD)
     for name in names:
         system = GENERATED[name]() if name in GENERATED else final_system(file_of(name))
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def final_system(path: Path) -> BlockSystem:
-    """Λ of the whole file, linearised where the solver ends from the file's own start."""
+    """Λ of the whole file, linearized where the solver ends from the file's own start."""
     solver = Solver(Options(mode="all-batch"))
     solver.stage(read(path).whole())
     solver.step(settle=True)

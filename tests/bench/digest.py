@@ -39,7 +39,7 @@ _ACCOUNT = (
     "strategy",
     "iterations",
     "eliminated",
-    "relinearised",
+    "relinearized",
     "flops",
     "nnz_r",
     "changed",

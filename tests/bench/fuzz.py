@@ -35,10 +35,10 @@ from factorbus.proto.limits import Limits as MessageLimits
 from factorbus.proto.messages import Batch, Graph, Insert
 from factorbus.proto.problems import Problem, Refused
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Answer, Arrived, Folded, Judged, Refuse, Run, Stepped
+from factorbus.service.core.events import Answer, Applied, Arrived, InsertBatch, Refuse, Stepped, Verdict
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.questions.answers import Question
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
@@ -120,30 +120,30 @@ class _Map:
                 case Refuse(asker, problem):
                     codec.encode_problem(problem)
                     self.answers[asker].append(problem.code)
-                case Run():
+                case InsertBatch():
                     self._run(effect)
 
-    def _run(self, run: Run) -> None:
-        for event in self.folder.fold(run.inserts):
-            if isinstance(event, Judged):
+    def _run(self, run: InsertBatch) -> None:
+        for event in self.folder.record(run.inserts):
+            if isinstance(event, Verdict):
                 if taken := [each.insert for each in event.outcomes if isinstance(each.answer, bytes)]:
                     self.accepted.append(taken)
                     self._took = True
                 self._perform(self.core.judged(event))
             elif isinstance(event, Stepped):
                 self._perform(self.core.stepped(event))
-            elif isinstance(event, Folded):
+            elif isinstance(event, Applied):
                 bits = _bits(self.folder)
                 if bits != self.bits and not self._took:
                     raise AssertionError("refused, and the map is not what it was")
                 self.bits, self._took = bits, False
-                self._perform(self.core.folded(event))
+                self._perform(self.core.applied(event))
 
     def compare(self) -> str:
         """Beside a map that got only what was accepted, by step: `same bits`, `same content`, or else `different`."""
         fresh = _folder()
         for inserts in self.accepted:
-            list(fresh.fold(inserts))
+            list(fresh.record(inserts))
         theirs = _bits(fresh)
         return (
             "same bits" if self.bits == theirs else "same content" if _same_content(self.bits, theirs) else "different"
@@ -272,11 +272,11 @@ def _collect(sent: tuple[str, float, "SimpleQueue[Any]"], outcome: Outcome) -> N
         outcome.answers[answer.code if isinstance(answer, Refused) else "ok"] += 1
 
 
-def _folder() -> Folder:
-    return Folder(lambda: Solver(Options()), EPOCH, LIMITS)
+def _folder() -> MapSolver:
+    return MapSolver(lambda: Solver(Options()), EPOCH, LIMITS)
 
 
-def _bits(folder: Folder) -> bytes:
+def _bits(folder: MapSolver) -> bytes:
     taken = folder.snapshot([Question("graph")])
     return codec.encode_graph(taken.graph)
 

@@ -44,7 +44,7 @@ def measure() -> dict[str, Any]:
         "ratios": ratios,
         "ratio": statistics.median(ratios),
         "goal": GOAL,
-        "way_ms": way["trip_ms"],
+        "way_ms": way["latency_ms"],
         "byte_ns": way["byte_ns"],
         "overhead_ms": beyond_s * 1e3,
         "work_ms": work_s * 1e3,
@@ -62,7 +62,7 @@ def front(workers: int) -> Iterator["Front"]:
         bus = stack.enter_context(connect(endpoint, client="bench", timeout_s=60))
         watch = stack.enter_context(bus.map("bench", mirror=False))
         made = Front(bus, watch)
-        while sum("trip_ms" in row for row in watch.stats()["workers"]) < workers:
+        while sum("latency_ms" in row for row in watch.stats()["workers"]) < workers:
             made.run(0.05)
         yield made
 

@@ -33,7 +33,7 @@ _WITHIN = {1: 9.0, 3: 14.16, 6: 20.06}  # χ² that is as rare as 3σ
 class Target(Protocol):
     """A map: somewhere to insert, and what it estimates."""
 
-    def insert(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> Any: ...
+    def insert(self, batch: Batch | Draft, *, settle: bool = False, convert_below: float = 0.0) -> Any: ...
 
     def value(self, key: int) -> np.ndarray: ...
 
@@ -51,8 +51,8 @@ class Track:
 class FrontEnd:
     """Tells a map what a camera sees."""
 
-    def __init__(self, world: MonocularWorld, target: Target, points_below: float = 0.0, every: int = 20) -> None:
-        self._world, self._map, self._below, self._every = world, target, points_below, every
+    def __init__(self, world: MonocularWorld, target: Target, convert_below: float = 0.0, every: int = 20) -> None:
+        self._world, self._map, self._below, self._every = world, target, convert_below, every
         self.tracks: dict[int, Track] = {}
         self.poses: list[np.ndarray] = []  # true ones
         self._sigma = world.sigma_pixel
@@ -68,16 +68,16 @@ class FrontEnd:
                 self._sights(draft, number, frame)
             self.poses.append(frame.pose)
             ripen = self._below if number % self._every == 0 else 0.0
-            self._map.insert(draft, points_below=ripen)
+            self._map.insert(draft, convert_below=ripen)
         self._map.insert(Draft(), settle=True)
 
     def _begin(self, draft: Draft, frame: Frame) -> None:
-        """The first camera is where it is; some points of the target are recognised, and their distances known."""
+        """The first camera is where it is; some points of the target are recognized, and their distances known."""
         draft.se3(symbol("x", 0), frame.pose, fixed=True)
-        recognised = np.flatnonzero(~frame.outlier)[:_TARGET]
+        recognized = np.flatnonzero(~frame.outlier)[:_TARGET]
         for k, (track, pixel) in enumerate(zip(frame.points.tolist(), frame.pixels, strict=True)):
             self.tracks[track] = Track({0: pixel})
-            if k in recognised:
+            if k in recognized:
                 rho = 1 / float(np.linalg.norm(self._world.points[track] - frame.pose[:3]))
                 noisy = rho * (1 + _TARGET_SHARE * np.random.default_rng([self._world.seed, track]).normal())
                 self._feature(draft, 0, track, pixel, noisy, _TARGET_SHARE * rho)
@@ -126,11 +126,11 @@ class Near:
         self.solver, self.reports = Solver(Options(mode=mode)), []
         self._values: dict[int, np.ndarray] = {}
 
-    def insert(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> None:
+    def insert(self, batch: Batch | Draft, *, settle: bool = False, convert_below: float = 0.0) -> None:
         """As the service does."""
         self.solver.stage(batch.batch() if isinstance(batch, Draft) else batch)
         self.reports.append(self.solver.step(settle=settle))
-        if points_below and (ripe := self.solver.ripe(points_below)).size:
+        if convert_below and (ripe := self.solver.ripe(convert_below)).size:
             self.solver, report = self.solver.with_points(ripe)
             self.reports.append(report)
         for group in self.solver.changed():
@@ -152,9 +152,9 @@ class Far:
     def __init__(self, joined: Map) -> None:
         self._map = joined
 
-    def insert(self, batch: Batch | Draft, *, settle: bool = False, points_below: float = 0.0) -> None:
+    def insert(self, batch: Batch | Draft, *, settle: bool = False, convert_below: float = 0.0) -> None:
         """Until the mirror has it."""
-        self._map.insert(batch, settle=settle, points_below=points_below)
+        self._map.insert(batch, settle=settle, convert_below=convert_below)
 
     def value(self, key: int) -> np.ndarray:
         """The estimate of one variable."""

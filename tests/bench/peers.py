@@ -7,7 +7,7 @@
                another replay than the timed ones
     growth     a simulated drive of 100,000 poses: the time of a step and the memory as the map grows
     cores      what a second core brings for the longest steps of 20,000 poses, by the clock
-    full-pass  relinearise, order, analyse, factorise and solve each final system, against CHOLMOD with OpenBLAS
+    full-pass  relinearize, order, analyse, factorize and solve each final system, against CHOLMOD with OpenBLAS
     overhead   what Python adds to the compiled calls of a step; the start of a process; compiling from nothing
 
 Every run is a process of its own on one core, three repetitions, medians, and is kept in the output folder

@@ -97,14 +97,14 @@ def _send(driven: Map, letter: str, n: int, begins: bool, notes: Notes) -> None:
         draft = Draft().se2(f"{letter}{n}")
         draft.between_se2(f"{letter}{n - 1}", f"{letter}{n}", (1, 0, 0.01), sigmas=SIGMAS)
     notes.state[n] = SENT | (BEGINS if begins else 0)
-    ticket = driven.send(draft, timeout_s=_PATIENCE_S)
+    pending_insert = driven.send(draft, timeout_s=_PATIENCE_S)
 
     def answered(_: object) -> None:
-        if ticket.future.exception() is None:
-            notes.took_us[n] = 1e6 * (ticket.round_trip_s or 0.0)
+        if pending_insert.future.exception() is None:
+            notes.took_us[n] = 1e6 * (pending_insert.round_trip_s or 0.0)
             notes.state[n] |= ANSWERED
 
-    ticket.future.add_done_callback(answered)
+    pending_insert.future.add_done_callback(answered)
 
 
 class _Orders:

@@ -28,7 +28,7 @@ def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", ["intel", "manhattan3500", "city10000"])
 def test_blocks_are_gtsam_s_at_the_end_of_a_data_set(datasets: Path, name: str) -> None:
-    """At the batch optimum, where both are linearised."""
+    """At the batch optimum, where both are linearized."""
     assert datasets.is_dir()
     graph = Solver(Options(mode="all-batch"))
     problem: Problem = ask._problem(name, 0)

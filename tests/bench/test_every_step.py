@@ -37,7 +37,7 @@ SLOPPY = (
     "relinearize_same_step_share",
     "relinearize_max_error",
     "converged_share",
-)  # at 1e9: nothing is relinearised
+)  # at 1e9: nothing is relinearized
 
 
 def steps_of(name: str, poses: int = SMALL, seed: int = 3) -> list[Batch]:

@@ -199,7 +199,7 @@ def test_samples_see_a_batch_at_every_hundredth_step_at_all_its_moments() -> Non
 
 
 @pytest.mark.parametrize("kind", ["poses", "landmarks", "space"])
-def test_fill_counts_what_a_dense_factorisation_fills(kind: str) -> None:
+def test_fill_counts_what_a_dense_factorization_fills(kind: str) -> None:
     columns = columns_of(REPLAYS[kind])
     numbers, pictures = fill.orderings(columns, pixels=40)
     dims, rows, cols, _ = fill.block_pattern(columns)

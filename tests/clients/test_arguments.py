@@ -104,19 +104,19 @@ def test_of_a_map(service: Service, kitchen: Map, call: Callable[[Any], object],
 
 @pytest.mark.parametrize("timeout_s", ["5", math.nan, -1, math.inf, True, [1]])
 def test_times_of_every_call(bus: Bus, kitchen: Map, timeout_s: Any) -> None:
-    ticket = kitchen.send(POINT)
+    pending_insert = kitchen.send(POINT)
     calls: list[Callable[..., object]] = [
         lambda **t: kitchen.insert(Draft(), **t), lambda **t: kitchen.send(Draft(), **t), kitchen.settle,
         lambda **t: kitchen.change(Changes(), **t), kitchen.flush, kitchen.wait_converged, kitchen.stats,
         kitchen.chi2, kitchen.graph, kitchen.clients, kitchen.export, kitchen.ask_estimate, kitchen.repair,
-        kitchen.estimate.wait_converged, lambda **t: kitchen.estimate.wait_for(1, **t), ticket.result,
+        kitchen.estimate.wait_converged, lambda **t: kitchen.estimate.wait_for(1, **t), pending_insert.result,
         kitchen.doubt.covariance, lambda **t: kitchen.doubt.why("x1", **t), bus.maps, bus.stats,
         lambda **t: bus.create("attic", **t), lambda **t: bus.drop("attic", **t),
     ]  # fmt: skip
     for call in calls:
         with pytest.raises(BadOption, match=r"timeout_s: .*; wanted seconds: a finite number, 0 or more"):
             call(timeout_s=timeout_s)
-    assert ticket.result(cast("Any", np.float32(20.0))).revision == 1
+    assert pending_insert.result(cast("Any", np.float32(20.0))).revision == 1
 
 
 def test_of_a_bus(bus: Bus) -> None:

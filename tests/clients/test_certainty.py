@@ -4,6 +4,7 @@ from concurrent.futures import Future
 
 import numpy as np
 import pytest
+from factorbus.viz.rate_limited import RateLimited
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 
@@ -15,7 +16,6 @@ from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import solve_batch
 from factorbus.viz.certainty import chosen
-from factorbus.viz.polite import Polite
 from factorbus.viz.tree import parents_of, places_of, reached_from
 
 
@@ -36,17 +36,21 @@ def test_a_question_is_put_one_at_a_time_and_what_was_waited_for_is_not_overwrit
         asked.append(Future())
         return asked[-1]
 
-    polite = Polite(ask, 0)
-    assert (polite.refresh(lambda had: had < 1), polite.refresh(lambda had: had < 1), len(asked)) == (0, 0, 1)
+    rate_limited = RateLimited(ask, 0)
+    assert (rate_limited.refresh(lambda had: had < 1), rate_limited.refresh(lambda had: had < 1), len(asked)) == (
+        0,
+        0,
+        1,
+    )
     asked[0].set_exception(RuntimeError("the service went"))
-    assert polite.refresh(lambda _: False) == 0
-    assert polite.refresh(lambda had: had < 1) == 0
+    assert rate_limited.refresh(lambda _: False) == 0
+    assert rate_limited.refresh(lambda had: had < 1) == 0
     assert len(asked) == 1, "there is a pause first"
-    polite = Polite(ask, 0)
-    polite.refresh(lambda had: had < 1)
-    polite.put(7)
+    rate_limited = RateLimited(ask, 0)
+    rate_limited.refresh(lambda had: had < 1)
+    rate_limited.put(7)
     asked[-1].set_result(3)
-    assert polite.refresh(lambda _: False) == 7
+    assert rate_limited.refresh(lambda _: False) == 7
 
 
 def test_covariances_at_a_files_values_are_those_of_a_dense_inverse() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from faulty.service import MAP, Service, endpoint_in
 
-from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, courier
+from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, sender
 from factorbus.client.mirror import Mirror
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Variables
@@ -62,11 +62,11 @@ def test_inserts_are_answered_and_seen_in_the_mirror(start: Callable[..., Servic
         assert "l2" not in kitchen.estimate
         assert len(kitchen.estimate) == 1
         assert kitchen.client.startswith("robot1-")
-        tickets = [kitchen.send(point(f"l{i}", i / 3)) for i in range(2, 200)]
+        pending_inserts = [kitchen.send(point(f"l{i}", i / 3)) for i in range(2, 200)]
         kitchen.flush()
-        assert [ticket.result().sequence for ticket in tickets] == list(range(2, 200))
+        assert [pending_insert.result().sequence for pending_insert in pending_inserts] == list(range(2, 200))
         elapsed_s = time.monotonic() - started
-        assert all(0 < ticket.round_trip_s <= elapsed_s for ticket in tickets)
+        assert all(0 < pending_insert.round_trip_s <= elapsed_s for pending_insert in pending_inserts)
         kitchen.estimate.wait_for(199)
         assert same(kitchen.estimate, service)
         assert not kitchen.estimate.stale
@@ -94,7 +94,7 @@ def test_an_insert_is_sent_again_with_its_number_and_taken_once(
 def test_an_insert_nobody_answers_in_time_is_sent_again(
     start: Callable[..., Service], endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(courier, "TRY_S", 0.1)
+    monkeypatch.setattr(sender, "TRY_S", 0.1)
     service = start()
     service.faults.append("hold")
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
@@ -106,9 +106,9 @@ def test_inserts_that_overtook_are_sent_again_behind_the_first(start: Callable[.
     service = start()
     service.faults.extend(["silence", "parked too long", "parked too long"])
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
-        tickets = [kitchen.send(point(f"l{i}", i)) for i in range(3)]
+        pending_inserts = [kitchen.send(point(f"l{i}", i)) for i in range(3)]
         kitchen.flush()
-        assert [ticket.result().revision for ticket in tickets] == [1, 2, 3]
+        assert [pending_insert.result().revision for pending_insert in pending_inserts] == [1, 2, 3]
         assert same(kitchen.estimate, service)
 
 
@@ -146,7 +146,7 @@ def test_a_full_window_blocks_and_says_so(start: Callable[..., Service], endpoin
             kitchen.send(point("l3", 3), timeout_s=0.05)
         with pytest.raises(NoAnswerYet) as caught:
             first.result(0.05)
-        assert caught.value.ticket is first
+        assert caught.value.pending_insert is first
         with pytest.raises(Unavailable, match="2 inserts without an answer"):
             kitchen.flush(0.05)
         kitchen.close()
@@ -240,14 +240,14 @@ def test_the_same_map_after_a_loss_of_the_link(start: Callable[..., Service], en
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
         kitchen.insert(point("l1", 1))
         before.close()
-        tickets = [kitchen.send(point(f"l{i}", i)) for i in range(2, 6)]
+        pending_inserts = [kitchen.send(point(f"l{i}", i)) for i in range(2, 6)]
         with pytest.raises(NoAnswerYet):
-            tickets[0].result(0.3)
+            pending_inserts[0].result(0.3)
         assert kitchen.estimate.stale
         after = start()
         after.values, after.revision = before.values, before.revision
         after.answers, after.next = before.answers, before.next
-        assert [ticket.result().sequence for ticket in tickets] == [2, 3, 4, 5]
+        assert [pending_insert.result().sequence for pending_insert in pending_inserts] == [2, 3, 4, 5]
         kitchen.estimate.wait_for(5)
         assert same(kitchen.estimate, after)
 
@@ -274,10 +274,10 @@ def test_joining_anew_gives_up_what_was_not_answered(start: Callable[..., Servic
     service = start()
     service.faults.append("hold")
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
-        ticket = kitchen.send(point("l1", 1))
+        pending_insert = kitchen.send(point("l1", 1))
         kitchen.rejoin()
         with pytest.raises(Unavailable, match="joined the map anew"):
-            ticket.result()
+            pending_insert.result()
         assert kitchen.insert(point("l2", 1)).sequence == 1
 
 

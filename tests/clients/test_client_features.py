@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factorbus.client.pool import SharedMemoryPool
 from naive.random_sightings import random_sighting
 
 from factorbus import idp
 from factorbus.client.grown import factored, grown
-from factorbus.client.memories import Memories
 from factorbus.idp import job, minimal
 from factorbus.proto.features import Answer, Ask, Done, Shard, ShardDone, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
@@ -48,17 +48,17 @@ def test_shards_become_the_grown_covariance(seen, form: str) -> None:
 def test_rows_in_memory_and_rows_that_came_as_bytes_are_put_together(seen) -> None:
     """One worker shares memory with us, another does not."""
     sighting, P, after = seen
-    memories = Memories()
+    pool = SharedMemoryPool()
     m = sighting.width
-    lent = memories.try_lend(PAGE, after.shape, m)
+    lent = pool.try_allocate(PAGE, after.shape, m)
     assert lent is not None
     here = answered(Ask(sighting, "rows", lent.segment), CUTS[:2])
     elsewhere = answered(Ask(sighting, "rows"), CUTS[2:])
     assert [done.shard.stored for done in here.shards] == [True, True]
     found = grown(np.zeros(m), P, sighting, Answer((*here.shards, *elsewhere.shards), True), lent.matrix)
     assert found.P.tobytes() == after.tobytes()
-    memories.settle(lent, clean=False)
-    memories.close()
+    pool.settle(lent, clean=False)
+    pool.close()
 
 
 def test_factors_give_every_block(seen) -> None:
@@ -121,43 +121,43 @@ def descriptors() -> set[str]:
 
 
 def test_memory_is_used_again_when_nobody_looks_at_it() -> None:
-    before, memories = descriptors(), Memories()
-    first = memories.try_lend(PAGE, (300, 300), 10)
+    before, pool = descriptors(), SharedMemoryPool()
+    first = pool.try_allocate(PAGE, (300, 300), 10)
     assert first is not None
     descriptor, view = first.segment.descriptor, first.matrix[5:7]
-    memories.settle(first, clean=True)
+    pool.settle(first, clean=True)
     del first
     gc.collect()
-    second = memories.try_lend(PAGE, (300, 300), 10)
+    second = pool.try_allocate(PAGE, (300, 300), 10)
     assert second is not None
     assert second.segment.descriptor != descriptor, "a view of the first is still looked at"
     view[:] = 1.0
     del view
     gc.collect()
-    third = memories.try_lend(PAGE, (290, 290), 10)
+    third = pool.try_allocate(PAGE, (290, 290), 10)
     assert third is not None
     assert third.segment.descriptor == descriptor
     assert third.segment.nonce != second.segment.nonce
-    memories.settle(second, clean=False)
-    memories.settle(third, clean=False)
-    memories.close()
+    pool.settle(second, clean=False)
+    pool.settle(third, clean=False)
+    pool.close()
     del second, third
     gc.collect()
     assert descriptors() == before
 
 
 def test_memory_that_somebody_may_still_write_to_is_not_used_again() -> None:
-    before, memories = descriptors(), Memories()
-    lent = memories.try_lend(PAGE, (300, 300), 0)
+    before, pool = descriptors(), SharedMemoryPool()
+    lent = pool.try_allocate(PAGE, (300, 300), 0)
     assert lent is not None
-    memories.settle(lent, clean=False)
+    pool.settle(lent, clean=False)
     del lent
     gc.collect()
     assert descriptors() == before
-    again = memories.try_lend(PAGE, (300, 300), 0)
+    again = pool.try_allocate(PAGE, (300, 300), 0)
     assert again is not None
-    memories.settle(again, clean=True)
-    memories.close()
+    pool.settle(again, clean=True)
+    pool.close()
     again.matrix[:] = 2.0  # lives on
     del again
     gc.collect()
@@ -165,4 +165,4 @@ def test_memory_that_somebody_may_still_write_to_is_not_used_again() -> None:
 
 
 def test_there_is_no_memory_for_more_than_one_question_may_use() -> None:
-    assert Memories().try_lend(PAGE, (1 << 15, 1 << 15), 0) is None
+    assert SharedMemoryPool().try_allocate(PAGE, (1 << 15, 1 << 15), 0) is None

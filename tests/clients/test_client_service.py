@@ -108,7 +108,7 @@ REFUSED = {
     "not_positive_definite": Draft().between_se2("x0", "x1", (1, 0, 0), information=np.diag([1, -1, 1])),
     "bad_range": Draft().point2("l1").bearing_range_se2("x1", "l1", (0, -1), sigmas=(1, 1)),
     "bad_quaternion": Draft().se3("y1", (0, 0, 0, 1, 1, 1, 1)),
-    "uninitialised": Draft().se2("x7"),
+    "uninitialized": Draft().se2("x7"),
     "underconstrained": Draft().se2("x8", (0, 0, 0)),
 }
 
@@ -131,9 +131,9 @@ def test_what_is_refused_leaves_the_map_as_it_was(service: Service) -> None:
 def test_a_stream_through_the_window_and_a_viewer_that_comes_late(service: Service) -> None:
     with connect(service.endpoint, timeout_s=60) as bus, bus.map("stream", window=16) as stream:
         stream.send(start())
-        tickets = [stream.send(step(i)) for i in range(1, 200)]
+        pending_inserts = [stream.send(step(i)) for i in range(1, 200)]
         stream.flush()
-        assert [ticket.result().sequence for ticket in tickets] == list(range(2, 201))
+        assert [pending_insert.result().sequence for pending_insert in pending_inserts] == list(range(2, 201))
         with connect(service.endpoint) as other, other.map("stream", create=False) as viewer:
             last = stream.insert(Draft().between_se2("x0", "x199", (0, 5, 0.1), sigmas=SIGMAS)).revision
             viewer.estimate.wait_for(last)
@@ -158,8 +158,8 @@ def test_the_same_under_asyncio(service: Service) -> None:
             listener = asyncio.create_task(listen(joined))
             await asyncio.sleep(0)  # it has subscribed
             assert (await joined.insert(start())).revision == 1
-            tickets = [await joined.send(step(i)) for i in range(1, 51)]
-            assert (await joined.result(tickets[0])).sequence == 2
+            pending_inserts = [await joined.send(step(i)) for i in range(1, 51)]
+            assert (await joined.result(pending_inserts[0])).sequence == 2
             await joined.flush()
             await listener
             with pytest.raises(Refused, match="x0"):
@@ -196,14 +196,14 @@ def test_a_killed_service_comes_back_empty_and_the_client_says_so(tmp_path: Path
         kitchen.insert(start())
         first = kitchen.epoch
         service.kill()
-        ticket = kitchen.send(step(1))
+        pending_insert = kitchen.send(step(1))
         with pytest.raises(NoAnswerYet):
-            ticket.result(0.3)
+            pending_insert.result(0.3)
         assert kitchen.estimate.stale
         assert kitchen.estimate["x0"].tolist() == [0, 0, 0]
         service = Service(endpoint)
         with pytest.raises(Refused) as caught:
-            ticket.result()
+            pending_insert.result()
         assert caught.value.code in ("unknown_map", "wrong_epoch")
         with connect(endpoint, timeout_s=30) as other, other.map("kitchen") as anew:
             anew.insert(start())

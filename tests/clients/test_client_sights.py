@@ -34,7 +34,7 @@ def test_a_draft_of_sights_is_the_golden_insert() -> None:
         np.testing.assert_array_equal(mine.information, theirs.information)
         assert (mine.scale is None) == (theirs.scale is None)
         assert mine.scale is None or mine.scale.tolist() == theirs.scale.tolist()
-    assert codec.decode_insert(codec.encode_insert(Insert(1, batch, points_below=0.1))).points_below == 0.1
+    assert codec.decode_insert(codec.encode_insert(Insert(1, batch, convert_below=0.1))).convert_below == 0.1
 
 
 @pytest.mark.parametrize("loss", [("welsch", 1.0), ("huber", 0.0), ("huber", float("nan"))])

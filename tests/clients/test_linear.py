@@ -84,7 +84,7 @@ def values(solver: Solver) -> dict[int, np.ndarray]:
 def drawn(
     names: list[str], kinds: list[str], near: list[np.ndarray], rows: int, rng: np.random.Generator, off: float = 0.1
 ) -> Known:
-    """What somebody knows of these variables, linearised at values near those given."""
+    """What somebody knows of these variables, linearized at values near those given."""
     y = [boxplus(kind, x, off * rng.normal(size=TANGENT[kind])) for kind, x in zip(kinds, near, strict=True)]
     root = rng.normal(size=(rows, rows)) + 3.0 * np.eye(rows)
     return Known(
@@ -177,7 +177,7 @@ def test_preintegrated_motion_between_states_of_four_variables() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
-    """Step by step they overlap without end; each is one of its own to what removes and marginalises."""
+    """Step by step they overlap without end; each is one of its own to what removes and marginalizes."""
     rng, count, each = np.random.default_rng(6), 40, []
     kinds, at, held = inertial(count, rng)
     solver, window = Solver(Options(mode=mode)), Solver(Options(mode=mode))
@@ -195,7 +195,7 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
             gone = [symbol(c, k) for c in "xvag" for k in range(n - 9, n - 4) if n > 9]
             gone += [symbol(c, k) for c in "xvag" for k in range(5) if n == 9]
             gone = [key for key in gone if window._graph.find(key) >= 0]
-            window, *_ = window.with_changes([Change("marginalise", keys=np.array(gone))])
+            window, *_ = window.with_changes([Change("marginalize", keys=np.array(gone))])
     assert [len(joint.variables) for joint in find_joints(solver._graph)] == [8] * (count - 1)
     assert window.factor_count < solver.factor_count
     assert max(len(joint.variables) for joint in find_joints(window._graph)) <= 8
@@ -215,7 +215,7 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
     for key, row in values(other).items():
         assert np.abs(row - values(solver)[key]).max() < 1e-7  # the last is known to half a metre
     # A marginal of one state has the next one in its border, and nothing else.
-    slid, *_ = solver.with_changes([Change("marginalise", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
+    slid, *_ = solver.with_changes([Change("marginalize", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
     widths = sorted(len(joint.variables) for joint in find_joints(slid._graph))
     assert widths == [4] + [8] * (count - 2)
     for key, row in values(slid).items():

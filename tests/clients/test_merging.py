@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factorbus.client.transform_linear import is_relative, says_nothing
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import boxminus, boxplus, pose_matrix, pose_vector, residual
@@ -17,8 +18,7 @@ from naive.random_sights import random_sight
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
 from factorbus.client.merging import fit_into
-from factorbus.client.moved import moved_factors
-from factorbus.client.moved_linear import is_relative, says_nothing
+from factorbus.client.moved import transform_factors
 from factorbus.pieces import cut
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
@@ -67,7 +67,7 @@ def test_a_moved_factor_says_of_moved_values_what_it_said_before(kind: str, seed
     T = random_value("se2" if connects[0].endswith("2") else "se3", rng)
     omega = random_information(FACTOR_KINDS[kind].dim, rng)
     group = Factors(kind, np.arange(len(ends))[None], z[None], omega[None])
-    moved = moved_factors(group, T)
+    moved = transform_factors(group, T)
     there = [moved_values(of, end[None], T)[0] for of, end in zip(connects, ends, strict=True)]
     before, after = residual(kind, ends, z), residual(kind, there, moved.measured[0])
     expected = before @ full(omega) @ before
@@ -82,7 +82,7 @@ def test_a_moved_factor_of_features_says_so_to_first_order(kind: str, seed: int)
     rng = np.random.default_rng(seed)
     ends, z = random_relative(kind, rng)
     connects, T = FACTOR_KINDS[kind].connects, random_value("se3", rng)
-    moved = moved_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T)
+    moved = transform_factors(Factors(kind, np.arange(len(ends))[None], z[None], np.zeros((1, 0))), T)
     y, far = parts_of(kind, z[None]).y, []
     off = [rng.normal(size=6 if of != "point3" else 3) for of in connects]
     for near in (1e-3, 1e-4):
@@ -139,7 +139,7 @@ def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() 
             solver = Solver(Options())
             solver.stage(draft.batch())
             solver.step(settle=True)
-            changes = Changes().marginalise("x2").listed()
+            changes = Changes().marginalize("x2").listed()
             marginal, *_ = solver.with_changes(changes, Batch(), True)
             pairs = [f for f in marginal.graph()[1] if f.kind == f"linear_pair_{kind}"]
             assert len(pairs) == 1

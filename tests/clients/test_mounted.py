@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorbus.client import Draft
-from factorbus.client.mounted import moved_se2, moved_se3
+from factorbus.client.mounted import transform_se2, transform_se3
 from factorbus.proto.messages import Batch
 from factorbus.proto.problems import BadInformation, BadShape
 from factorbus.proto.symbols import symbol
@@ -59,7 +59,7 @@ def random_poses(space: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def moved(space: str, z: np.ndarray, mount: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return moved_se2(z, mount) if space == "se2" else moved_se3("test", z, mount)
+    return transform_se2(z, mount) if space == "se2" else transform_se3("test", z, mount)
 
 
 @pytest.mark.parametrize("space", ["se2", "se3"])

@@ -19,7 +19,7 @@ SEEN: dict[str, Any] = {
         {"name": "a" * 64, "map": "m" * 64, "inserts": 9780, "inserts_per_s": 1.0, "here": True},
         {"name": "b", "map": "hall", "inserts": 1, "inserts_per_s": 0.0, "here": False},
     ],
-    "workers": [{"name": "w", "slots": 1, "in_flight": 0, "trip_ms": 12.5}],
+    "workers": [{"name": "w", "slots": 1, "in_flight": 0, "latency_ms": 12.5}],
 }  # fmt: skip
 
 

@@ -73,11 +73,11 @@ def test_who_has_been_heard_of_is_waited_for(tmp_path: Path) -> None:
         kitchen.insert(Draft().point2("l1", (1.0, 2.0)))
         service.close()
         with someone_of("v2", endpoint_in(tmp_path)):
-            ticket = kitchen.send(Draft().point2("l2", (1.0, 2.0)))
+            pending_insert = kitchen.send(Draft().point2("l2", (1.0, 2.0)))
             # Longer than it takes to find that the other one is there, had it looked.
             with pytest.raises(Unavailable):
                 kitchen.stats(timeout_s=2.0)
-            assert not ticket.future.done()
+            assert not pending_insert.future.done()
 
 
 class Older(Service):

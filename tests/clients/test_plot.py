@@ -87,8 +87,8 @@ def test_a_drive_shows_every_step_by_what_it_did() -> None:
     work = np.stack([np.arange(1, 41), np.full(40, 3), np.eye(40)[7]], axis=1).astype(float)
     worked = drive_figure(Course(course.chi2, course.step_ms, work=work), ["tree"] * 40).axes[3]
     marks = {line.get_label(): line.get_xdata().tolist() for line in worked.lines}
-    assert (len(marks["eliminated"]), marks["relinearised"]) == (40, [8]), (
-        "steps that relinearised nothing have no mark"
+    assert (len(marks["eliminated"]), marks["relinearized"]) == (40, [8]), (
+        "steps that relinearized nothing have no mark"
     )
 
 
@@ -142,7 +142,7 @@ def test_pictures_of_a_file(arguments: list[str], town: Path, tmp_path: Path, ca
     svg = tmp_path / "picture.svg"
     assert main(["plot", *arguments, str(town), "--out", str(svg)]) == OK
     text = svg.read_text()
-    assert {"map": "odometry alone", "drive": "relinearised", "sparsity": "fill-in", "tree": "last loop"}[
+    assert {"map": "odometry alone", "drive": "relinearized", "sparsity": "fill-in", "tree": "last loop"}[
         arguments[0]
     ] in text
     assert ("95 % of where it may be (9)" in text) == ("--ellipses" in arguments)

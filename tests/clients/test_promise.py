@@ -10,7 +10,7 @@ from types import FrameType
 
 import pytest
 
-from factorbus.client.promise import Promise
+from factorbus.client.promise import InterruptibleFuture
 
 WAITERS = 4
 INTERRUPTS = 200
@@ -18,7 +18,7 @@ _PAUSE_S = 1e-4
 
 
 def test_all_who_wait_get_it() -> None:
-    promise: Promise[int] = Promise()
+    promise: InterruptibleFuture[int] = InterruptibleFuture()
     with ThreadPoolExecutor(WAITERS) as pool:
         waiting = [pool.submit(promise.result, 60) for _ in range(WAITERS)]
         promise.set_result(7)
@@ -28,7 +28,7 @@ def test_all_who_wait_get_it() -> None:
 
 
 def test_what_failed_raises_for_all() -> None:
-    promise: Promise[int] = Promise()
+    promise: InterruptibleFuture[int] = InterruptibleFuture()
     promise.set_exception(KeyError("x1"))
     for _ in range(2):
         with pytest.raises(KeyError, match="x1"):
@@ -38,14 +38,14 @@ def test_what_failed_raises_for_all() -> None:
 
 @pytest.mark.parametrize("timeout_s", [0.0, 0.001, -1.0])
 def test_time_is_up(timeout_s: float) -> None:
-    promise: Promise[int] = Promise()
+    promise: InterruptibleFuture[int] = InterruptibleFuture()
     with pytest.raises(TimeoutError):
         promise.result(timeout_s)
     assert not promise.done()
 
 
 def test_asyncio_waits_for_it_and_cannot_cancel_it() -> None:
-    promise: Promise[int] = Promise()
+    promise: InterruptibleFuture[int] = InterruptibleFuture()
 
     async def wait() -> int:
         impatient = asyncio.wrap_future(promise)
@@ -74,7 +74,7 @@ def interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("interrupts")
 def test_interrupted_again_and_again_it_still_can_be_kept() -> None:
     for number in range(INTERRUPTS):
-        promise: Promise[int] = Promise()
+        promise: InterruptibleFuture[int] = InterruptibleFuture()
         end = time.monotonic() + 60
         try:
             signal.setitimer(signal.ITIMER_REAL, _PAUSE_S * (1 + number % 7))
@@ -89,7 +89,7 @@ def test_interrupted_again_and_again_it_still_can_be_kept() -> None:
             assert promise.result(10) == number
 
 
-def with_no_time(promise: Promise[int]) -> None:
+def with_no_time(promise: InterruptibleFuture[int]) -> None:
     try:
         promise.result(0)
     except TimeoutError:

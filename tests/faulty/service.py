@@ -114,7 +114,7 @@ class Service:
             if insert.sequence != self.next[client] + 1:
                 raise BadSequence(client, insert.sequence, "the next", self.next[client] + 1)
             self.next[client] += 1
-            self.answers[client, insert.sequence] = self._fold(insert)
+            self.answers[client, insert.sequence] = self._apply(insert)
         if fault == "answer lost":
             return None
         answer = self.answers[client, insert.sequence]
@@ -122,7 +122,7 @@ class Service:
             raise Problem("there is a NaN in it")
         return answer
 
-    def _fold(self, insert: Any) -> bytes:
+    def _apply(self, insert: Any) -> bytes:
         groups = insert.batch.variables
         if any(not np.isfinite(group.values).all() for group in groups):
             return b""

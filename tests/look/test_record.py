@@ -24,7 +24,8 @@ from factorbus.simulate import city_trees
 
 pytest.importorskip("foxglove")
 
-from factorbus.viz.lookout import Look
+from factorbus.viz.follower import Look
+
 from factorbus.viz.mcap import Recording
 
 

@@ -1,6 +1,6 @@
 """Block systems Λ to try the linear algebra on: random ones, generated worlds, and those of g2o files.
 
-A linearisation point is not needed for what is tested here, only the pattern and sensible numbers, so a relative
+A linearization point is not needed for what is tested here, only the pattern and sensible numbers, so a relative
 measurement z has the Jacobians −Ad(z⁻¹) and I, and a landmark those of a robot that never turns.
 """
 

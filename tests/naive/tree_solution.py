@@ -1,4 +1,4 @@
-"""δ and χ² of a tree of cliques, checked against the dense normal equations at its linearisation points."""
+"""δ and χ² of a tree of cliques, checked against the dense normal equations at its linearization points."""
 
 import copy
 
@@ -13,7 +13,7 @@ from factorbus.solver.sparse.blocks import Blocks
 
 
 def assert_solves(solver: Solver) -> None:
-    """δ is the solution of the dense normal equations at the linearisation points, and the account has its χ²."""
+    """δ is the solution of the dense normal equations at the linearization points, and the account has its χ²."""
     assert_is_a_tree(solver)
     information, eta, chi2, delta = normal_equations(solver)
     assert_is_solution(solver, information, eta, chi2, delta, least=1e-9)
@@ -33,7 +33,7 @@ def assert_is_solution(
 
 
 def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Λ, η and χ² of all factors at the linearisation points, by the kernels of the other modes; and δ."""
+    """Λ, η and χ² of all factors at the linearization points, by the kernels of the other modes; and δ."""
     graph = copy.copy(solver._graph)
     graph.fac, graph.values = graph.fac.copy(), tree_of(solver).lin[0].copy()
     blocks, scalars = Blocks(), int(graph.counts[at.SCALARS])

@@ -20,7 +20,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "weigh": {"factors": TWO, "weight": NUMBERS},
     "fix": {"keys": TWO},
     "free": {"keys": TWO},
-    "marginalise": {"keys": TWO},
+    "marginalize": {"keys": TWO},
     "place": {"kind": "point2", "keys": TWO, "values": 2 * NUMBERS},
 }
 

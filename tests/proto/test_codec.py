@@ -1,4 +1,4 @@
-"""Messages to bytes and back: golden bytes, round trips, and decoders that take anything without harm."""
+"""Messages to bytes and back: golden bytes, round latencies, and decoders that take anything without harm."""
 
 import json
 import re
@@ -135,7 +135,7 @@ def from_description(content: Any) -> Any:
     return [from_description(item) for item in content] if isinstance(content, list) else content
 
 
-# ---- round trips --------------------------------------------------------------------------------------------------
+# ---- round latencies --------------------------------------------------------------------------------------------------
 
 NUMBERS = st.integers(0, 2**63 - 1)
 DOUBLES = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -194,7 +194,7 @@ MESSAGES = {
         BATCHES,
         st.booleans(),
         NUMBERS,
-        points_below=st.floats(0.0, allow_infinity=False).map(lambda below: below or 0.0),  # 0 is as good as none
+        convert_below=st.floats(0.0, allow_infinity=False).map(lambda below: below or 0.0),  # 0 is as good as none
         changes=st.lists(changes(), max_size=3).map(tuple),
     ),
     "accepted": st.builds(Accepted, NUMBERS, NUMBERS, NUMBERS, NUMBERS, NUMBERS, REPORTS),
@@ -502,7 +502,7 @@ def test_a_documented_field_of_a_report_can_always_be_asked_for() -> None:
     ]
     assert {"mode", "because", "chi2", "converged", "step_ms", "solver_ms", "removed_factors"} <= set(named)
     accepted = codec.decode_accepted(
-        msgpack.packb({"sequence": 1, "epoch": 1, "revision": 1, "first_factor": 0, "folded": 1})
+        msgpack.packb({"sequence": 1, "epoch": 1, "revision": 1, "first_factor": 0, "applied": 1})
     )
     for name in named:
         accepted.report[name]

@@ -96,7 +96,7 @@ class RosNode:
 
 
 def read_attachment(data: bytes) -> tuple[int, int, bytes]:
-    """Number, time, gid, by Zenoh's own serialisation."""
+    """Number, time, gid, by Zenoh's own serialization."""
     number, stamp = z_deserialize(Int64, zenoh.ZBytes(data[:8])), z_deserialize(Int64, zenoh.ZBytes(data[8:16]))
     return int(number), int(stamp), bytes(z_deserialize(list[UInt8], zenoh.ZBytes(data[16:])))
 

@@ -71,7 +71,7 @@ def test_type_hashes_are_those_seen_on_robots() -> None:
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
-def test_attachments_are_read_by_zenohs_own_serialisation(number: int, stamp: int, of: bytes) -> None:
+def test_attachments_are_read_by_zenohs_own_serialization(number: int, stamp: int, of: bytes) -> None:
     assert ros.read_attachment(attachment(number, stamp, of)) == (number, stamp, of)
 
 

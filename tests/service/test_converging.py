@@ -11,18 +11,18 @@ from factorbus.proto.problems import Internal
 from factorbus.service.config import Limits
 from factorbus.service.core import converging
 from factorbus.service.core.events import (
-    Alone,
+    Applied,
     Arrived,
     Asked,
     Drained,
     Effect,
-    Folded,
-    Judged,
-    Located,
+    InsertBatch,
     Outcome,
+    ParsedInsert,
     Publish,
-    Run,
+    SingleInsertResult,
     Stepped,
+    Verdict,
 )
 from factorbus.service.core.map_state import MapCore, Restored
 from factorbus.service.questions.admin import MovedOn
@@ -50,18 +50,18 @@ class Driven:
         self.now += later
         return self.core.tick(self.now)
 
-    def done(self, run: Run, converged: bool, took_s: float = 0.0, **of_step: Any) -> list[Effect]:
+    def done(self, run: InsertBatch, converged: bool, took_s: float = 0.0, **of_step: Any) -> list[Effect]:
         """What comes of `run`; each step halves χ², unless it is told another."""
         self.now += took_s
         self.cpu_s += took_s
         self.revision += 1
         self.chi2 = of_step.pop("chi2", self.chi2 / 2)
-        effects = self.core.judged(Judged(tuple(Outcome(i, b"ok") for i in run.inserts))) if run.inserts else []
+        effects = self.core.judged(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts))) if run.inserts else []
         of_step = {"changed": 3, **of_step}
         effects += self.core.stepped(
             Stepped(self.revision, b"", "tree", self.chi2, 1.0, converged=converged, further=run.further, **of_step)
         )
-        return effects + self.core.folded(Folded(3, 4, self.cpu_s, self.now))
+        return effects + self.core.applied(Applied(3, 4, self.cpu_s, self.now))
 
     def says(self) -> tuple[bool, bool, bool]:
         """Converged, converging, and whether it has given up."""
@@ -81,14 +81,14 @@ def driven() -> Driven:
     return Driven()
 
 
-def the_run(effects: list[Effect]) -> Run:
-    (run,) = [effect for effect in effects if isinstance(effect, Run)]
+def the_run(effects: list[Effect]) -> InsertBatch:
+    (run,) = [effect for effect in effects if isinstance(effect, InsertBatch)]
     assert effects[-1] is run
     return run
 
 
 def goes_on(effects: list[Effect]) -> bool:
-    runs = [effect for effect in effects if isinstance(effect, Run)]
+    runs = [effect for effect in effects if isinstance(effect, InsertBatch)]
     assert all(run.further and not run.inserts and not run.short for run in runs)
     return bool(runs)
 
@@ -186,10 +186,10 @@ def test_after_one_that_is_done_at_once_quiet_is_waited_for_too(driven: Driven) 
     effects = driven.done(the_run(driven.tick()), converged=False)
     driven.done(the_run(effects), converged=True)
     driven.now += 1.0
-    insert = driven.arrived()._replace(content=Located(b"", np.zeros((0, 0), np.int64), False))
+    insert = driven.arrived()._replace(content=ParsedInsert(b"", np.zeros((0, 0), np.int64), False))
     run = the_run(driven.core.insert(insert))
     assert run.short
-    alone = Alone(insert, b"ok", b"", 0, 4, "tree", 9.0, 1.0, 3, 4, 0.0, driven.now, converged=False)
+    alone = SingleInsertResult(insert, b"ok", b"", 0, 4, "tree", 9.0, 1.0, 3, 4, 0.0, driven.now, converged=False)
     assert not goes_on(driven.core.alone(alone, insert.askers[0]))
     assert driven.says() == CONVERGING
     assert not goes_on(driven.tick(LATER / 2))
@@ -213,13 +213,13 @@ def test_questions_are_answered_of_the_latest_revision_and_do_not_stop_it(driven
     assert driven.core.ask(Asked("q", "chi2", b""), driven.now) == []
     following = the_run(driven.done(run, converged=False))
     assert [read.asker for read in following.reads] == ["q"]
-    assert following.further, "reads come first in a Run, and so are of the step before"
+    assert following.further, "reads come first in a InsertBatch, and so are of the step before"
     driven.done(following, converged=False)
     for n in range(20):  # who asks all the time
         effects = driven.core.ask(Asked(f"q{n}", "chi2", b""), driven.now)
         if not effects:
             break
-        driven.core.folded(Folded(3, 4, 0.0, driven.now))
+        driven.core.applied(Applied(3, 4, 0.0, driven.now))
     assert driven.core.stats(driven.now)["further_steps"] >= 2
 
 
@@ -267,13 +267,13 @@ def test_slow_ones_that_lower_it_go_on_and_there_is_an_end_to_them_too(
 def test_a_solver_that_refuses_is_not_tried_again(driven: Driven) -> None:
     driven.insert(converged=False)
     run = the_run(driven.tick())
-    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now, refused=True)) + driven.tick())
+    assert not goes_on(driven.core.applied(Applied(3, 4, 0.0, driven.now, refused=True)) + driven.tick())
     assert run.further
     assert driven.says() == GAVE_UP
     driven.insert(converged=True, unfinished=True)
     assert driven.says() == POLISHED, "what is new may help"
     the_run(driven.tick(converging.POLISH_IDLE_S))
-    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now, refused=True)) + driven.tick(60.0))
+    assert not goes_on(driven.core.applied(Applied(3, 4, 0.0, driven.now, refused=True)) + driven.tick(60.0))
     assert driven.says() == (True, False, True)
 
 
@@ -284,13 +284,13 @@ def test_one_that_diverges_is_not_tried_again_though_undoing_it_is_a_step(driven
         the_run(driven.tick(converging.POLISH_IDLE_S))
         driven.revision += 1
         undone = Stepped(driven.revision, b"", "full", 5.0, 1.0, changed=3, further=True, unfinished=True)
-        folded = Folded(3, 4, 0.0, driven.now, refused=True)
+        applied = Applied(3, 4, 0.0, driven.now, refused=True)
         if free_first:
-            driven.core.folded(folded)
+            driven.core.applied(applied)
             driven.core.kept([undone], driven.now)
         else:
             driven.core.stepped(undone)
-            driven.core.folded(folded)
+            driven.core.applied(applied)
         assert not goes_on(driven.tick(60.0))
         assert driven.says() == (True, False, True)
 
@@ -318,12 +318,12 @@ def test_while_a_step_is_not_written_or_nothing_can_be_there_is_none(driven: Dri
     """With a journal, and durability commit: what the solver did is told when it is safe."""
     driven.insert(converged=False)
     run = the_run(driven.tick())
-    assert not goes_on(driven.core.folded(Folded(3, 4, 0.0, driven.now)) + driven.tick()), "not told yet"
+    assert not goes_on(driven.core.applied(Applied(3, 4, 0.0, driven.now)) + driven.tick()), "not told yet"
     told = Stepped(2, b"", "tree", 5.0, 1.0, converged=False, changed=3, further=run.further)
     assert goes_on(driven.core.kept([told], driven.now))
-    driven.core.folded(Folded(3, 4, 0.0, driven.now))
+    driven.core.applied(Applied(3, 4, 0.0, driven.now))
     driven.core.unkept(Internal("x"), driven.now)  # that one did not happen
-    driven.core.folded(Folded(3, 4, 0.0, driven.now))  # the solver has gone back
+    driven.core.applied(Applied(3, 4, 0.0, driven.now))  # the solver has gone back
     assert not any(goes_on(driven.tick()) for _ in range(3)), "the disk is full"
     assert driven.core.revision == 2
     assert driven.says() == CONVERGING

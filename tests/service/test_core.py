@@ -10,33 +10,33 @@ from factorbus.proto.problems import Internal, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.events import (
     Answer,
+    Applied,
     Arrived,
     Asked,
     Drained,
     Effect,
-    Folded,
-    Judged,
+    InsertBatch,
     Outcome,
     Publish,
     Refuse,
-    Run,
     Stepped,
     Tell,
+    Verdict,
 )
 from factorbus.service.core.map_state import MapCore
 
 
 @pytest.fixture
 def core() -> MapCore:
-    return MapCore("m", "auto", 5, Limits(fold=2, keyframe_steps=3, questions=2), now=0.0)
+    return MapCore("m", "auto", 5, Limits(record=2, keyframe_steps=3, questions=2), now=0.0)
 
 
 def insert(client: str, sequence: int) -> Arrived:
     return Arrived([f"{client}{sequence}"], client, sequence, 0, 10, sequence, Insert(sequence, Batch()), 1.0)
 
 
-def run_of(effects: list[Effect]) -> Run:
-    (run,) = [effect for effect in effects if isinstance(effect, Run)]
+def run_of(effects: list[Effect]) -> InsertBatch:
+    (run,) = [effect for effect in effects if isinstance(effect, InsertBatch)]
     return run
 
 
@@ -44,11 +44,11 @@ def events(effects: list[Effect]) -> list[str]:
     return [codec.decode_map(e.message)["event"] for e in effects if isinstance(e, Publish) and e.channel == "event"]
 
 
-def solved(core: MapCore, run: Run, answer: Any = b"ok") -> list[Effect]:
-    effects = core.judged(Judged(tuple(Outcome(i, answer) for i in run.inserts)))
+def solved(core: MapCore, run: InsertBatch, answer: Any = b"ok") -> list[Effect]:
+    effects = core.judged(Verdict(tuple(Outcome(i, answer) for i in run.inserts)))
     if run.inserts and isinstance(answer, bytes):
         effects += core.stepped(Stepped(core.revision + 1, b"delta", "all-batch", 1.5, 2.0))
-    return effects + core.folded(Folded(3, 4, 0.5, 2.0))
+    return effects + core.applied(Applied(3, 4, 0.5, 2.0))
 
 
 def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: MapCore) -> None:
@@ -56,23 +56,23 @@ def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: Ma
     assert [core.insert(insert("a", s)) for s in (2, 3, 4)] == [[], [], []]
     effects = solved(core, run)
     assert effects[:2] == [Answer("a1", b"ok"), Publish("delta", b"delta")]
-    assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `fold` at a time"
+    assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `record` at a time"
     assert core.revision == 1
 
 
-def brought(core: MapCore, sequence: int, at: float, size: int = 10, settle: bool = False) -> Run:
-    """The Run for one more insert, which arrives `at`."""
+def brought(core: MapCore, sequence: int, at: float, size: int = 10, settle: bool = False) -> InsertBatch:
+    """The InsertBatch for one more insert, which arrives `at`."""
     message = Insert(sequence, Batch(), settle)
     return run_of(core.insert(Arrived([f"a{sequence}"], "a", sequence, 0, size, sequence, message, at)))
 
 
-def finish(core: MapCore, run: Run, at: float) -> list[Effect]:
-    core.judged(Judged(tuple(Outcome(i, b"ok") for i in run.inserts)))
-    return core.folded(Folded(3, 4, 0.5, at))
+def finish(core: MapCore, run: InsertBatch, at: float) -> list[Effect]:
+    core.judged(Verdict(tuple(Outcome(i, b"ok") for i in run.inserts)))
+    return core.applied(Applied(3, 4, 0.5, at))
 
 
 def ran(core: MapCore, sequence: int, begin: float, end: float) -> bool:
-    """Was the Run from `begin` to `end` called short?"""
+    """Was the InsertBatch from `begin` to `end` called short?"""
     run = brought(core, sequence, begin)
     finish(core, run, end)
     return run.short
@@ -81,7 +81,7 @@ def ran(core: MapCore, sequence: int, begin: float, end: float) -> bool:
 def test_a_run_is_short_when_those_of_late_were(core: MapCore) -> None:
     short = [ran(core, n, n, n + (0.5 if n == 3 else 0.001)) for n in range(1, 60)]
     assert short[:3] == [False, True, True], "nothing is known of the first"
-    assert not any(short[3:55]), "one slow Run is remembered: 0.9^52 of half a second is just above 2 ms"
+    assert not any(short[3:55]), "one slow InsertBatch is remembered: 0.9^52 of half a second is just above 2 ms"
     assert all(short[56:])
 
 
@@ -172,7 +172,7 @@ def test_a_keyframe_now_and_then(limits: Limits) -> None:
     due = 3  # the third step, or the third delta of five bytes
     for sequence in range(1, due + 1):
         effects = solved(core, run_of(core.insert(insert("a", sequence))))
-        keyframes = [r.question.name for e in effects if isinstance(e, Run) for r in e.reads]
+        keyframes = [r.question.name for e in effects if isinstance(e, InsertBatch) for r in e.reads]
         assert keyframes == (["keyframe"] if sequence == due else [])
 
 

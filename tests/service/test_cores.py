@@ -8,9 +8,9 @@ import pytest
 
 from factorbus.service.process import control_groups
 from factorbus.service.process import worker_threads as cores
-from factorbus.service.process.worker_threads import LentCores
+from factorbus.service.process.worker_threads import WorkerThreads
 from factorbus.solver.kernels.bayes_tree.step import tree_step
-from factorbus.solver.sparse.lending import can_lend, count_free
+from factorbus.solver.sparse.lending import can_work, count_free
 from factorbus.solver.warm import iter_compile
 
 pytestmark = pytest.mark.skipif(
@@ -58,7 +58,7 @@ def test_no_more_than_told_and_than_there_are(
 ) -> None:
     monkeypatch.setattr(cores, "core_count", lambda: there)
     assert list(iter_compile(tree_step))
-    free, lent = count_free(), LentCores(told)
+    free, lent = count_free(), WorkerThreads(told)
     assert lent.account() == {"used": used, "pieces": 0}
     assert lending() == used - 1
     assert count_free() == free - (used - 1)
@@ -69,13 +69,13 @@ def test_no_more_than_told_and_than_there_are(
 
 def test_no_thread_compiles_what_nobody_has_asked_for_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cores, "core_count", lambda: 2)
-    monkeypatch.setattr(cores, "can_lend", lambda: False)
-    free, lent = count_free(), LentCores(2)
+    monkeypatch.setattr(cores, "can_work", lambda: False)
+    free, lent = count_free(), WorkerThreads(2)
     lent.tick()
     assert lent.account() == {"used": 1, "pieces": 0}
     assert (lending(), count_free()) == (0, free)
     assert list(iter_compile(tree_step))
-    monkeypatch.setattr(cores, "can_lend", can_lend)
+    monkeypatch.setattr(cores, "can_work", can_work)
     for _ in range(2):
         lent.tick()
         assert lent.account() == {"used": 2, "pieces": 0}

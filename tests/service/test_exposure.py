@@ -36,7 +36,7 @@ def test_protected_is_safe(endpoint: str, settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "without", "lacking"),
+    ("endpoint", "without", "missing"),
     [
         ("tcp/0.0.0.0:7447", "", "encryption"),
         ("udp/10.0.0.1:7447", "", "encryption"),
@@ -45,9 +45,9 @@ def test_protected_is_safe(endpoint: str, settings: dict[str, Any]) -> None:
         ("tls/0.0.0.0:7447", "access_control", "denies by default"),
     ],
 )
-def test_one_thing_lacking_is_enough(endpoint: str, without: str, lacking: str) -> None:
+def test_one_thing_lacking_is_enough(endpoint: str, without: str, missing: str) -> None:
     settings = {path: value for path, value in SAFE.items() if path != without}
-    with pytest.raises(Exposed, match=lacking) as caught:
+    with pytest.raises(Exposed, match=missing) as caught:
         refuse_exposed(["tcp/127.0.0.1:1", endpoint], settings.get)
     assert caught.value.code == "exposed"
     assert caught.value.detail["endpoint"] == endpoint

@@ -15,9 +15,9 @@ from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Va
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.proto.symbols import parse_symbol
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
+from factorbus.service.core.events import Applied, Arrived, Outcome, ParsedInsert, SingleInsertResult, Stepped, Verdict
 from factorbus.service.questions.answers import Question
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
@@ -48,7 +48,7 @@ def waiting(content: Batch | Problem, client: str = "a", sequence: int = 1, sett
 
 @dataclass(frozen=True)
 class Result:
-    """All that came of one fold."""
+    """All that came of one record."""
 
     outcomes: tuple[Outcome, ...]
     steps: tuple[Stepped, ...]
@@ -56,27 +56,27 @@ class Result:
     factors: int
 
 
-def fold(folder: Folder, *inserts: Arrived) -> Result:
-    *events, end = folder.fold(inserts)
-    assert isinstance(end, Folded)
-    outcomes = tuple(o for e in events if isinstance(e, Judged) for o in e.outcomes)
+def record(folder: MapSolver, *inserts: Arrived) -> Result:
+    *events, end = folder.record(inserts)
+    assert isinstance(end, Applied)
+    outcomes = tuple(o for e in events if isinstance(e, Verdict) for o in e.outcomes)
     assert sorted(map(id, inserts)) == sorted(id(o.insert) for o in outcomes), "everybody is answered once"
     return Result(outcomes, tuple(e for e in events if isinstance(e, Stepped)), end.variables, end.factors)
 
 
-def codes(folded: Result) -> list[str]:
-    return [getattr(o.answer, "code", "accepted") for o in folded.outcomes]
+def codes(applied: Result) -> list[str]:
+    return [getattr(o.answer, "code", "accepted") for o in applied.outcomes]
 
 
-def accepted(folded: Result) -> list[Accepted]:
-    return [codec.decode_accepted(o.answer) for o in folded.outcomes if isinstance(o.answer, bytes)]
+def accepted(applied: Result) -> list[Accepted]:
+    return [codec.decode_accepted(o.answer) for o in applied.outcomes if isinstance(o.answer, bytes)]
 
 
-def deltas(folded: Result) -> list[Delta]:
-    return [codec.decode_delta(step.delta) for step in folded.steps]
+def deltas(applied: Result) -> list[Delta]:
+    return [codec.decode_delta(step.delta) for step in applied.steps]
 
 
-def values(folder: Folder) -> dict[int, bytes]:
+def values(folder: MapSolver) -> dict[int, bytes]:
     taken = folder.snapshot([Question("estimate")])
     return {
         int(key): row.tobytes() for g in taken.variables if g.values is not None
@@ -89,29 +89,31 @@ def make() -> Solver:
 
 
 @pytest.fixture
-def folder() -> Folder:
-    made = Folder(make, EPOCH, Limits())
-    fold(made, waiting(start()))
+def folder() -> MapSolver:
+    made = MapSolver(make, EPOCH, Limits())
+    record(made, waiting(start()))
     return made
 
 
-def test_several_inserts_in_one_step(folder: Folder) -> None:
-    folded = fold(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2))
-    assert codes(folded) == ["accepted"] * 3
-    assert [(a.revision, a.first_factor, a.folded, a.epoch) for a in accepted(folded)] == [
+def test_several_inserts_in_one_step(folder: MapSolver) -> None:
+    applied = record(
+        folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2)
+    )
+    assert codes(applied) == ["accepted"] * 3
+    assert [(a.revision, a.first_factor, a.applied, a.epoch) for a in accepted(applied)] == [
         (2, 0, 3, EPOCH),
         (2, 1, 3, EPOCH),
         (2, 2, 3, EPOCH),
     ]
-    (delta,) = deltas(folded)
+    (delta,) = deltas(applied)
     assert (delta.revision, delta.previous, delta.epoch) == (2, 1, EPOCH)
     assert sorted(int(k) for g in delta.variables for k in g.keys) == sorted(keys_of("x1", "x2", "x3").tolist())
-    assert (folded.variables, folded.factors) == (4, 3)
+    assert (applied.variables, applied.factors) == (4, 3)
     assert delta.report["solver_ms"] > 0
 
 
-def test_a_bad_insert_is_refused_and_the_others_go_on(folder: Folder) -> None:
-    folded = fold(
+def test_a_bad_insert_is_refused_and_the_others_go_on(folder: MapSolver) -> None:
+    applied = record(
         folder,
         waiting(pose("x1", "x0")),
         waiting(pose("x1", "x0"), "b"),
@@ -119,7 +121,7 @@ def test_a_bad_insert_is_refused_and_the_others_go_on(folder: Folder) -> None:
         waiting(BadMessage("insert", "garbage", "sense"), "d"),
         waiting(pose("x2", "x1"), "e"),
     )
-    by_client = dict(zip([o.insert.client for o in folded.outcomes], codes(folded), strict=True))
+    by_client = dict(zip([o.insert.client for o in applied.outcomes], codes(applied), strict=True))
     assert by_client == {
         "a": "accepted",
         "b": "duplicate_variable",
@@ -127,46 +129,46 @@ def test_a_bad_insert_is_refused_and_the_others_go_on(folder: Folder) -> None:
         "d": "bad_message",
         "e": "accepted",
     }
-    assert len(folded.steps) == 1
+    assert len(applied.steps) == 1
 
 
-def test_nothing_accepted_means_no_step_and_not_a_bit_changed(folder: Folder) -> None:
-    fold(folder, waiting(pose("x1", "x0")))
+def test_nothing_accepted_means_no_step_and_not_a_bit_changed(folder: MapSolver) -> None:
+    record(folder, waiting(pose("x1", "x0")))
     before = values(folder)
-    folded = fold(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x7"), "b"))
-    assert codes(folded) == ["duplicate_variable", "unknown_variable"]
-    assert folded.steps == ()
+    applied = record(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x7"), "b"))
+    assert codes(applied) == ["duplicate_variable", "unknown_variable"]
+    assert applied.steps == ()
     assert values(folder) == before
     assert folder.snapshot([Question("chi2")]).revision == 2
 
 
-def test_when_the_step_fails_only_the_guilty_are_refused(folder: Folder) -> None:
+def test_when_the_step_fails_only_the_guilty_are_refused(folder: MapSolver) -> None:
     alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
-    folded = fold(folder, waiting(pose("x1", "x0")), waiting(alone, "b"), waiting(pose("x2", "x1"), "c"))
-    assert codes(folded) == ["accepted", "underconstrained", "accepted"]
-    assert [step.revision for step in folded.steps] == [2, 3], "one step each"
+    applied = record(folder, waiting(pose("x1", "x0")), waiting(alone, "b"), waiting(pose("x2", "x1"), "c"))
+    assert codes(applied) == ["accepted", "underconstrained", "accepted"]
+    assert [step.revision for step in applied.steps] == [2, 3], "one step each"
     assert parse_symbol("x8") not in values(folder)
-    assert [a.first_factor for a in accepted(folded)] == [0, 1]
+    assert [a.first_factor for a in accepted(applied)] == [0, 1]
 
 
-def test_a_lonely_guilty_insert_is_tried_once(folder: Folder) -> None:
+def test_a_lonely_guilty_insert_is_tried_once(folder: MapSolver) -> None:
     alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
-    folded = fold(folder, waiting(alone))
-    assert (codes(folded), folded.steps, folded.variables) == (["underconstrained"], (), 1)
+    applied = record(folder, waiting(alone))
+    assert (codes(applied), applied.steps, applied.variables) == (["underconstrained"], (), 1)
 
 
-def test_a_map_has_a_size(folder: Folder) -> None:
-    small = Folder(make, EPOCH, Limits(variables=2, factors=1))
-    folded = fold(small, waiting(start()), waiting(pose("x1", "x0"), "b"), waiting(pose("x2", "x0"), "c"))
-    assert codes(folded) == ["accepted", "accepted", "too_large"]
-    assert [o.answer.detail["limit"] for o in folded.outcomes if isinstance(o.answer, Problem)] == [2]
+def test_a_map_has_a_size(folder: MapSolver) -> None:
+    small = MapSolver(make, EPOCH, Limits(variables=2, factors=1))
+    applied = record(small, waiting(start()), waiting(pose("x1", "x0"), "b"), waiting(pose("x2", "x0"), "c"))
+    assert codes(applied) == ["accepted", "accepted", "too_large"]
+    assert [o.answer.detail["limit"] for o in applied.outcomes if isinstance(o.answer, Problem)] == [2]
 
 
-def test_settle_iterates_until_converged(folder: Folder) -> None:
-    fold(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x1"), "b"))
-    fold(folder, waiting(Batch(factors=(edge("x0", "x2", 2.5),))))
-    folded = fold(folder, waiting(Batch(), settle=True))
-    assert deltas(folded)[0].report["converged"] is True
+def test_settle_iterates_until_converged(folder: MapSolver) -> None:
+    record(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x1"), "b"))
+    record(folder, waiting(Batch(factors=(edge("x0", "x2", 2.5),))))
+    applied = record(folder, waiting(Batch(), settle=True))
+    assert deltas(applied)[0].report["converged"] is True
 
 
 class Faulty(Solver):
@@ -211,11 +213,11 @@ class Faulty(Solver):
         return result
 
 
-def with_faults() -> tuple[Folder, list[str]]:
+def with_faults() -> tuple[MapSolver, list[str]]:
     failing: list[str] = []
-    folder = Folder(lambda: Faulty(failing), EPOCH, Limits())
+    folder = MapSolver(lambda: Faulty(failing), EPOCH, Limits())
     for sequence, batch in enumerate((start(), pose("x1", "x0"), pose("x2", "x1")), 1):
-        fold(folder, waiting(batch, sequence=sequence))
+        record(folder, waiting(batch, sequence=sequence))
     return folder, failing
 
 
@@ -224,41 +226,41 @@ def test_a_fault_of_the_solver_refuses_its_insert_and_keeps_what_was_accepted(fa
     folder, failing = with_faults()
     held = set(values(folder))
     failing.append(fault)
-    folded = fold(folder, waiting(pose("x3", "x2")))
-    assert codes(folded) == ["internal"]
+    applied = record(folder, waiting(pose("x3", "x2")))
+    assert codes(applied) == ["internal"]
     assert set(values(folder)) == held
-    (delta,) = deltas(folded)
+    (delta,) = deltas(applied)
     assert (delta.previous, delta.revision) == (3, 4), "readers are told of everything again"
     assert {int(k) for g in delta.variables for k in g.keys} == held
-    assert codes(fold(folder, waiting(pose("x3", "x2"), sequence=2))) == ["accepted"]
+    assert codes(record(folder, waiting(pose("x3", "x2"), sequence=2))) == ["accepted"]
 
 
 def test_a_fault_after_the_answer_costs_only_a_delta() -> None:
     folder, failing = with_faults()
     failing.append("before changed")
-    folded = fold(folder, waiting(pose("x3", "x2")))
-    assert codes(folded) == ["accepted"]
-    (delta,) = deltas(folded)
-    assert (accepted(folded)[0].revision, delta.previous, delta.revision) == (4, 4, 5), "a reader at 3 sees the gap"
+    applied = record(folder, waiting(pose("x3", "x2")))
+    assert codes(applied) == ["accepted"]
+    (delta,) = deltas(applied)
+    assert (accepted(applied)[0].revision, delta.previous, delta.revision) == (4, 4, 5), "a reader at 3 sees the gap"
     assert {int(k) for g in delta.variables for k in g.keys} == set(values(folder))
 
 
 def test_a_fault_among_several_inserts_hits_only_the_one_that_brings_it() -> None:
     folder, failing = with_faults()
     failing.append("x13")
-    folded = fold(folder, waiting(pose("x3", "x2")), waiting(pose("x13", "x2"), "b"), waiting(pose("x4", "x2"), "c"))
-    assert codes(folded) == ["accepted", "internal", "accepted"]
+    applied = record(folder, waiting(pose("x3", "x2")), waiting(pose("x13", "x2"), "b"), waiting(pose("x4", "x2"), "c"))
+    assert codes(applied) == ["accepted", "internal", "accepted"]
     assert set(values(folder)) == set(keys_of("x0", "x1", "x2", "x3", "x4").tolist())
-    assert [d.revision - d.previous for d in deltas(folded)] == [1] * len(folded.steps)
+    assert [d.revision - d.previous for d in deltas(applied)] == [1] * len(applied.steps)
 
 
 def test_what_cannot_be_brought_back_is_said_for_good() -> None:
     folder, failing = with_faults()
     failing += ["before step", "before graph"]
-    assert codes(fold(folder, waiting(pose("x3", "x2")))) == ["internal"]
-    folded = fold(folder, waiting(pose("x4", "x2")))
-    assert codes(folded) == ["internal"]
-    assert "drop it" in folded.outcomes[0].answer.message
+    assert codes(record(folder, waiting(pose("x3", "x2")))) == ["internal"]
+    applied = record(folder, waiting(pose("x4", "x2")))
+    assert codes(applied) == ["internal"]
+    assert "drop it" in applied.outcomes[0].answer.message
     with pytest.raises(Problem, match="drop it"):
         folder.snapshot([Question("estimate")])
 
@@ -270,26 +272,26 @@ def located(batch: Batch, sequence: int = 1, settle: bool = False) -> Arrived:
     message = codec.encode_insert(Insert(sequence, batch, settle))
     arrived = read_insert(None, "a", message, REQUEST_LIMITS, 0.0)
     assert isinstance(arrived, Arrived)
-    assert isinstance(arrived.content, Located)
+    assert isinstance(arrived.content, ParsedInsert)
     return arrived._replace(askers=[])
 
 
-def fold_alone(folder: Folder, insert: Arrived) -> tuple[Result, bool]:
+def apply_single(folder: MapSolver, insert: Arrived) -> tuple[Result, bool]:
     """What came of it, and whether it was had in one piece."""
-    events = folder.fold_alone(insert)
-    if isinstance(events, Alone):
+    events = folder.apply_single(insert)
+    if isinstance(events, SingleInsertResult):
         outcome = Outcome(events.insert, events.answer, events.first_factor)
         stepped = Stepped(events.revision, events.delta, events.strategy, events.chi2, events.solver_ms)
         return Result((outcome,), (stepped,), events.variables, events.factors), True
     *rest, end = events
-    assert isinstance(end, Folded)
-    outcomes = tuple(o for e in rest if isinstance(e, Judged) for o in e.outcomes)
+    assert isinstance(end, Applied)
+    outcomes = tuple(o for e in rest if isinstance(e, Verdict) for o in e.outcomes)
     return Result(outcomes, tuple(e for e in rest if isinstance(e, Stepped)), end.variables, end.factors), False
 
 
-def told(folded: Result) -> Any:
+def told(applied: Result) -> Any:
     """All of it but the times."""
-    messages: list[Any] = [*accepted(folded), *deltas(folded)]
+    messages: list[Any] = [*accepted(applied), *deltas(applied)]
     reports = [{k: v for k, v in m.report.items() if not k.endswith("_ms")} for m in messages]
     plain = [
         (type(m).__name__, m.epoch, m.revision, getattr(m, "sequence", None), getattr(m, "first_factor", None))
@@ -297,58 +299,58 @@ def told(folded: Result) -> Any:
     ]
     columns = [
         (g.kind, g.keys.tobytes(), *(None if c is None else c.tobytes() for c in (g.values, g.stamps)), g.fixed)
-        for d in deltas(folded)
+        for d in deltas(applied)
         for g in d.variables
     ]
-    steps = [(s.revision, s.strategy, s.chi2, s.rebuilt) for s in folded.steps]
-    first = [o.first_factor for o in folded.outcomes]
-    return plain, reports, columns, steps, first, codes(folded), folded.variables, folded.factors
+    steps = [(s.revision, s.strategy, s.chi2, s.rebuilt) for s in applied.steps]
+    first = [o.first_factor for o in applied.outcomes]
+    return plain, reports, columns, steps, first, codes(applied), applied.variables, applied.factors
 
 
 @pytest.mark.parametrize("mode", ["inc-l", "bayes-tree"])
 def test_one_insert_comes_to_the_same_either_way(mode: str) -> None:
-    quick, usual = (Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()) for _ in range(2))
+    quick, usual = (MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()) for _ in range(2))
     alone = 0
     for sequence, batch in enumerate(random_steps(3, steps=25), 1):
         settle = sequence % 10 == 0
-        folded, in_one_piece = fold_alone(quick, located(batch, sequence, settle))
-        assert told(folded) == told(fold(usual, waiting(batch, sequence=sequence, settle=settle)))
+        applied, in_one_piece = apply_single(quick, located(batch, sequence, settle))
+        assert told(applied) == told(record(usual, waiting(batch, sequence=sequence, settle=settle)))
         alone += in_one_piece
     assert alone > 10, "where there is room"
     assert values(quick) == values(usual)
 
 
-def test_a_guilty_insert_is_refused_in_the_same_words_either_way(folder: Folder) -> None:
+def test_a_guilty_insert_is_refused_in_the_same_words_either_way(folder: MapSolver) -> None:
     for n in range(1, 20):
-        fold_alone(folder, located(pose(f"x{n}", f"x{n - 1}")))
+        apply_single(folder, located(pose(f"x{n}", f"x{n - 1}")))
     lonely = Batch((Variables("se2", keys_of("x80"), np.zeros((1, 3))),))
     before = values(folder)
     for bad in (pose("x1", "x0"), pose("x90", "x77"), lonely, Batch(factors=(edge("x1", "x1"),))):
-        quick, in_one_piece = fold_alone(folder, located(bad))
+        quick, in_one_piece = apply_single(folder, located(bad))
         assert not in_one_piece
-        assert told(quick) == told(fold(folder, waiting(bad)))
-        assert quick.outcomes[0].answer.message == fold(folder, waiting(bad)).outcomes[0].answer.message
+        assert told(quick) == told(record(folder, waiting(bad)))
+        assert quick.outcomes[0].answer.message == record(folder, waiting(bad)).outcomes[0].answer.message
     assert values(folder) == before
-    assert fold_alone(folder, located(Batch(factors=(edge("x3", "x5", 2.0),))))[1], "and the next one is taken"
+    assert apply_single(folder, located(Batch(factors=(edge("x3", "x5", 2.0),))))[1], "and the next one is taken"
 
 
-def test_several_located_inserts_in_one_step(folder: Folder) -> None:
-    folded = fold(folder, located(pose("x1", "x0")), located(pose("x2", "x0"), 2), located(pose("x2", "x0"), 3))
-    assert codes(folded) == ["accepted", "accepted", "duplicate_variable"]
+def test_several_located_inserts_in_one_step(folder: MapSolver) -> None:
+    applied = record(folder, located(pose("x1", "x0")), located(pose("x2", "x0"), 2), located(pose("x2", "x0"), 3))
+    assert codes(applied) == ["accepted", "accepted", "duplicate_variable"]
 
 
 def test_the_size_of_a_map_is_kept_either_way() -> None:
-    small = Folder(make, EPOCH, Limits(variables=2, factors=1))
-    folded = [fold_alone(small, located(batch))[0] for batch in (start(), pose("x1", "x0"), pose("x2", "x0"))]
-    assert [code for result in folded for code in codes(result)] == ["accepted", "accepted", "too_large"]
+    small = MapSolver(make, EPOCH, Limits(variables=2, factors=1))
+    applied = [apply_single(small, located(batch))[0] for batch in (start(), pose("x1", "x0"), pose("x2", "x0"))]
+    assert [code for result in applied for code in codes(result)] == ["accepted", "accepted", "too_large"]
 
 
-def test_what_does_not_fit_into_one_piece_is_told_in_two(folder: Folder) -> None:
+def test_what_does_not_fit_into_one_piece_is_told_in_two(folder: MapSolver) -> None:
     folder._out = folder._out[:100]
     for n in range(1, 6):
-        folded, in_one_piece = fold_alone(folder, located(pose(f"x{n}", f"x{n - 1}")))
+        applied, in_one_piece = apply_single(folder, located(pose(f"x{n}", f"x{n - 1}")))
         assert not in_one_piece
-        assert [(d.previous, d.revision) for d in deltas(folded)] == [(n, n + 1)]
+        assert [(d.previous, d.revision) for d in deltas(applied)] == [(n, n + 1)]
 
 
 @pytest.mark.parametrize("fault", ["before try_stage", "after try_stage", "before step", "after step"])
@@ -356,19 +358,19 @@ def test_a_fault_with_a_located_insert_refuses_it_and_keeps_what_was_accepted(fa
     folder, failing = with_faults()
     held = set(values(folder))
     failing.append(fault)
-    folded, in_one_piece = fold_alone(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
-    assert (codes(folded), in_one_piece) == (["internal"], False)
-    (delta,) = deltas(folded)
-    assert (delta.previous, delta.revision, folded.steps[0].rebuilt) == (3, 4, True)
+    applied, in_one_piece = apply_single(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    assert (codes(applied), in_one_piece) == (["internal"], False)
+    (delta,) = deltas(applied)
+    assert (delta.previous, delta.revision, applied.steps[0].rebuilt) == (3, 4, True)
     assert {int(k) for g in delta.variables for k in g.keys} == held == set(values(folder))
-    assert codes(fold_alone(folder, located(pose("x3", "x2"), 2))[0]) == ["accepted"]
+    assert codes(apply_single(folder, located(pose("x3", "x2"), 2))[0]) == ["accepted"]
 
 
 def test_a_fault_after_the_step_of_a_located_insert_costs_only_a_delta() -> None:
     folder, failing = with_faults()
     failing += ["before pick_changed", "before changed"]
-    folded, in_one_piece = fold_alone(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
-    assert (codes(folded), in_one_piece) == (["accepted"], False)
-    (delta,) = deltas(folded)
-    assert (accepted(folded)[0].revision, delta.previous, delta.revision) == (4, 4, 5)
+    applied, in_one_piece = apply_single(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    assert (codes(applied), in_one_piece) == (["accepted"], False)
+    (delta,) = deltas(applied)
+    assert (accepted(applied)[0].revision, delta.previous, delta.revision) == (4, 4, 5)
     assert {int(k) for g in delta.variables for k in g.keys} == set(values(folder))

@@ -1,4 +1,4 @@
-"""Inserts that change what a map has, among others: steps of their own, refused whole, the same when folded again."""
+"""Inserts that change what a map has, among others: steps of their own, refused whole, the same when applied again."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,9 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Arrived, Judged, Outcome, Stepped
+from factorbus.service.core.events import Arrived, Outcome, Stepped, Verdict
 from factorbus.service.questions.answers import Question
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import read_again, read_insert
 from factorbus.solver import Options, Solver
 
@@ -62,23 +62,23 @@ def loop(i: int, j: int, x: float) -> Batch:
     return Batch(factors=(Factors("between_se2", keys, np.array([[x, 0.0, 0.3]]), information),))
 
 
-def make(folder: Folder | None = None, solver: type[Solver] = Solver) -> Folder:
-    folder = folder or Folder(lambda: solver(Options()), EPOCH, Limits())
+def make(folder: MapSolver | None = None, solver: type[Solver] = Solver) -> MapSolver:
+    folder = folder or MapSolver(lambda: solver(Options()), EPOCH, Limits())
     for n in range(5):
-        list(folder.fold([waiting(pose(n), n + 1)]))
+        list(folder.record([waiting(pose(n), n + 1)]))
     return folder
 
 
-def came(folder: Folder, *inserts: Arrived) -> tuple[list[Judged], list[Stepped]]:
-    events, _ = folder.fold_whole(inserts)
-    return [e for e in events if isinstance(e, Judged)], [e for e in events if isinstance(e, Stepped)]
+def came(folder: MapSolver, *inserts: Arrived) -> tuple[list[Verdict], list[Stepped]]:
+    events, _ = folder.apply_whole(inserts)
+    return [e for e in events if isinstance(e, Verdict)], [e for e in events if isinstance(e, Stepped)]
 
 
-def outcomes(judged: list[Judged]) -> list[Outcome]:
+def outcomes(judged: list[Verdict]) -> list[Outcome]:
     return [outcome for each in judged for outcome in each.outcomes]
 
 
-def keys_in(folder: Folder) -> list[int]:
+def keys_in(folder: MapSolver) -> list[int]:
     taken = folder.snapshot([Question("estimate")])
     return sorted(int(key) - symbol("x", 0) for group in taken.variables for key in group.keys)
 
@@ -88,7 +88,7 @@ def test_a_change_is_a_step_of_its_own_whose_delta_has_everything() -> None:
     inserts = [waiting(pose(5), 6), waiting(gone(3, 4, 5), 7), waiting(pose(3), 8), waiting(pose(4), 9)]
     judged, steps = came(folder, *inserts)
     answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
-    assert [(a.sequence, a.revision, a.first_factor, a.folded) for a in answers] == [
+    assert [(a.sequence, a.revision, a.first_factor, a.applied) for a in answers] == [
         (6, 6, 4, 1),
         (7, 7, 5, 1),
         (8, 8, 5, 2),
@@ -124,21 +124,21 @@ def test_a_fault_in_a_change_leaves_the_map_as_it_was() -> None:
 
 
 def test_the_same_folds_give_the_same_bits_again() -> None:
-    """As a restart folds them: from the bytes of the messages."""
-    folds = [[waiting(pose(n), n + 1)] for n in range(5)]
-    folds += [[waiting(pose(5), 6), waiting(gone(5), 7), waiting(pose(5, 1.2), 8)]]
-    folds += [
+    """As a restart records them: from the bytes of the messages."""
+    records = [[waiting(pose(n), n + 1)] for n in range(5)]
+    records += [[waiting(pose(5), 6), waiting(gone(5), 7), waiting(pose(5, 1.2), 8)]]
+    records += [
         [waiting((Change("weigh", np.array([2]), weight=np.array([0.5])), Change("fix", keys=gone(1)[0].keys)), 9)]
     ]
-    folds += [[waiting(pose(6), 10)]]
-    first, second = (Folder(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
-    for inserts in folds:
+    records += [[waiting(pose(6), 10)]]
+    first, second = (MapSolver(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
+    for inserts in records:
         _, steps = came(first, *inserts)
         again = []
         for insert in inserts:
             digest, content = read_again(insert.message)
             again.append(insert._replace(digest=digest, content=content))
-        events = list(second.fold_again(again, rebuilt=False))
+        events = list(second.apply_again(again, rebuilt=False))
         deltas = [codec.decode_delta(e.delta) for e in events if isinstance(e, Stepped)]
         for one, other in zip([codec.decode_delta(step.delta) for step in steps], deltas, strict=True):
             assert (one.previous, one.revision, one.report["chi2"]) == (
@@ -152,9 +152,9 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
 def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
-    folder = make(Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
+    folder = make(MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
     came(folder, waiting(gone(4), 6))
-    again = Folder(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
+    again = MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
     again.load(folder.dump())
     for each in (folder, again):
         judged, _ = came(each, waiting(pose(4), 7))
@@ -167,7 +167,7 @@ def test_a_change_of_factors_is_a_step_whose_delta_has_what_moved() -> None:
     folder = make()
     judged, steps = came(folder, waiting(loop(1, 3, 2.5), 6), waiting((weighed(4, 0.5),), 7), waiting(pose(5), 8))
     answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
-    assert [(a.sequence, a.revision, a.folded) for a in answers] == [(6, 6, 1), (7, 7, 1), (8, 8, 1)]
+    assert [(a.sequence, a.revision, a.applied) for a in answers] == [(6, 6, 1), (7, 7, 1), (8, 8, 1)]
     deltas = [codec.decode_delta(step.delta) for step in steps]
     assert [(delta.previous, delta.revision) for delta in deltas] == [(5, 6), (6, 7), (7, 8)]
     report = answers[1].report
@@ -200,26 +200,26 @@ def test_a_fault_in_a_change_of_factors_has_the_solver_replaced() -> None:
 
 def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_snapshot() -> None:
     """Those that are refused among them: they leave no trace either."""
-    folds = [[waiting(pose(n), n + 1)] for n in range(5)]
-    folds += [[waiting(loop(0, 4, 3.5), 6)], [waiting(loop(1, 4, 2.5), 7)]]
-    folds += [
+    records = [[waiting(pose(n), n + 1)] for n in range(5)]
+    records += [[waiting(loop(0, 4, 3.5), 6)], [waiting(loop(1, 4, 2.5), 7)]]
+    records += [
         [waiting((weighed(4, 0.5), weighed(2, 3.0)), 8)],
         [waiting((Change("remove_factors", np.array([1])),), 9)],
     ]
-    folds += [[waiting((Change("remove_factors", np.array([0, 2, 3])),), 10), waiting(pose(5), 11)]]
-    folds += [[waiting((Change("loss", np.array([5]), loss="huber", scale=np.ones(1)),), 12)], [waiting(pose(6), 13)]]
-    first, second = (Folder(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
-    third = Folder(lambda: Solver(Options()), EPOCH, Limits())
+    records += [[waiting((Change("remove_factors", np.array([0, 2, 3])),), 10), waiting(pose(5), 11)]]
+    records += [[waiting((Change("loss", np.array([5]), loss="huber", scale=np.ones(1)),), 12)], [waiting(pose(6), 13)]]
+    first, second = (MapSolver(lambda: Solver(Options()), EPOCH, Limits()) for _ in range(2))
+    third = MapSolver(lambda: Solver(Options()), EPOCH, Limits())
     codes = []
-    for n, inserts in enumerate(folds):
+    for n, inserts in enumerate(records):
         judged, steps = came(first, *inserts)
         codes += [getattr(o.answer, "code", "") for o in outcomes(judged)]
         again = [i._replace(content=read_again(i.message)[1]) for i in inserts]
-        others = [list(second.fold_again(again))]
+        others = [list(second.apply_again(again))]
         if n == 8:
             third.load(first.dump())
         if n > 8:
-            others.append(list(third.fold_again(again)))
+            others.append(list(third.apply_again(again)))
         for events in others:
             for one, other in zip(steps, [e for e in events if isinstance(e, Stepped)], strict=True):
                 a, b = codec.decode_delta(one.delta), codec.decode_delta(other.delta)

@@ -10,7 +10,7 @@ from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import format_symbol, symbol
 from factorbus.solver import Options, Solver, solve_batch
-from factorbus.solver.errors import Uninitialised
+from factorbus.solver.errors import Uninitialized
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.model import layout
@@ -170,5 +170,5 @@ def test_bearings_in_space_place_a_point() -> None:
 @pytest.mark.parametrize("poses", [[[0, 0, 0.0]], [[0, 0, 0], [0, 0, 1.0]]])
 def test_bearings_from_one_place_place_nothing(poses: list[list[float]]) -> None:
     solver = Solver(Options(mode="inc-l"))
-    with pytest.raises(Uninitialised, match="l0"):
+    with pytest.raises(Uninitialized, match="l0"):
         solver.stage(sees(np.array(poses), np.zeros(len(poses))))

@@ -106,7 +106,7 @@ def test_a_pose_joined_by_points_alone_takes_its_value(tmp_path: Path) -> None:
     ]
 
 
-def test_localisation_among_fixed_points(tmp_path: Path) -> None:
+def test_localization_among_fixed_points(tmp_path: Path) -> None:
     text = "VERTEX_SE2 0 1 1 1\nVERTEX_XY 8 1 2\nFIX 8\n" + sight(0, 8) + edge(0, 1) + sight(1, 8)
     assert story(graph_of(tmp_path, text).steps()) == [
         (["x0=", "l8!="], ["x0-l8"]),

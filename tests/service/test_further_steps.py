@@ -19,13 +19,13 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Delta, Insert
 from factorbus.service.config import Limits
 from factorbus.service.core.converging import CONVERGE_IDLE_S
-from factorbus.service.core.events import Answer, Arrived, Drained, Effect, Folded, Publish, Stepped
+from factorbus.service.core.events import Answer, Applied, Arrived, Drained, Effect, Publish, Stepped
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.recovery import recover, verify
 from factorbus.service.journal.writing import written
 from factorbus.service.maps.host import Host
 from factorbus.service.questions.answers import Question
-from factorbus.service.solving.apply import GOES_ON, Folder
+from factorbus.service.solving.apply import GOES_ON, MapSolver
 from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
@@ -40,9 +40,9 @@ MODES = ["inc-l", "all-batch"]
 ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
 
 
-def folder_in(mode: str, **options: Any) -> Folder:
+def folder_in(mode: str, **options: Any) -> MapSolver:
     settings = Options.of(**{"mode": mode, **FEW, **options})
-    return Folder(lambda: Solver(settings), EPOCH, Limits(), settings.as_dict())
+    return MapSolver(lambda: Solver(settings), EPOCH, Limits(), settings.as_dict())
 
 
 def arrived(sequence: int, batch: Batch) -> Arrived:
@@ -62,23 +62,23 @@ class Written:
         self.folder, self.refused = folder_in(mode, **options), False
         self.store: Store = create(path, path.name, mode, self.folder.options(), EPOCH, "none")
 
-    def fold(self, *taken: Arrived, further: bool = False) -> list[Stepped]:
-        events, folded = self.folder.fold_whole(taken, further)
-        self.refused = folded.refused
+    def record(self, *taken: Arrived, further: bool = False) -> list[Stepped]:
+        events, applied = self.folder.apply_whole(taken, further)
+        self.refused = applied.refused
         last = self.store.last()
-        self.store.append([written(last.fold + 1, taken, events, last, further)])
+        self.store.append([written(last.record + 1, taken, events, last, further)])
         return [event for event in events if isinstance(event, Stepped)]
 
     def converge(self) -> list[Stepped]:
         steps: list[Stepped] = []
         while self.folder.unfinished:
-            steps += self.fold(further=True)
+            steps += self.record(further=True)
             assert not self.refused
             assert len(steps) < 2000
         return steps
 
 
-def values(folder: Folder) -> dict[int, bytes]:
+def values(folder: MapSolver) -> dict[int, bytes]:
     taken = folder.snapshot([Question("estimate")])
     return {int(key): row.tobytes() for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
 
@@ -94,7 +94,7 @@ def told(deltas: list[Delta]) -> dict[int, bytes]:
 @pytest.mark.parametrize("mode", MODES)
 def test_further_steps_lead_to_the_optimum_and_tell_what_they_change(tmp_path: Path, mode: str) -> None:
     map_, came = Written(tmp_path / "m", mode), inserts()
-    deltas = [codec.decode_delta(step.delta) for one in came for step in map_.fold(one)]
+    deltas = [codec.decode_delta(step.delta) for one in came for step in map_.record(one)]
     assert not map_.folder.converged
     assert (deltas[-1].report["converged"], deltas[-1].report["converging"]) == (False, True)
     before = len(deltas)
@@ -121,7 +121,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     map_ = Written(tmp_path / "m", mode, max_iterations=10, max_nonmonotone_steps=20)
     world, judge = WORLDS["manhattan"](120, 7), Solver(Options(mode="all-batch"))
     for n, step in enumerate(world):
-        (stepped,) = map_.fold(arrived(n + 1, step.batch))
+        (stepped,) = map_.record(arrived(n + 1, step.batch))
         report = codec.decode_delta(stepped.delta).report
         assert report["converging"] is stepped.unfinished is map_.folder.unfinished
         judge.stage(step.batch)
@@ -138,12 +138,12 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     late.load(state)
     assert late.unfinished, "a snapshot knows"
     while late.unfinished:
-        late.fold_whole((), further=True)
+        late.apply_whole((), further=True)
     assert values(again) == values(map_.folder) == values(late)
     assert not again.unfinished
     # Nothing is left to do, whoever insists.
     before = values(map_.folder)
-    map_.fold(further=True)
+    map_.record(further=True)
     assert values(map_.folder) == before
 
 
@@ -152,19 +152,21 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
     """Further steps between inserts, too: how many there were is in the journal."""
     map_, came = Written(tmp_path / "m", mode), inserts()
     for one in came:
-        map_.fold(one)
+        map_.record(one)
     for _ in range(3):
-        map_.fold(further=True)
-    map_.fold(arrived(len(came) + 1, closing(POSES)))
+        map_.record(further=True)
+    map_.record(arrived(len(came) + 1, closing(POSES)))
     state, at = map_.folder.dump(), map_.store.last()
     for _ in range(2):
-        map_.fold(further=True)
+        map_.record(further=True)
     assert not map_.folder.converged
     again = folder_in(mode)
     recovered = recover(map_.store, again)
     assert (recovered.same, recovered.last) == (True, map_.store.last())
     assert (values(again), again.revision, again.converged) == (values(map_.folder), map_.folder.revision, False)
-    assert [fold.number for fold in map_.store.folds() if fold.further] == [len(came) + n for n in (1, 2, 3, 5, 6)]
+    assert [record.number for record in map_.store.records() if record.further] == [
+        len(came) + n for n in (1, 2, 3, 5, 6)
+    ]
     write_snapshot(tmp_path / "s", state)
     late = folder_in(mode)
     late.load(read_snapshot(tmp_path / "s"))
@@ -172,7 +174,7 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
     map_.converge()
     for other, made in ((again, 2), (late, 0)):
         while other.unfinished:
-            other.fold_whole((), further=True)
+            other.apply_whole((), further=True)
             made += 1
         assert values(other) == values(map_.folder), "what goes on from there goes the same way"
         assert other.revision == map_.folder.revision == at.revision + made
@@ -180,13 +182,13 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
 
 
 @pytest.mark.parametrize(
-    "damage", ["UPDATE fold SET rebuilt = 0 WHERE rebuilt = 2", "DELETE FROM entry WHERE fold = 3"]
+    "damage", ["UPDATE record SET rebuilt = 0 WHERE rebuilt = 2", "DELETE FROM entry WHERE record = 3"]
 )
 def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Path, damage: str) -> None:
     map_ = Written(tmp_path / "m", "inc-l")
     for one in inserts():
-        map_.fold(one)
-    map_.fold(further=True)
+        map_.record(one)
+    map_.record(further=True)
     map_.store._db.execute(damage)
     map_.store.close()
     store = open_store(tmp_path / "m")
@@ -195,10 +197,10 @@ def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Pat
     store.close()
 
 
-def unconverged(mode: str = "all-batch") -> Folder:
+def unconverged(mode: str = "all-batch") -> MapSolver:
     folder = folder_in(mode)
     for one in inserts():
-        folder.fold_whole([one])
+        folder.apply_whole([one])
     assert not folder.converged
     return folder
 
@@ -211,15 +213,15 @@ def test_a_further_step_that_is_refused_leaves_all_as_it_is(monkeypatch: pytest.
         raise NotFinite("χ²")
 
     monkeypatch.setattr(Solver, "step", refuse)
-    events, folded = folder.fold_whole((), further=True)
-    assert (events, folded.refused, folder.revision, values(folder)) == ([], True, revision, before)
+    events, applied = folder.apply_whole((), further=True)
+    assert (events, applied.refused, folder.revision, values(folder)) == ([], True, revision, before)
 
 
 def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It may leave traces in how the next step is made: as that of an insert it is in the journal."""
     map_, true_step = Written(tmp_path / "m", "all-batch"), Solver.step
     for one in inserts():
-        map_.fold(one)
+        map_.record(one)
     tried: list[Solver] = []
 
     def refuse(solver: Solver, settle: bool = False) -> Any:
@@ -229,9 +231,9 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
         return true_step(solver, settle)
 
     monkeypatch.setattr(Solver, "step", refuse)
-    assert map_.fold(further=True) == []
+    assert map_.record(further=True) == []
     assert map_.refused
-    *_, last = map_.store.folds()
+    *_, last = map_.store.records()
     assert (last.further, last.revision, last.entries) == (True, map_.folder.revision, ())
     again = folder_in("all-batch")
     assert recover(map_.store, again).same
@@ -262,12 +264,12 @@ def test_one_that_diverges_is_refused_and_the_map_stays_where_it_was(
     map_ = Written(tmp_path / "m", "all-batch")
     extra = Draft().se2("r0", (0, 0, 0)).between_se2("x0", "r0", (0, 0, 0), sigmas=(sigma, sigma, sigma)).batch()
     for one in (*inserts(), arrived(POSES + 2, extra)):
-        map_.fold(one)
+        map_.record(one)
     before, revision, solver = values(map_.folder), map_.folder.revision, map_.folder.solver
     chi2 = map_.folder.chi2()
     with monkeypatch.context() as patched:
         escaping(patched)
-        steps = map_.fold(further=True)
+        steps = map_.record(further=True)
         again = folder_in("all-batch")
         assert recover(map_.store, again).same
     assert map_.refused
@@ -282,7 +284,7 @@ def test_one_that_diverges_is_refused_and_the_map_stays_where_it_was(
         assert np.isfinite([np.frombuffer(row) for row in values(map_.folder).values()]).all()
         assert map_.folder.chi2() <= chi2
     # An insert later it is tried again, and all is well.
-    map_.fold(arrived(POSES + 3, closing(POSES)))
+    map_.record(arrived(POSES + 3, closing(POSES)))
     map_.converge()
 
 
@@ -295,10 +297,10 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
 ) -> None:
     map_ = Written(tmp_path / "m", "all-batch")
     for one in inserts():
-        map_.fold(one)
+        map_.record(one)
     revision, broken = map_.folder.revision, map_.folder.solver
     monkeypatch.setattr(broken, "step", failing)
-    (stepped,) = map_.fold(further=True)
+    (stepped,) = map_.record(further=True)
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
     assert map_.folder.solver is not broken
     assert len(told([codec.decode_delta(stepped.delta)])) == POSES
@@ -312,7 +314,7 @@ def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypa
     folder = unconverged()
     revision, broken = folder.revision, folder.solver
     monkeypatch.setattr(broken, "changed", failing)
-    (stepped,) = [event for event in folder.fold_whole((), further=True)[0] if isinstance(event, Stepped)]
+    (stepped,) = [event for event in folder.apply_whole((), further=True)[0] if isinstance(event, Stepped)]
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
     assert folder.solver is not broken
     assert told([codec.decode_delta(stepped.delta)]) == values(folder)
@@ -369,9 +371,9 @@ class Hosted:
 
     def __init__(self, solver: Solver) -> None:
         self.told = Told()
-        self.core = MapCore("m", "all-batch", EPOCH, Limits(fold=1), 0.0)
+        self.core = MapCore("m", "all-batch", EPOCH, Limits(record=1), 0.0)
         self.host = Host(
-            self.core, Folder(lambda: solver, EPOCH, Limits()), self.told.take, self.told.take,
+            self.core, MapSolver(lambda: solver, EPOCH, Limits()), self.told.take, self.told.take,
             lambda reads, taken: None, threading.Lock(), self.told.take_both,
         )  # fmt: skip
         self.came = inserts()
@@ -440,6 +442,6 @@ def test_a_map_that_comes_to_an_end_by_itself_is_what_it_says(waiting: tuple[Hos
     solver.leave.release(10_000)
     hosted.tick_until(lambda: not hosted.core.row()["converging"])
     assert hosted.core.row()["converged"]
-    assert not any(isinstance(e, Folded) for e in hosted.told.effects)
+    assert not any(isinstance(e, Applied) for e in hosted.told.effects)
     assert hosted.core.stats(0.0)["chi2"] == pytest.approx(optimum(POSES, DEGREES), rel=1e-6)
     assert np.isclose(solver.chi2(), hosted.core.stats(0.0)["chi2"], rtol=1e-12)

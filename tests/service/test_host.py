@@ -1,4 +1,4 @@
-"""A map at work: which thread folds an insert, in what order its messages leave, and how it ends."""
+"""A map at work: which thread records an insert, in what order its messages leave, and how it ends."""
 
 import threading
 import time
@@ -13,11 +13,11 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.symbols import parse_symbol
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Answer, Arrived, Drained, Effect, Located, Publish, Refuse
+from factorbus.service.core.events import Answer, Arrived, Drained, Effect, ParsedInsert, Publish, Refuse
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.maps.host import Host
-from factorbus.service.maps.serial_executor import Lane
-from factorbus.service.solving.apply import Folder
+from factorbus.service.maps.serial_executor import SerialExecutor
+from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import message_digest, read_insert
 from factorbus.solver import Options, Solver
 
@@ -77,12 +77,18 @@ class Setup:
     """A host with a real solver."""
 
     def __init__(self) -> None:
-        self.told, self.seat, self.solver = Told(), threading.Lock(), Held()
+        self.told, self.inline_run, self.solver = Told(), threading.Lock(), Held()
         self.sequence = 0
         core = MapCore("m", "auto", EPOCH, Limits(), 0.0)
-        folder = Folder(lambda: self.solver, EPOCH, Limits())
+        folder = MapSolver(lambda: self.solver, EPOCH, Limits())
         self.host = Host(
-            core, folder, self.told.take, self.told.take, lambda reads, taken: None, self.seat, self.told.take_both
+            core,
+            folder,
+            self.told.take,
+            self.told.take,
+            lambda reads, taken: None,
+            self.inline_run,
+            self.told.take_both,
         )
 
     def arrived(self, content: Batch, settle: bool = False, client: str = "a", size: int = 100) -> Arrived:
@@ -99,7 +105,7 @@ class Setup:
         answers = len(self.told.answers())
         self.host.insert(self.arrived(content, **how))
         self.told.wait_for(lambda: len(self.told.answers()) > answers)
-        # The answer is told before the Run ends, and until then the solver is not free.
+        # The answer is told before the InsertBatch ends, and until then the solver is not free.
         self.wait_until_free()
 
     def wait_until_free(self) -> None:
@@ -148,13 +154,13 @@ def test_a_short_run_is_done_by_who_brought_it_and_others_by_the_maps_thread(set
     setup.insert(pose(4))
     here = threading.current_thread().name
     assert setup.told.threads() == ["solver m", here, "solver m", "solver m", here]
-    assert not setup.seat.locked(), "given back"
+    assert not setup.inline_run.locked(), "given back"
     check(setup, 5)
 
 
 def test_without_the_seat_a_short_run_goes_to_the_maps_thread(setup: Setup) -> None:
     setup.until_short()
-    with setup.seat:
+    with setup.inline_run:
         setup.insert(pose(1))
     assert setup.told.threads() == ["solver m"] * 2
     check(setup, 2)
@@ -175,7 +181,7 @@ def test_what_comes_in_during_a_short_run_follows_it_on_the_maps_thread(setup: S
     setup.told.wait_for(lambda: len(setup.told.answers()) == 4)
     assert setup.told.threads() == ["solver m", "bringing", "solver m"]
     accepted = [codec.decode_accepted(answer.message) for answer in setup.told.answers()]
-    assert [(a.sequence, a.revision, a.folded) for a in accepted] == [(1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 3, 2)]
+    assert [(a.sequence, a.revision, a.applied) for a in accepted] == [(1, 1, 1), (2, 2, 1), (3, 3, 2), (4, 3, 2)]
     check(setup, 3)
 
 
@@ -185,7 +191,7 @@ def located(setup: Setup, content: Batch, asker: str = "") -> Arrived:
     message = codec.encode_insert(Insert(setup.sequence, content))
     arrived = read_insert(asker or str(setup.sequence), "a", message, REQUEST_LIMITS, setup.now())
     assert isinstance(arrived, Arrived)
-    assert isinstance(arrived.content, Located)
+    assert isinstance(arrived.content, ParsedInsert)
     return arrived
 
 
@@ -281,17 +287,17 @@ def test_a_fault_in_a_short_run_ends_the_map_and_tells_who_waits(setup: Setup, m
     def broken(inserts: Any) -> Any:
         raise RuntimeError("folding failed")
 
-    monkeypatch.setattr(setup.host._folder, "fold", broken)
+    monkeypatch.setattr(setup.host._folder, "record", broken)
     setup.host.insert(setup.arrived(pose(1)))
     setup.host.insert(setup.arrived(pose(2)))
     codes = [effect.problem.code for effect, _ in setup.told.effects if isinstance(effect, Refuse)]
     assert codes == ["internal", "internal"]
-    assert not setup.seat.locked()
+    assert not setup.inline_run.locked()
     assert setup.told.has(Drained)()
 
 
 def test_an_idle_lane_is_not_needed_and_a_busy_one_keeps_the_order() -> None:
-    lane, reached, leave = Lane("lane"), threading.Event(), threading.Event()
+    executor, reached, leave = SerialExecutor("executor"), threading.Event(), threading.Event()
     done: list[tuple[int, str]] = []
 
     def do(number: int) -> None:
@@ -300,18 +306,18 @@ def test_an_idle_lane_is_not_needed_and_a_busy_one_keeps_the_order() -> None:
             reached.set()
             assert leave.wait(PATIENCE_S)
         if number == 4:
-            raise ValueError("the lane logs it and goes on")
+            raise ValueError("the executor logs it and goes on")
 
     here = threading.current_thread().name
-    lane.hand_or_do(do, 1)
-    lane.hand(do, 2)
+    executor.hand_or_do(do, 1)
+    executor.hand(do, 2)
     assert reached.wait(PATIENCE_S)
-    lane.hand_or_do(do, 3)  # number 2 is begun, but not done
-    lane.hand_or_do(do, 4)
+    executor.hand_or_do(do, 3)  # number 2 is begun, but not done
+    executor.hand_or_do(do, 4)
     leave.set()
-    lane.close()
-    lane.hand_or_do(do, 5)
-    assert done == [(1, here), (2, "lane"), (3, "lane"), (4, "lane"), (5, here)]
+    executor.close()
+    executor.hand_or_do(do, 5)
+    assert done == [(1, here), (2, "executor"), (3, "executor"), (4, "executor"), (5, here)]
 
 
 def is_event(effect: Effect) -> bool:

@@ -98,7 +98,7 @@ def encoded(shard: ShardDone) -> bytes:
     return encode_shard_done(shard)
 
 
-class Desk:
+class Control:
     """Does at once what it is handed."""
 
     def hand(self, call: Any, *arguments: Any) -> None:
@@ -114,7 +114,7 @@ def test_a_worker_is_tried_again_after_a_while_that_doubles(monkeypatch: pytest.
         sent.append(worker)
         came(WrongAnswer("answered nonsense"))
 
-    jobs = Jobs(Desk(), send)  # type: ignore[arg-type]
+    jobs = Jobs(Control(), send)  # type: ignore[arg-type]
     jobs.joined("a", 1)
     ends: list[Ended] = []
     for waits_s in (60.0, 120.0):

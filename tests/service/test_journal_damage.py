@@ -12,7 +12,7 @@ from factorbus.journal.digest import sealed
 from factorbus.journal.folders import maps_in
 from factorbus.journal.log_frames import lost_from
 from factorbus.journal.problems import JournalDamaged, JournalUnreadable, JournalVersion
-from factorbus.journal.records import ACCEPTED, Entry, Epoch, Fold
+from factorbus.journal.records import ACCEPTED, Entry, Epoch, JournalRecord
 from factorbus.journal.store import NAME, create, open_store
 from factorbus.service.config import Config, Limits
 from factorbus.service.journal import library
@@ -27,9 +27,9 @@ def entry(client: str, sequence: int, message: bytes) -> Entry:
     return sealed(Entry(client, sequence, 0, ACCEPTED, sequence, 10 * sequence, 1, b"answer", message))
 
 
-def fold(number: int) -> Fold:
+def record(number: int) -> JournalRecord:
     message = bytes([number % 251]) * (number * 137 % 3000)
-    return Fold(
+    return JournalRecord(
         number, number, False, bytes([number % 251]) * 16, (entry("ab"[number % 2], (number + 1) // 2, message),)
     )
 
@@ -38,7 +38,7 @@ def written(folder: Path, durability: str = "commit", name: str = "m") -> Path:
     """Forty transactions, as a process that was killed leaves them: in the log, and counted by its index."""
     made = create(folder / "alive" / name, name, "bayes-tree", OPTIONS, 77, durability)
     for number in range(1, 41):
-        made.append([fold(number)])
+        made.append([record(number)])
     left = folder / name
     shutil.copytree(folder / "alive" / name, left)
     made.close()
@@ -59,7 +59,7 @@ def content(folder: Path) -> tuple[object, ...]:
     store = open_store(folder)
     try:
         store.check_form()
-        return store.header(), store.last(), list(store.folds()), store.senders(1, 256, 1024), store.snapshots()
+        return store.header(), store.last(), list(store.records()), store.senders(1, 256, 1024), store.snapshots()
     finally:
         store.close()
 
@@ -108,7 +108,7 @@ def test_what_was_being_written_when_the_power_went_was_not_confirmed(tmp_path: 
         assert lost_from(folder / NAME) == ""
         last = frame
     assert last == ends[-1]
-    assert content(folder)[1] == (39, 39, fold(39).chain)
+    assert content(folder)[1] == (39, 39, record(39).chain)
 
 
 def test_a_journal_that_promises_nothing_opens_with_what_there_is(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_journal_that_promises_nothing_opens_with_what_there_is(tmp_path: Path
     change(folder / LOG, 20 * FRAME)
     assert lost_from(folder / NAME)
     store = open_store(folder)
-    assert 0 < store.last().fold < 40
+    assert 0 < store.last().record < 40
     store.close()
 
 
@@ -125,7 +125,7 @@ def test_frames_of_before_a_checkpoint_are_not_missed(tmp_path: Path) -> None:
     store = open_store(folder)
     with sqlite3.connect(folder / NAME) as database:
         assert database.execute("PRAGMA wal_checkpoint(RESTART)").fetchone()[0] == 0
-    store.append([fold(41)])  # over the first of many frames
+    store.append([record(41)])  # over the first of many frames
     assert lost_from(folder / NAME) == ""
     open_store(folder, read_only=True).close()
     database.close()
@@ -196,15 +196,15 @@ def test_whatever_is_damaged_is_said_or_all_there(tmp_path: Path, left: Callable
         path = copy / chance.choice([name for name in (NAME, LOG) if (copy / name).exists()])
         path.write_bytes(DAMAGE[kind](bytearray(path.read_bytes()), chance))
         try:
-            header, _, folds, senders, _ = content(copy)
+            header, _, records, senders, _ = content(copy)
         except (JournalDamaged, JournalVersion):
             found += 1
             continue
         assert (header.map, header.mode, header.options) == ("m", "bayes-tree", OPTIONS), seed  # type: ignore[attr-defined]
         assert header.epochs == (Epoch(77, 1, "created"),), seed  # type: ignore[attr-defined]
-        assert [each._replace(chain=b"") for each in folds] == [fold(n)._replace(chain=b"") for n in range(1, 41)], (
-            seed
-        )  # a bit of a chain begins a new epoch
+        assert [each._replace(chain=b"") for each in records] == [
+            record(n)._replace(chain=b"") for n in range(1, 41)
+        ], seed  # a bit of a chain begins a new epoch
         assert [sender.next for sender in senders] == [21, 21], seed  # type: ignore[attr-defined]
     assert found > 10
 

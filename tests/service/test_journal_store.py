@@ -19,7 +19,7 @@ from factorbus.journal.digest import sealed
 from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, MapThere, NoJournal
-from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, Fold
+from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, JournalRecord
 from factorbus.journal.snapshots import file_of, read_snapshot, remove_strangers, write_snapshot
 from factorbus.journal.store import FORM, NAME, Saved, Store, create, open_store
 
@@ -28,15 +28,15 @@ def entry(client: str, sequence: int, message: bytes = b"hello") -> Entry:
     return sealed(Entry(client, sequence, 0, ACCEPTED, sequence, 10 * sequence, 1, b"", message))
 
 
-def fold(number: int, *entries: Entry) -> Fold:
-    return Fold(number, number, False, bytes([number]) * 16, entries)
+def record(number: int, *entries: Entry) -> JournalRecord:
+    return JournalRecord(number, number, False, bytes([number]) * 16, entries)
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     made = create(tmp_path / "m", "m", "inc-l", {"mode": "inc-l", "incremental_tolerance": 1e-3}, 77, "commit")
-    made.append([fold(1, entry("a", 1), entry("b", 1)), fold(2, entry("a", 2, b"more"))])
-    made.append([fold(3, sealed(entry("a", 3)._replace(outcome=REFUSED, answer=b"why")), entry("b", 2))])
+    made.append([record(1, entry("a", 1), entry("b", 1)), record(2, entry("a", 2, b"more"))])
+    made.append([record(3, sealed(entry("a", 3)._replace(outcome=REFUSED, answer=b"why")), entry("b", 2))])
     return made
 
 
@@ -45,14 +45,14 @@ def test_what_was_written_is_there_when_it_is_opened_again(store: Store) -> None
     again = open_store(store.path.parent)
     header = again.header()
     assert (header.map, header.mode, header.options["incremental_tolerance"], header.epoch) == ("m", "inc-l", 1e-3, 77)
-    assert [(f.number, [(e.client, e.sequence) for e in f.entries]) for f in again.folds(1)] == [
+    assert [(f.number, [(e.client, e.sequence) for e in f.entries]) for f in again.records(1)] == [
         (2, [("a", 2)]),
         (3, [("a", 3), ("b", 2)]),
     ]
     assert again.last() == (3, 3, b"\x03" * 16)
     assert again.at(2).chain == b"\x02" * 16
     assert list(again.check()) == []
-    assert again.counts() == {"folds": 3, "inserts": 5, "clients": 2, "message_bytes": 24}
+    assert again.counts() == {"records": 3, "inserts": 5, "clients": 2, "message_bytes": 24}
 
 
 def test_clients_are_where_they_were_and_the_one_heard_last_comes_last(store: Store) -> None:
@@ -62,17 +62,17 @@ def test_clients_are_where_they_were_and_the_one_heard_last_comes_last(store: St
     ]
     assert [s.client for s in store.senders(1, 1, 5)] == ["b"]
     store.begin("commit", Epoch(78, 4, "a test"))
-    assert store.senders(store.header().epochs[-1].fold, 10, 10) == []
-    store.append([fold(4, entry("a", 1))])
+    assert store.senders(store.header().epochs[-1].record, 10, 10) == []
+    store.append([record(4, entry("a", 1))])
     assert [(s.client, s.next) for s in store.senders(4, 10, 10)] == [("a", 2)]
     assert list(store.check()) == [], "numbers begin anew in another epoch"
 
 
 def test_a_transaction_is_there_wholly_or_not_at_all(store: Store) -> None:
     with pytest.raises(JournalFailed, match="UNIQUE"):
-        store.append([fold(4, entry("a", 4)), fold(3)])
-    assert store.last().fold == 3
-    assert len(list(store.folds())) == 3
+        store.append([record(4, entry("a", 4)), record(3)])
+    assert store.last().record == 3
+    assert len(list(store.records())) == 3
 
 
 @pytest.mark.parametrize(
@@ -81,11 +81,11 @@ def test_a_transaction_is_there_wholly_or_not_at_all(store: Store) -> None:
         ("UPDATE entry SET message = x'00' WHERE number = 3", "insert 2 of client a is not what was written"),
         ("UPDATE entry SET revision = 9 WHERE number = 3", "insert 2 of client a is not what was written"),
         ("UPDATE entry SET outcome = 1 WHERE number = 3", "insert 2 of client a is not what was written"),
-        ("DELETE FROM fold WHERE number = 2", "fold 2 is missing"),
+        ("DELETE FROM record WHERE number = 2", "record 2 is missing"),
         ("DELETE FROM entry WHERE number = 3", "client a has number 3 after 1"),
-        ("UPDATE entry SET fold = 9 WHERE number = 5", "fold 9, which is missing"),
+        ("UPDATE entry SET record = 9 WHERE number = 5", "record 9, which is missing"),
         ("UPDATE entry SET client = 'c' WHERE number = 3", "insert 2 of client c is not what was written"),
-        ("UPDATE fold SET revision = 0 WHERE number = 3", "goes back from revision 2 to 0"),
+        ("UPDATE record SET revision = 0 WHERE number = 3", "goes back from revision 2 to 0"),
     ],
 )
 def test_check_finds_what_is_wrong(store: Store, damage: str, said: str) -> None:
@@ -107,24 +107,24 @@ def test_a_page_of_nonsense_is_damage_and_not_a_map(store: Store) -> None:
     with pytest.raises(JournalDamaged):
         again.header()
     with pytest.raises(JournalDamaged):
-        list(again.folds())
+        list(again.records())
     assert list(again.check())
 
 
 def long_journal(folder: Path) -> Store:
-    """Twenty transactions, of one to four folds each, in the log and not in the database yet."""
+    """Twenty transactions, of one to four records each, in the log and not in the database yet."""
     made = create(folder, "m", "inc-l", {}, 77, "commit")
     number = 0
     for turn in range(20):
         more = range(number + 1, number + 2 + turn % 4)
-        made.append([fold(n, entry("a", n, bytes([n]) * (n * 37 % 5000))) for n in more])
+        made.append([record(n, entry("a", n, bytes([n]) * (n * 37 % 5000))) for n in more])
         number = more[-1]
     return made
 
 
 def test_a_log_cut_anywhere_is_a_journal_of_whole_transactions(tmp_path: Path) -> None:
     made = long_journal(tmp_path / "m")
-    whole = list(made.folds())
+    whole = list(made.records())
     ends = [0, *(fold_.number for fold_ in whole)]
     content = made.path.with_name("journal.db-wal").read_bytes()
     chance, seen = random.Random(3), set[int]()
@@ -135,11 +135,11 @@ def test_a_log_cut_anywhere_is_a_journal_of_whole_transactions(tmp_path: Path) -
         shutil.copyfile(made.path, cut / NAME)
         (cut / "journal.db-wal").write_bytes(content[:end] + chance.randbytes(chance.choice((0, 100, 5000))))
         again = open_store(cut)
-        assert list(again.folds()) == whole[: again.last().fold]
+        assert list(again.records()) == whole[: again.last().record]
         assert list(again.check()) == []
-        assert again.last().fold in ends
-        seen.add(again.last().fold)
-        again.append([fold(again.last().fold + 1, entry("b", 1))])
+        assert again.last().record in ends
+        seen.add(again.last().record)
+        again.append([record(again.last().record + 1, entry("b", 1))])
         again.close()
     assert len(seen) > 5
     made.close()
@@ -148,7 +148,7 @@ def test_a_log_cut_anywhere_is_a_journal_of_whole_transactions(tmp_path: Path) -
 def test_a_page_torn_while_the_log_was_put_into_the_database_is_whole_again(tmp_path: Path) -> None:
     """What a power cut in the middle of that leaves: half of a page of the log in the database, and all of the log."""
     made = long_journal(tmp_path / "m")
-    whole = list(made.folds())
+    whole = list(made.records())
     log = made.path.with_name("journal.db-wal").read_bytes()
     made.close()  # puts it in
     content, chance = made.path.read_bytes(), random.Random(5)
@@ -162,7 +162,7 @@ def test_a_page_torn_while_the_log_was_put_into_the_database_is_whole_again(tmp_
         )
         (torn / "journal.db-wal").write_bytes(log)
         again = open_store(torn)
-        assert list(again.folds()) == whole
+        assert list(again.records()) == whole
         assert list(again.check()) == []
         again.close()
 
@@ -170,7 +170,7 @@ def test_a_page_torn_while_the_log_was_put_into_the_database_is_whole_again(tmp_
 def test_a_torn_page_without_a_log_is_never_taken_for_the_journal(tmp_path: Path) -> None:
     """A disk that lost what it had confirmed: damage, or every bit is there (the page's free part was torn)."""
     made = long_journal(tmp_path / "m")
-    whole = list(made.folds())
+    whole = list(made.records())
     made.close()
     content, chance, found = made.path.read_bytes(), random.Random(6), 0
     for n in range(60):
@@ -187,7 +187,7 @@ def test_a_torn_page_without_a_log_is_never_taken_for_the_journal(tmp_path: Path
         said = list(again.check())
         found += bool(said)
         try:
-            came = list(again.folds())
+            came = list(again.records())
             again.header()
         except JournalDamaged:
             assert said
@@ -255,7 +255,7 @@ def test_snapshots_that_nobody_noted_go(store: Store) -> None:
         write_snapshot(file_of(folder, number), {"n": number})
         assert store.add_snapshot(Saved(number, 1, {"sources": "here"}, "", 10), 2) == ([1] if number == 3 else [])
     (folder / "snapshot-4.part").write_bytes(b"begun")
-    remove_strangers(folder, {saved.fold for saved in store.snapshots()})
+    remove_strangers(folder, {saved.record for saved in store.snapshots()})
     assert sorted(p.name for p in folder.glob("snapshot*")) == ["snapshot-2.fbs", "snapshot-3.fbs"]
 
 
@@ -265,7 +265,7 @@ def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
     export_map(store.path.parent, tmp_path / "m.fbmap")  # while it is open for writing
     import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     again = open_store(tmp_path / "other" / "n")
-    assert list(again.folds()) == list(store.folds())
+    assert list(again.records()) == list(store.records())
     assert (again.header().map, again.header().epoch) == ("n", 77)
     assert read_snapshot(file_of(tmp_path / "other" / "n", 3))["state"].tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(MapThere, match="there is a map 'n'"):

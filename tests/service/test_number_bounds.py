@@ -15,16 +15,16 @@ from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Arrived, Judged, Stepped
+from factorbus.service.core.events import Arrived, Stepped, Verdict
 from factorbus.service.questions.answers import Question
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import read_insert
 from factorbus.solver import Options, Solver
 
 POINT = symbol("l", 0)
 MODES = ("bayes-tree", "inc-l", "all-batch")
 # What an insert within its bounds may be refused for.
-REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialised", "out_of_bounds", "bad_sight",
+REASONS = {"accepted", "diverged", "not_finite", "underconstrained", "uninitialized", "out_of_bounds", "bad_sight",
            "bad_direction", "not_positive_definite", "bad_range"}  # fmt: skip
 
 
@@ -32,14 +32,14 @@ class Map:
     """A map as the service has it, asked after every insert whether everything in it is a number."""
 
     def __init__(self, mode: str) -> None:
-        self.folder = Folder(lambda: Solver(Options(mode=mode)), 9, Limits())
+        self.folder = MapSolver(lambda: Solver(Options(mode=mode)), 9, Limits())
         self.values: dict[int, np.ndarray] = {}
         self.sequence = 0
 
     def insert(self, batch: Batch, changes: tuple[Change, ...] = (), settle: bool = False) -> str:
         """Code of the answer."""
-        events, _ = self.folder.fold_whole([self.arrived(batch, changes, settle)])
-        (answer,) = [o.answer for e in events if isinstance(e, Judged) for o in e.outcomes]
+        events, _ = self.folder.apply_whole([self.arrived(batch, changes, settle)])
+        (answer,) = [o.answer for e in events if isinstance(e, Verdict) for o in e.outcomes]
         for event in events:
             if isinstance(event, Stepped):
                 self._follow(codec.decode_delta(event.delta))
@@ -145,8 +145,8 @@ def test_a_step_that_diverges_from_usual_numbers_is_undone(mode: str) -> None:
 def test_of_several_inserts_only_the_guilty_is_refused(mode: str) -> None:
     tried = start(mode)
     arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0))]
-    events, _ = tried.folder.fold_whole(arrived)
-    answers = [o.answer for e in events if isinstance(e, Judged) for o in e.outcomes]
+    events, _ = tried.folder.apply_whole(arrived)
+    answers = [o.answer for e in events if isinstance(e, Verdict) for o in e.outcomes]
     assert [getattr(answer, "code", "accepted") for answer in answers] == ["accepted", "diverged", "accepted"]
     estimate = tried.folder.snapshot([Question("estimate")]).variables[0].values
     np.testing.assert_allclose(estimate, [[2.0, 0.0]], atol=1e-6)
@@ -192,9 +192,9 @@ def test_run_again_from_a_journal_it_comes_to_the_same_bits(mode: str) -> None:
     tried, again = start(mode), start(mode)
     arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0), far(1e9), near(2.0))]
     for one in arrived:
-        events, _ = tried.folder.fold_whole([one])
+        events, _ = tried.folder.apply_whole([one])
         assert not any(event.rebuilt for event in events if isinstance(event, Stepped)), "no fault of the solver"
-        list(again.folder.fold_again([one], rebuilt=False))
+        list(again.folder.apply_again([one], rebuilt=False))
         assert (tried.folder.revision, tried.folder.size) == (again.folder.revision, again.folder.size)
         assert tried.estimate() == again.estimate()
     assert tried.folder.size == (1, 4)

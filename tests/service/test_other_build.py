@@ -58,11 +58,11 @@ class Session:
 
     def insert(self, *batches: Batch) -> None:
         for batch in batches:
-            number = self.keeper.folds + 1
+            number = self.keeper.records + 1
             made = read_insert(None, "a", codec.encode_insert(Insert(number, batch)), REQUEST_LIMITS, 0.0)
             assert isinstance(made, Arrived)
             inserts = [made._replace(askers=[])]
-            events, _ = self.folder.fold_whole(inserts)
+            events, _ = self.folder.apply_whole(inserts)
             self.keeper.hand(inserts, events)
 
     def row(self) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def test_another_build_goes_on_from_the_snapshot_and_says_so(
     """Upgraded, or moved to another machine; here all bits are the same, and that has been seen."""
     by_another(tmp_path / "m", **{part: "elsewhere"})
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds) == (SNAPSHOT, INSERTS - SNAPSHOT)
+    assert (session.recovered.from_record, session.recovered.records) == (SNAPSHOT, INSERTS - SNAPSHOT)
     assert session.recovered.same
     assert session.recovered.other_build.startswith(f"{part} elsewhere, here ")
     assert f"map m was made by another build of the solver: {part} elsewhere" in caplog.text
@@ -150,7 +150,7 @@ def test_another_build_goes_on_from_the_snapshot_and_says_so(
     session.insert(*BATCHES[INSERTS:])
     session.close()
     again = reopen()
-    assert [(maker.fold, maker.build[part] == "elsewhere") for maker in again.makers()] == [
+    assert [(maker.record, maker.build[part] == "elsewhere") for maker in again.makers()] == [
         (1, True),
         (INSERTS + 1, False),
     ]
@@ -166,20 +166,20 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
     session.close()
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds) == (INSERTS + 1, 0)
+    assert (session.recovered.from_record, session.recovered.records) == (INSERTS + 1, 0)
     assert session.recovered.same, "no value has changed"
     row = session.row()
     assert row["reproducible"] is False
-    assert row["reason"].startswith(f"another build wrote the snapshot of fold {INSERTS + 1} (processor elsewhere")
+    assert row["reason"].startswith(f"another build wrote the snapshot of record {INSERTS + 1} (processor elsewhere")
     assert f"map m is not reproducible: {row['reason']}" in caplog.text
     assert session.kept.header.epochs[1:] == ()
     session.close()
     session = reopen()
-    assert len(session.makers()) == 1, "who made no fold is not among the makers"
+    assert len(session.makers()) == 1, "who made no record is not among the makers"
     session.insert(BATCHES[INSERTS + 1])
     session.close()
     session = reopen()
-    assert session.row()["reason"] == row["reason"], "a fold that this build made itself compares nothing"
+    assert session.row()["reason"] == row["reason"], "a record that this build made itself compares nothing"
     session.keeper.snapshot(session.folder.dump(), 0.0)
     session.close()
     session = reopen()
@@ -194,7 +194,7 @@ def test_other_bits_after_the_snapshot_are_said_and_begin_an_epoch(
     by_another(tmp_path / "m", processor="elsewhere")
     rounding_otherwise(monkeypatch)
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.same) == (SNAPSHOT, False)
+    assert (session.recovered.from_record, session.recovered.same) == (SNAPSHOT, False)
     assert session.values() != values
     assert session.values().keys() == values.keys()
     row = session.row()
@@ -210,7 +210,7 @@ def test_other_bits_after_the_snapshot_are_said_and_begin_an_epoch(
     present = session.values()
     session.close()
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds) == (INSERTS, 1)
+    assert (session.recovered.from_record, session.recovered.records) == (INSERTS, 1)
     assert session.recovered.same, "digests go on from what the journal had"
     assert session.values() == present
     assert len(session.kept.header.epochs) == 2, "and no further epoch"
@@ -231,9 +231,9 @@ def test_a_fold_with_other_bits_does_not_hide_those_after_it(
     values: dict[int, bytes], library: Library, tmp_path: Path
 ) -> None:
     """Each is compared from what the journal has of the one before."""
-    changed(tmp_path / "m", "UPDATE fold SET chain = x'00112233445566778899aabbccddeeff' WHERE number = 9")
+    changed(tmp_path / "m", "UPDATE record SET chain = x'00112233445566778899aabbccddeeff' WHERE number = 9")
     kept = library.open("m", Limits())
-    same = {fold.number: alike for fold, alike in verify(kept.store, kept.folder)}
+    same = {record.number: alike for record, alike in verify(kept.store, kept.folder)}
     kept.store.close()
     assert [number for number, alike in same.items() if not alike] == [9, 10], "10 begins with the digest of 9"
 
@@ -243,7 +243,7 @@ def test_a_snapshot_in_another_format_is_not_read_and_all_is_folded_again(
 ) -> None:
     changed(tmp_path / "m", f"UPDATE snapshot SET format = {FORMAT + 1}")
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds, session.recovered.same) == (0, INSERTS, True)
+    assert (session.recovered.from_record, session.recovered.records, session.recovered.same) == (0, INSERTS, True)
     assert f"has a state of format {FORMAT + 1}, this version reads {FORMAT}: not used" in caplog.text
     assert session.values() == values
     assert session.row()["reproducible"] is True
@@ -257,11 +257,11 @@ def test_a_long_replay_is_made_once(
     changed(tmp_path / "m", f"UPDATE snapshot SET format = {FORMAT + 1}")
     library._config = Config(journal=str(tmp_path), snapshot_s=1e-6)
     session = reopen()
-    assert session.recovered.from_fold == 0
+    assert session.recovered.from_record == 0
     assert session.keeper.wants_snapshot()
     session.close(snapshot=True)
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds) == (INSERTS, 0)
+    assert (session.recovered.from_record, session.recovered.records) == (INSERTS, 0)
     session.close()
 
 
@@ -276,7 +276,7 @@ def test_a_damaged_snapshot_is_not_read_whoever_wrote_it(
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds, session.recovered.same) == (0, INSERTS, True)
+    assert (session.recovered.from_record, session.recovered.records, session.recovered.same) == (0, INSERTS, True)
     assert session.values() == values
     assert session.row()["reproducible"] is True, "all of it was compared"
     session.close()
@@ -288,9 +288,9 @@ def test_vectors_of_another_width_leave_the_estimate_and_r_is_computed_anew(
     """Rows of R as they were would be read past their ends."""
     by_another(tmp_path / "m", processor="elsewhere")
     true_load = Solver.load
-    monkeypatch.setattr(Solver, "load", lambda solver, state: true_load(solver, {**state, "lanes": 0}))
+    monkeypatch.setattr(Solver, "load", lambda solver, state: true_load(solver, {**state, "executors": 0}))
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.folds) == (SNAPSHOT, INSERTS - SNAPSHOT)
+    assert (session.recovered.from_record, session.recovered.records) == (SNAPSHOT, INSERTS - SNAPSHOT)
     assert session.row()["reason"].startswith(
         f"R was computed anew: snapshot {SNAPSHOT} has it for vectors of another width"
     )
@@ -302,7 +302,7 @@ def test_vectors_of_another_width_leave_the_estimate_and_r_is_computed_anew(
     session.close(snapshot=True)
     monkeypatch.undo()
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.same) == (len(BATCHES), True)
+    assert (session.recovered.from_record, session.recovered.same) == (len(BATCHES), True)
     session.close()
 
 
@@ -310,16 +310,16 @@ def test_a_step_more_or_less_by_another_build_keeps_no_map_closed(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path
 ) -> None:
     """A threshold may be crossed by one and not by the other; by the same build it is a fault."""
-    changed(tmp_path / "m", "UPDATE fold SET revision = revision + 1 WHERE number >= 10")
-    with pytest.raises(JournalDiffers, match="fold 10 led to revision 11, and leads to 10"):
+    changed(tmp_path / "m", "UPDATE record SET revision = revision + 1 WHERE number >= 10")
+    with pytest.raises(JournalDiffers, match="record 10 led to revision 11, and leads to 10"):
         reopen()
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
-    assert (session.recovered.from_fold, session.recovered.same) == (SNAPSHOT, False)
+    assert (session.recovered.from_record, session.recovered.same) == (SNAPSHOT, False)
     assert session.folder.revision == INSERTS + 1
     session.close()
-    changed(tmp_path / "m", "DELETE FROM entry WHERE fold = 11")
-    with pytest.raises(JournalDiffers, match="fold 11 led to revision 12, and leads to 11"):
+    changed(tmp_path / "m", "DELETE FROM entry WHERE record = 11")
+    with pytest.raises(JournalDiffers, match="record 11 led to revision 12, and leads to 11"):
         reopen()
 
 
@@ -331,10 +331,10 @@ def test_a_fork_has_what_is_known_of_the_original(
     assert forked.values() == values
     assert forked.row()["reason"] == "it is so"
     forked.insert(BATCHES[INSERTS])
-    assert forked.kept.header.epochs[-1].fold == INSERTS + 1
+    assert forked.kept.header.epochs[-1].record == INSERTS + 1
     forked.close()
     again = Session(library.open("n", Limits()))
-    assert (again.recovered.from_fold, again.row()["reason"]) == (INSERTS, "it is so")
+    assert (again.recovered.from_record, again.row()["reason"]) == (INSERTS, "it is so")
     again.close()
     session.close()
 

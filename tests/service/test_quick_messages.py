@@ -17,7 +17,7 @@ from factorbus.proto.limits import REQUEST_LIMITS, Limits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.stamps import NO_STAMP
-from factorbus.service.core.events import Arrived, Located
+from factorbus.service.core.events import Arrived, ParsedInsert
 from factorbus.service.kernels.words import LETTERS, LONGEST, WORDS
 from factorbus.service.kernels.write import write_messages
 from factorbus.service.solving.arrival import message_digest, read_insert, try_locate
@@ -32,7 +32,7 @@ seeds = st.integers(0, 2**32 - 1)
 integers = st.sampled_from([0, 1, 127, 128, 255, 256, 65_535, 65_536, 2**32 - 1, 2**32, 2**62, 2**63 - 1])
 
 
-def content_of(located: Located) -> tuple[list[Any], list[Any]]:
+def content_of(located: ParsedInsert) -> tuple[list[Any], list[Any]]:
     """Kinds and columns, bit for bit, at the places that were found."""
 
     def column(row: np.ndarray, offset: int, numbers: int) -> bytes | None:
@@ -234,7 +234,7 @@ def test_an_arrival_is_the_same_either_way() -> None:
     usual = read_insert("asker", "robot", message, Limits(1 << 20, 0, 0), 1.5)
     assert isinstance(quick, Arrived)
     assert isinstance(usual, Arrived)
-    assert isinstance(quick.content, Located)
+    assert isinstance(quick.content, ParsedInsert)
     assert isinstance(usual.content, Insert)
     assert quick._replace(content=usual.content) == usual
 

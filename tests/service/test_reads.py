@@ -1,4 +1,4 @@
-"""What questions cost an insert: in one Run the solver's thread does so much for them, however many wait."""
+"""What questions cost an insert: in one InsertBatch the solver's thread does so much for them, however many wait."""
 
 import threading
 from typing import Any
@@ -12,7 +12,7 @@ from factorbus.proto import asking, asking_codec, codec
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.service.bus.delivery import Delivery
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Arrived, Asked, Effect, Folded, Read, Run
+from factorbus.service.core.events import Applied, Arrived, Asked, Effect, InsertBatch, Read
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.core.pending_questions import Reads
 from factorbus.service.questions.answers import Question, QuestionCopies, answer, parse, snapshot
@@ -38,7 +38,7 @@ def why_factor() -> bytes:
 
 
 def taken(*questions: tuple[str, bytes]) -> tuple[list[int], int]:
-    """Which of them the first Run takes, and after how many Runs none is left."""
+    """Which of them the first InsertBatch takes, and after how many Runs none is left."""
     reads, runs = Reads(), 1
     for n, (name, payload) in enumerate(questions):
         reads.append(Read(parse(name, payload), n))
@@ -72,16 +72,16 @@ def test_inserts_are_taken_between_them() -> None:
     for n in range(1, 100):
         core.ask(Asked(n, "covariance", covariance(8)), 1.0)
     core.insert(Arrived(["a1"], "a", 1, 0, 10, 1, Insert(1, Batch()), 1.0))
-    run = run_of(core.folded(Folded(3, 4, 0.5, 2.0)))
+    run = run_of(core.applied(Applied(3, 4, 0.5, 2.0)))
     assert ([read.asker for read in run.reads], [insert.sequence for insert in run.inserts]) == ([1], [1])
     asked: list[Any] = []
-    while effects := core.folded(Folded(3, 4, 0.5, 3.0)):
+    while effects := core.applied(Applied(3, 4, 0.5, 3.0)):
         asked += [read.asker for read in run_of(effects).reads]
     assert asked == list(range(2, 100))
 
 
-def run_of(effects: list[Effect]) -> Run:
-    (run,) = [effect for effect in effects if isinstance(effect, Run)]
+def run_of(effects: list[Effect]) -> InsertBatch:
+    (run,) = [effect for effect in effects if isinstance(effect, InsertBatch)]
     return run
 
 
@@ -96,7 +96,7 @@ def solved(mode: str) -> Solver:
 
 
 @pytest.mark.parametrize("mode", ["inc-l", "all-batch"])
-def test_a_mode_without_a_tree_is_factorised_by_who_answers(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mode_without_a_tree_is_factorized_by_who_answers(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     solver, made = solved(mode), list[int]()
     real = solver_of.factored_anew
     monkeypatch.setattr(solver_of, "factored_anew", lambda graph: made.append(1) or real(graph))
@@ -110,7 +110,7 @@ def test_a_mode_without_a_tree_is_factorised_by_who_answers(mode: str, monkeypat
         found = asking_codec.decode_covariances(answer(question, copy))
         assert [group.keys.tolist() for group in found.groups] == [[0, 1]], "as the map was"
     np.testing.assert_allclose(found[1], np.diag([0.01, 0.01, 0.0025]), rtol=1e-9, atol=1e-15)
-    assert len(made) == 1, "one factorisation serves all questions about a revision"
+    assert len(made) == 1, "one factorization serves all questions about a revision"
 
 
 class Answers:

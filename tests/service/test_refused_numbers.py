@@ -19,7 +19,7 @@ from factorbus.proto.place import find_place
 from factorbus.proto.problems import BadMessage, Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.admission import Admission
-from factorbus.service.core.events import Answer, Arrived, Effect, Folded, Judged, Outcome, Refuse, Run
+from factorbus.service.core.events import Answer, Applied, Arrived, Effect, InsertBatch, Outcome, Refuse, Verdict
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.solving.arrival import read_insert
 from factorbus.solver.errors import DuplicateVariable
@@ -54,7 +54,7 @@ BROKEN: dict[str, Callable[[dict], bytes]] = {
     "a far number": lambda m: msgpack.packb(m | {"sequence": m["sequence"] + 999}),
     "the next number": lambda m: msgpack.packb(m | {"sequence": m["sequence"] + 1}),
     "another epoch": lambda m: msgpack.packb(m | {"epoch": EPOCH + 1}),
-    "points_below −1": lambda m: msgpack.packb(m | {"points_below": -1.0}),
+    "convert_below −1": lambda m: msgpack.packb(m | {"convert_below": -1.0}),
     "an unknown loss": lambda m: msgpack.packb(m | {"changes": [{"change": "loss", "factors": b"", "loss": "none"}]}),
 }
 # In these the number itself is wrong, or behind what cannot be passed over.
@@ -94,12 +94,12 @@ class Service:
 
     def _run(self, effects: list[Effect]) -> Iterator[Effect]:
         for effect in effects:
-            if not isinstance(effect, Run):
+            if not isinstance(effect, InsertBatch):
                 yield effect
                 continue
             outcomes = tuple(Outcome(insert, self._answer(insert)) for insert in effect.inserts)
-            yield from self._run(self.core.judged(Judged(outcomes, 1, len(outcomes))))
-            yield from self._run(self.core.folded(Folded(0, 0, 0.0, self.now)))
+            yield from self._run(self.core.judged(Verdict(outcomes, 1, len(outcomes))))
+            yield from self._run(self.core.applied(Applied(0, 0, 0.0, self.now)))
 
     def _answer(self, insert: Arrived) -> bytes | Exception:
         if isinstance(insert.content, Problem):

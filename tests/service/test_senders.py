@@ -7,7 +7,7 @@ import pytest
 from factorbus.proto.keys import insert_key
 from factorbus.proto.problems import Problem
 from factorbus.service.bus.senders import Senders
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.maps.serial_executor import SerialExecutor
 
 
 class Declared:
@@ -23,65 +23,65 @@ class Declared:
         return lambda: self.now.remove(key)
 
 
-def settle(desk: Lane) -> None:
-    """Return when the desk is done with what it has."""
+def settle(control: SerialExecutor) -> None:
+    """Return when the control is done with what it has."""
     reached = threading.Event()
-    desk.hand(reached.set)
+    control.hand(reached.set)
     assert reached.wait(10)
 
 
-def remembered(senders: Senders, desk: Lane, *clients: str) -> list[str]:
+def remembered(senders: Senders, control: SerialExecutor, *clients: str) -> list[str]:
     """Have `clients` send to one map; their keys."""
     sent = [insert_key("m", client) for client in clients]
     for key in sent:
         senders.remember(key, senders.find(key))
-    desk.close()
+    control.close()
     return sent
 
 
 def test_a_key_is_taken_apart_and_declared_once():
-    desk, declared = Lane("desk"), Declared()
-    senders = Senders(desk, declared.declare)
-    key, *_ = remembered(senders, desk, "robot", "robot", "robot")
+    control, declared = SerialExecutor("control"), Declared()
+    senders = Senders(control, declared.declare)
+    key, *_ = remembered(senders, control, "robot", "robot", "robot")
     assert senders.find(key) == ("m", "robot")
     assert declared.ever == [key]
 
 
 def test_who_only_asked_is_not_declared():
-    desk, declared = Lane("desk"), Declared()
-    senders = Senders(desk, declared.declare)
+    control, declared = SerialExecutor("control"), Declared()
+    senders = Senders(control, declared.declare)
     assert senders.find(insert_key("m", "robot")) == ("m", "robot")
-    desk.close()
+    control.close()
     assert not declared.ever
 
 
 @pytest.mark.parametrize("key", ["factorbus/v1/map/*/in/robot", "factorbus/v1/map/m/in/**"])
 def test_a_key_of_nobody_is_refused(key: str):
-    desk = Lane("desk")
-    senders = Senders(desk, Declared().declare)
+    control = SerialExecutor("control")
+    senders = Senders(control, Declared().declare)
     with pytest.raises(Problem) as caught:
         senders.find(key)
     assert caught.value.code == "bad_name"
-    desk.close()
+    control.close()
 
 
 def test_the_oldest_makes_room():
-    desk, declared = Lane("desk"), Declared()
-    senders = Senders(desk, declared.declare, most=2)
-    a, b, c, again = remembered(senders, desk, "a", "b", "c", "b")
+    control, declared = SerialExecutor("control"), Declared()
+    senders = Senders(control, declared.declare, most=2)
+    a, b, c, again = remembered(senders, control, "a", "b", "c", "b")
     assert again == b
     assert declared.now == [b, c]
     assert senders.find(a) == ("m", "a"), "it is taken apart anew"
 
 
 def test_who_made_room_can_come_back():
-    desk, declared = Lane("desk"), Declared()
-    senders = Senders(desk, declared.declare, most=1)
+    control, declared = SerialExecutor("control"), Declared()
+    senders = Senders(control, declared.declare, most=1)
     a, b = insert_key("m", "a"), insert_key("m", "b")
     for key in (a, b):
         senders.remember(key, senders.find(key))
-    settle(desk)
+    settle(control)
     assert declared.now == [b]
     senders.remember(a, senders.find(a))
-    desk.close()
+    control.close()
     assert declared.now == [a]

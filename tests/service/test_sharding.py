@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from factorbus.proto.features import Ask, Segment, answer_size
 from factorbus.proto.features_codec import encode_shard_done
 from factorbus.service.jobs.rates import example, measured
-from factorbus.service.jobs.sharding import Rates, Trip, Work, cuts, seconds, shards_for, work_of
+from factorbus.service.jobs.sharding import Rates, RoundTrip, Work, cuts, seconds, shards_for, work_of
 
 RATES = Rates(fixed_s=1e-4, feature_s=1e-7, number_s=2e-9, stored_s=1e-9)
-TRIP = Trip(fixed_s=3e-4, byte_s=1e-9)
+ROUND_TRIP = RoundTrip(fixed_s=3e-4, byte_s=1e-9)
 
 
 def stored(n: int) -> Ask:
@@ -22,35 +22,35 @@ def stored(n: int) -> Ask:
 
 def test_without_workers_it_is_done_in_place() -> None:
     assert shards_for(work_of(stored(1000)), RATES, [], 0) == 0
-    assert shards_for(work_of(stored(1000)), RATES, [TRIP], 0) == 0
+    assert shards_for(work_of(stored(1000)), RATES, [ROUND_TRIP], 0) == 0
 
 
 def test_the_way_pays_when_it_is_shorter_than_the_work() -> None:
-    counts = [shards_for(work_of(stored(n)), RATES, [TRIP], 2) for n in (1, 10, 30, 100, 1000)]
+    counts = [shards_for(work_of(stored(n)), RATES, [ROUND_TRIP], 2) for n in (1, 10, 30, 100, 1000)]
     assert counts == sorted(counts)
     assert (counts[0], counts[-1]) == (0, 2)
     for n in (20, 30, 50, 70, 100):
         work = work_of(stored(n))
-        way = TRIP.fixed_s + TRIP.byte_s * work.bytes_back
-        assert (shards_for(work, RATES, [TRIP], 1) > 0) == (way < seconds(work, RATES))
+        way = ROUND_TRIP.fixed_s + ROUND_TRIP.byte_s * work.bytes_back
+        assert (shards_for(work, RATES, [ROUND_TRIP], 1) > 0) == (way < seconds(work, RATES))
 
 
 def test_an_answer_that_takes_longer_to_send_than_to_make_is_made_here() -> None:
-    slow = Trip(fixed_s=1e-4, byte_s=5e-9)
+    slow = RoundTrip(fixed_s=1e-4, byte_s=5e-9)
     assert shards_for(work_of(example("half", 1000)), RATES, [slow], 4) == 0
     assert shards_for(work_of(stored(1000)), RATES, [slow], 4) == 4
 
 
 def test_more_workers_take_more_shards_but_not_more_than_features_or_slots() -> None:
-    assert [shards_for(work_of(stored(1000)), RATES, [TRIP], slots) for slots in (1, 2, 7)] == [1, 2, 7]
+    assert [shards_for(work_of(stored(1000)), RATES, [ROUND_TRIP], slots) for slots in (1, 2, 7)] == [1, 2, 7]
     many = Work(features=3, bytes_back=0, numbers=10**9, stored=True)
-    assert shards_for(many, RATES, [TRIP], 7) == 3
+    assert shards_for(many, RATES, [ROUND_TRIP], 7) == 3
 
 
 def test_the_slowest_way_counts() -> None:
     work = work_of(stored(100))
-    assert shards_for(work, RATES, [TRIP], 2) > 0
-    assert shards_for(work, RATES, [TRIP, Trip(1.0, 0.0)], 2) == 0
+    assert shards_for(work, RATES, [ROUND_TRIP], 2) > 0
+    assert shards_for(work, RATES, [ROUND_TRIP, RoundTrip(1.0, 0.0)], 2) == 0
 
 
 @given(st.integers(1, 300), st.integers(1, 12), st.sampled_from(["rows", "half", "factored"]))

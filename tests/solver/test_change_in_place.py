@@ -83,7 +83,7 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     information, eta, model, delta = normal_equations(solver)
     if solver._stepper.tree.raised:  # then R is not quite that of Λ
         return
-    if not solver._stepper._held:  # else the estimate is where the tree is linearised, and R waits for the next step
+    if not solver._stepper._held:  # else the estimate is where the tree is linearized, and R waits for the next step
         assert_is_solution(solver, information, eta, model, delta, least=2e-8)
     scale = np.sqrt(np.diag(information))
     unit = information / scale / scale[:, None]

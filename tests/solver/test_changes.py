@@ -111,7 +111,7 @@ def test_factors_taken_out_in_the_middle_were_never_there(seed: int, mode: str) 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_without_settling_the_step_is_gauss_newton_at_the_estimate(mode: str) -> None:
-    """The linear problem that is solved is that of what is left, linearised at the estimate: as a dense twin has it."""
+    """The linear problem that is solved is that of what is left, linearized at the estimate: as a dense twin has it."""
     batches = list(random_steps(5, steps=8))
     solver, firsts = fed(batches, mode)
     twin = DenseGraph()
@@ -289,7 +289,7 @@ BAD: dict[str, tuple[type[errors.SolverError], list[Change]]] = {
         errors.NamedTwice,
         [Change("place", keys=np.array([symbol("x", 2)] * 2), kind="se2", values=np.zeros((2, 3)))],
     ),
-    "a variable marginalised twice": (errors.NamedTwice, [Change("marginalise", keys=np.array([symbol("x", 2)] * 2))]),
+    "a variable marginalized twice": (errors.NamedTwice, [Change("marginalize", keys=np.array([symbol("x", 2)] * 2))]),
     "too few weights": (errors.BadShape, [Change("weigh", np.array([4, 5]), weight=np.ones(1))]),
     "left free": (errors.Underconstrained, [Change("remove_factors", np.array([4, 5]))]),
     "no anchor": (errors.Underconstrained, [Change("free", keys=np.array([symbol("x", 0)]))]),

@@ -1,4 +1,4 @@
-"""The factorisation and the solves against dense and CHOLMOD ones, damping, failures, reuse of arenas."""
+"""The factorization and the solves against dense and CHOLMOD ones, damping, failures, reuse of arenas."""
 
 import os
 import subprocess

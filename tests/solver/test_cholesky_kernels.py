@@ -12,11 +12,11 @@ from factorbus.solver.kernels.jit.simd import LANES, add_run, six, solve_rows, t
 from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, padded, update_row, update_size
 from factorbus.solver.kernels.sparse.panels import DEPTH
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
-from factorbus.solver.sparse.lending import BOARD
+from factorbus.solver.sparse.lending import TASK_QUEUE
 
 
 @given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))
-def test_a_front_is_factorised_like_a_dense_matrix(p, m, seed):
+def test_a_front_is_factorized_like_a_dense_matrix(p, m, seed):
     assert_front(p, m, seed)
 
 
@@ -99,7 +99,7 @@ def assert_front(p: int, m: int, seed: int) -> None:
 
 
 def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[int, np.ndarray, np.ndarray]:
-    """Put a front into an arena as `fronts` says, everything around it NaN, and factorise it."""
+    """Put a front into an arena as `fronts` says, everything around it NaN, and factorize it."""
     n = len(front)
     m, lead = n - p, -p % LANES
     ld, width = lead + p + m + -m % LANES, padded(m)
@@ -118,7 +118,7 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
         put += width - first
     assert put == start + size
     floors = np.zeros(p) if floors is None else floors
-    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0, 0, BOARD)
+    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0, 0, TASK_QUEUE)
     assert np.isnan(arena[-8:]).all()
     result = np.zeros((m, m))
     for i, row in enumerate(update):

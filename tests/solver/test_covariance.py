@@ -33,8 +33,8 @@ def solved(seed: int, mode: str, steps: int = 6) -> Solver:
     return solver
 
 
-def dense(solver: Solver, at_linearisation: bool = True) -> DenseCovariance:
-    """The twin, linearised where the solver's R is."""
+def dense(solver: Solver, at_linearization: bool = True) -> DenseCovariance:
+    """The twin, linearized where the solver's R is."""
     graph = DenseGraph()
     variables, factors = solver.graph()
     graph.add(_Whole(variables, factors))
@@ -43,7 +43,7 @@ def dense(solver: Solver, at_linearisation: bool = True) -> DenseCovariance:
         kind = VARIABLE_KIND_OF_CODE[int(solver._graph.var[v, at.V_KIND])]
         x = int(solver._graph.var[v, at.V_AT])
         values = (
-            tree_of(solver).lin[0] if hasattr(solver._stepper, "tree") and at_linearisation else solver._graph.values
+            tree_of(solver).lin[0] if hasattr(solver._stepper, "tree") and at_linearization else solver._graph.values
         )
         graph.kinds[key], graph.values[key] = kind.name, values[x : x + kind.size].copy()
     return DenseCovariance(graph)
@@ -304,7 +304,7 @@ def test_relative_to_a_point_is_refused() -> None:
 
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-@example(seed=111)  # a point so near that what little is left to solve would move linearisation points off the estimate
+@example(seed=111)  # a point so near that what little is left to solve would move linearization points off the estimate
 def test_why_a_factor(seed: int) -> None:
     """χ² without a factor, and how much of it is known from it, by solving without it."""
     solver = solved(seed, "all-batch", steps=4)
@@ -341,7 +341,7 @@ def test_why_a_variable(mode: str) -> None:
         close(account.sigmas**2, np.diag(twin.joint([account.key])), twin.tell)
         assert 0 < account.conditioning <= 1 + 1e-3
         assert account.pivot >= 1 / account.sigmas.max() * (1 - 1e-9)
-        assert (account.linearised_step >= 1) == (mode == "bayes-tree")
+        assert (account.linearized_step >= 1) == (mode == "bayes-tree")
         assert account.as_dict()["factors"][0]["keys"]
 
 

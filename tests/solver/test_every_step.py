@@ -2,7 +2,7 @@
 
 `test_incremental.py` does the same with dense matrices on small random maps.  Here, after each step, RᵀR x = PΛPᵀ x
 for random signs x (an entry that is wrong by e shows as e or more in half of them), entry by entry now and then, and δ
-is what CHOLMOD finds on its own (Λ ordered and factorised anew).
+is what CHOLMOD finds on its own (Λ ordered and factorized anew).
 """
 
 from collections import Counter
@@ -30,7 +30,7 @@ RELATIVE = 1e-9
 ROUNDING = 100  # times what refining changes of CHOLMOD's own: 37 has been seen, and it depends on the BLAS
 PROBES = 4
 ENTRYWISE = 50  # every so many steps
-# "omega" and "lambda" update R the one way for as long as it lives, and never move the linearisation point.
+# "omega" and "lambda" update R the one way for as long as it lives, and never move the linearization point.
 WAYS = {
     "omega": {
         "small_loop_threshold": 10**6,
@@ -135,7 +135,7 @@ def assert_is_the_factor(solver: Solver, rng: np.random.Generator, entrywise: bo
 
 
 def rows_of(solver: Solver) -> BlockFactor | None:
-    """R in block rows; a copy when it is in the fronts of a full factorisation."""
+    """R in block rows; a copy when it is in the fronts of a full factorization."""
     factor = solver._stepper.system.factor
     if factor._have is Where.NOWHERE:
         return None

@@ -96,8 +96,8 @@ def covariance(solver: Solver, *names: int) -> np.ndarray:
     )
 
 
-def marginalise(*names: int) -> list[Change]:
-    return [Change("marginalise", keys=x(*names))]
+def marginalize(*names: int) -> list[Change]:
+    return [Change("marginalize", keys=x(*names))]
 
 
 def apart(a: Solver, b: Solver) -> float:
@@ -220,7 +220,7 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
     estimate, gone = values(solver), list(range(8))
     names = list(range(8, 16))
     sure = covariance(solver, *names)
-    after, _, report, counted = solver.with_changes(marginalise(*gone), settle=True)
+    after, _, report, counted = solver.with_changes(marginalize(*gone), settle=True)
     assert counted["removed_variables"] == 8
     (joint,) = find_joints(after._graph)
     assert len(joint.variables) >= 3, "else it shows nothing"
@@ -259,10 +259,10 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
 def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
     """What is known of many poses goes whole into the next marginal, and leaves no pieces behind."""
     solver = solved(loopy(kind, 18, 5))
-    at_once, *_ = solver.with_changes(marginalise(*range(10)), settle=True)
+    at_once, *_ = solver.with_changes(marginalize(*range(10)), settle=True)
     slowly = solver
     for n in range(10):
-        slowly, *_ = slowly.with_changes(marginalise(n), settle=True)
+        slowly, *_ = slowly.with_changes(marginalize(n), settle=True)
     assert apart(at_once, slowly) < 1e-9
     a, b = covariance(at_once, *range(10, 18)), covariance(slowly, *range(10, 18))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * np.abs(a).max())
@@ -273,7 +273,7 @@ def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
 
 def window() -> tuple[Solver, list[int]]:
     """A map with one form in pieces, and the ids of these."""
-    solver, *_ = solved(loopy("se2", 16, 1)).with_changes(marginalise(*range(8)), settle=True)
+    solver, *_ = solved(loopy("se2", 16, 1)).with_changes(marginalize(*range(8)), settle=True)
     (joint,) = find_joints(solver._graph)
     return solver, solver._graph.ids_of(np.array(joint.rows)).tolist()
 
@@ -350,7 +350,7 @@ def test_the_kept_up_covariance_is_that_from_scratch() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", SIZE)
 def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> None:
-    solver, *_ = solved(loopy(kind, 16, 1)).with_changes(marginalise(*range(8)), settle=True)
+    solver, *_ = solved(loopy(kind, 16, 1)).with_changes(marginalize(*range(8)), settle=True)
     variables, factors = solver.graph()
     sent = Batch(
         tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in variables),
@@ -382,7 +382,7 @@ def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
-    solver, *_ = solved(loopy("se2", 16, 1), mode).with_changes(marginalise(*range(8)))
+    solver, *_ = solved(loopy("se2", 16, 1), mode).with_changes(marginalize(*range(8)))
     again = Solver(Options(mode=mode))
     again.load(solver.dump())
     for n in (16, 17):
@@ -396,7 +396,7 @@ def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
             each.stage(Batch((Variables("se2", x(n)),), (edge, loop)))
             each.step()
         assert all(np.array_equal(row, values(again)[key][1]) for key, (_, row) in values(solver).items())
-    ones, others = solver.with_changes(marginalise(8, 9))[0], again.with_changes(marginalise(8, 9))[0]
+    ones, others = solver.with_changes(marginalize(8, 9))[0], again.with_changes(marginalize(8, 9))[0]
     assert all(np.array_equal(row, values(others)[key][1]) for key, (_, row) in values(ones).items())
 
 
@@ -422,9 +422,9 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
     )
     solver = solved(Batch((Variables("se2", x(*range(count))),), (*star, loopy("se2", 2, 1).factors[-2])))
     with pytest.raises(errors.TooConnected) as refused:
-        solver.with_changes(marginalise(0))
+        solver.with_changes(marginalize(0))
     assert refused.value.detail["border"] == x(*range(1, count)).tolist()
-    after, *_ = solver.with_changes(marginalise(0, 1), settle=True)
+    after, *_ = solver.with_changes(marginalize(0, 1), settle=True)
     assert len(find_joints(after._graph)[0].variables) == MOST
     assert apart(after, solver) < 1e-9
     l = np.array([symbol("l", 1)])
@@ -435,7 +435,7 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
     solver.stage(Batch((Variables("point2", l),), tuple(seen)))
     solver.step()
     with pytest.raises(errors.TooConnected):
-        solver.with_changes(marginalise(0))
+        solver.with_changes(marginalize(0))
 
 
 @pytest.mark.timeout(600)
@@ -450,7 +450,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
             each.step()
         loops += step.factor_count - 1
         if n - first == keep + every:
-            solver, *_ = solver.with_changes(marginalise(*range(first, first + every)))
+            solver, *_ = solver.with_changes(marginalize(*range(first, first + every)))
             first += every
             sizes.append(solver.memory_bytes())
             widest = max([widest, *(len(joint.variables) for joint in find_joints(solver._graph))])
@@ -466,7 +466,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
         seen, wanted = (_relative("se2", of[key][1], end) for of, end in zip((here, there), last, strict=True))
         assert distance("se2", seen, wanted) < 1e-3, "the window is what it is in the whole map"
     if poses < 1000:
-        assert np.hypot(*(last[0] - last[1])[:2]) < 0.1, "and where it is there, but for what was linearised once"
+        assert np.hypot(*(last[0] - last[1])[:2]) < 0.1, "and where it is there, but for what was linearized once"
 
 
 def _steps(poses: int, keep: int) -> Iterator[Batch]:

@@ -28,7 +28,7 @@ from factorbus.solver.kernels.bayes_tree.eliminate import (
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
 from factorbus.solver.kernels.sparse.task_queue import MOST
-from factorbus.solver.sparse.lending import BOARD, Lender, count_free
+from factorbus.solver.sparse.lending import TASK_QUEUE, WorkerThread, count_free
 
 pytestmark = pytest.mark.skipif(
     count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"
@@ -38,9 +38,9 @@ POSES = 1500
 
 
 @contextmanager
-def lent(count: int = 1) -> Iterator[list[Lender]]:
+def lent(count: int = 1) -> Iterator[list[WorkerThread]]:
     """So many threads lend their cores meanwhile."""
-    lenders = [Lender() for _ in range(count)]
+    lenders = [WorkerThread() for _ in range(count)]
     threads = [threading.Thread(target=lender.lend) for lender in lenders]
     for thread in threads:
         thread.start()
@@ -81,14 +81,14 @@ def eliminated(driven: Solver) -> tuple[list[bytes], int]:
 @pytest.mark.parametrize(("p", "m"), [(70, 420), (130, 401), (300, 300), (700, 3), (500, 0)])
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_front_has_the_same_bits(p: int, m: int, count: int) -> None:
-    expected = factorised(p, m)
+    expected = factorized(p, m)
     with lent(count) as lenders:
         while not any(lender.made for lender in lenders):
-            assert factorised(p, m) == expected
-    assert factorised(p, m) == expected
+            assert factorized(p, m) == expected
+    assert factorized(p, m) == expected
 
 
-def factorised(p: int, m: int) -> bytes:
+def factorized(p: int, m: int) -> bytes:
     """A front, zeros between what is its own."""
     rng, lead, ld, width = np.random.default_rng(p), -p % fr.LANES, fr.padded(p) + fr.padded(m), fr.padded(m)
     start = fr.SCRATCH + p * ld
@@ -97,7 +97,7 @@ def factorised(p: int, m: int) -> bytes:
     rows[:] = rng.normal(size=(p, p + m))
     rows[:, :p] = np.triu(rows[:, :p] @ rows[:, :p].T + (p + m) * np.eye(p))
     at = fr.SCRATCH + lead
-    assert factor_front(arena, at, ld, p, m, start, width, np.zeros(p), 0, 0, BOARD) == -1
+    assert factor_front(arena, at, ld, p, m, start, width, np.zeros(p), 0, 0, TASK_QUEUE) == -1
     return arena[fr.SCRATCH :].tobytes()
 
 
@@ -177,7 +177,7 @@ def test_who_leaves_is_no_longer_there_and_makes_room_for_others(driven: Solver)
 
 def test_there_is_room_for_so_many_and_no_more() -> None:
     with lent(count_free()), pytest.raises(ValueError, match=f"{MOST} threads lend their cores"):
-        Lender()
+        WorkerThread()
 
 
 @given(st.lists(st.tuples(st.integers(1, 300), st.integers(0, 600)), max_size=60), st.data(), st.integers(1, 3))

@@ -1,4 +1,4 @@
-"""Old variables marginalised: what is left has the estimate and the covariances that it had; memory does not grow."""
+"""Old variables marginalized: what is left has the estimate and the covariances that it had; memory does not grow."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def driven(kind: str, poses: int, mode: str = "bayes-tree", closure: int = 2) ->
 
 
 def oldest(first: int, last: int) -> list[Change]:
-    return [Change("marginalise", keys=np.array([symbol("x", n) for n in range(first, last)]))]
+    return [Change("marginalize", keys=np.array([symbol("x", n) for n in range(first, last)]))]
 
 
 def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
@@ -99,7 +99,7 @@ def test_a_relative_marginal_leaves_its_poses_free_together() -> None:
     np.testing.assert_allclose(covariance(middle, 2, 9), covariance(solver, 2, 9), rtol=1e-5, atol=1e-10)
 
 
-def test_a_border_of_three_is_a_factor_in_pieces_and_marginalising_comes_first() -> None:
+def test_a_border_of_three_is_a_factor_in_pieces_and_marginalizing_comes_first() -> None:
     solver, _ = driven("se2", 20, closure=2)
     solver.stage(Batch(factors=(step("se2", 17, np.random.default_rng(1), 10).factors[1],)))
     solver.step(settle=True)
@@ -128,7 +128,7 @@ def test_landmarks_seen_from_one_pose_that_stays_become_what_it_knows() -> None:
     assert sorted(values(after)) == [symbol("x", 6), symbol("x", 7)]
     for key, (of, row) in values(after).items():
         assert distance(of, row, before[key][1]) < 1e-7
-    kept, *_ = solver.with_changes([Change("marginalise", keys=l[:0])])
+    kept, *_ = solver.with_changes([Change("marginalize", keys=l[:0])])
     assert len(values(kept)) == len(before)
 
 

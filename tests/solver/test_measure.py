@@ -16,7 +16,7 @@ from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
 
-# Nothing is relinearised, so a lot is bent.
+# Nothing is relinearized, so a lot is bent.
 NEVER = Options.of(
     relinearize_next_step_share=1e9,
     relinearize_same_step_share=1e9,

@@ -1,4 +1,4 @@
-"""Variables of any kinds marginalised, with poses, points and features in their border: the rest is what it was."""
+"""Variables of any kinds marginalized, with poses, points and features in their border: the rest is what it was."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -49,7 +49,7 @@ def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:
-    return solver.with_changes([Change("marginalise", keys=np.array(keys))], settle=True)[0]
+    return solver.with_changes([Change("marginalize", keys=np.array(keys))], settle=True)[0]
 
 
 def assert_same(solver: Solver, after: Solver, gone: list[int], settled: float = 1e-9) -> None:
@@ -137,7 +137,7 @@ def test_a_border_is_bounded_and_a_refusal_says_by_what() -> None:
 
 
 class Window:
-    """Of a drive past trees the last poses, and the trees that they see; the others are marginalised now and then."""
+    """Of a drive past trees the last poses, and the trees that they see; the others are marginalized now and then."""
 
     def __init__(self, keep: int, every: int) -> None:
         self.solver, self.rest = Solver(Options()), Solver(Options())
@@ -178,7 +178,7 @@ class Window:
         for tree in [tree for tree, last in self.seen.items() if last < self.first]:
             gone.append(self.names.pop(tree))
             del self.seen[tree]
-        self.solver = self.solver.with_changes([Change("marginalise", keys=np.array(gone))])[0]
+        self.solver = self.solver.with_changes([Change("marginalize", keys=np.array(gone))])[0]
         self.sizes.append(self.solver.memory_bytes())
         self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(self.solver._graph)), 0)
 
@@ -187,7 +187,7 @@ class Window:
 @pytest.mark.parametrize("poses", [600, pytest.param(3000, marks=pytest.mark.data)])
 def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_has_it(poses: int) -> None:
     window = Window(keep=30, every=10)
-    # What was linearised once and for all is off by the square of the noise, which no window can help.
+    # What was linearized once and for all is off by the square of the noise, which no window can help.
     calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sigma_sight_m=0.03)
     for n, step in enumerate(calm(poses, seed=2, tree_share=0.6, sight_share=0.6)):
         window.take(n, step.batch)
@@ -202,7 +202,7 @@ def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_ha
     for key in keys:
         seen, wanted = (relative(of[key][1], end) for of, end in zip((here, there), last, strict=True))
         assert distance("se2", seen, wanted) < 5e-3, "the window is what it is in the whole map"
-    if poses < 1000:  # and where it is there, but for what was linearised once
+    if poses < 1000:  # and where it is there, but for what was linearized once
         sigma = np.sqrt(np.diag(covariance(window.rest, keys))).reshape(-1, 3)
         for key, sure in zip(keys, sigma, strict=True):
             apart = here[key][1] - there[key][1]

@@ -29,7 +29,7 @@ LINEAR = {
     "relinearize_same_step_share": math.inf,
     "relinearize_max_error": math.inf,
     "converged_share": math.inf,
-}  # little is relinearised
+}  # little is relinearized
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
 
 
@@ -90,7 +90,7 @@ def test_above_what_is_near_there_is_only_what_is_near_or_recent(world: str) -> 
     solver, dim, first, looked, alone = Solver(options), 6 if world == "sphere" else 3, 0, 0, 0
     for n, _ in enumerate(drive(solver, (step.batch for step in WORLDS[world](250, 7)))):
         tree = tree_of(solver)
-        if n >= 100 and solver.factor_count - first > 1 and tree.state[tl.S_RELINEARISED] == 0:
+        if n >= 100 and solver.factor_count - first > 1 and tree.state[tl.S_RELINEARIZED] == 0:
             cliques = assert_is_a_tree(solver)
             close = nearest(solver, first, NEAR // dim)
             recent = {
@@ -215,7 +215,7 @@ def test_the_more_an_elimination_takes_the_more_comes_with_it() -> None:
         tree = tree_of(solver)
         F = flops_of(cliques_above({v for v in ends(solver, first) if v < n}, node, clique), clique)
         wanted = max(near * F ** (1 / 3), around * F ** (2 / 3))
-        if n > 100 and wanted < n and tree.state[tl.S_RELINEARISED] == 0:
+        if n > 100 and wanted < n and tree.state[tl.S_RELINEARIZED] == 0:
             assert abs(3 * len(rings(solver)) - wanted) <= 3
             seen.add(near * F ** (1 / 3) > around * F ** (2 / 3))
         first, node, clique = solver.factor_count, tree.node.copy(), tree.clique.copy()
@@ -241,5 +241,5 @@ def test_the_root_is_moved_less_often_the_more_must_be_spent_before() -> None:
     for worth in (0.0, 0.5, 8.0):
         solver = Solver(Options.of(reroot_period=worth))
         states = (tree_of(solver).state for _ in drive(solver, steps("sphere", 700)))
-        moves[worth] = sum(s[tl.S_FLOPS] > 0 and s[tl.S_SPENT] == 0 and s[tl.S_RELINEARISED] == 0 for s in states)
+        moves[worth] = sum(s[tl.S_FLOPS] > 0 and s[tl.S_SPENT] == 0 and s[tl.S_RELINEARIZED] == 0 for s in states)
     assert moves[0.0] > moves[0.5] > moves[8.0] > 0

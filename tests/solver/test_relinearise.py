@@ -1,4 +1,4 @@
-"""Moving linearisation points: whatever moves, its factors are linearised again, each once, and no others."""
+"""Moving linearization points: whatever moves, its factors are linearized again, each once, and no others."""
 
 import copy
 
@@ -10,7 +10,7 @@ from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import tree_at
-from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearise_around
+from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearize_around
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import graph_at
 
@@ -25,7 +25,7 @@ def driven() -> Solver:
 
 
 @pytest.mark.parametrize("picked", [[3], [5, 390], list(range(40, 60)), list(range(1, 400))])
-def test_the_factors_of_some_variables_are_linearised(driven: Solver, picked: list[int]) -> None:
+def test_the_factors_of_some_variables_are_linearized(driven: Solver, picked: list[int]) -> None:
     assert isinstance(driven._stepper, TreeSteps)
     tree, graph = driven._stepper.tree, driven._graph
     count = int(tree.state[tl.S_FACTORS])
@@ -35,7 +35,7 @@ def test_the_factors_of_some_variables_are_linearised(driven: Solver, picked: li
         assert np.ptp(around) >= SPARSE * around.size, "far apart: found by walking"
     right, wrong, copied = tree.hessian.copy(), np.full(tree.hessian.size, np.nan), copy.copy(tree)
     copied.hessian = wrong
-    linearise_around(graph_at(graph.places), tree_at(copied.places), np.array(picked))
+    linearize_around(graph_at(graph.places), tree_at(copied.places), np.array(picked))
     starts = np.append(tree.link[:count, tl.L_AT], tree.state[tl.S_HESSIAN])
     done = [
         f for f in range(count) if np.array_equal(wrong[starts[f] : starts[f + 1]], right[starts[f] : starts[f + 1]])

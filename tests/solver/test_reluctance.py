@@ -6,9 +6,9 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.step import reluctance
 
 
-def test_so_soon_after_a_relinearisation_more_has_to_be_bent() -> None:
+def test_so_soon_after_a_relinearization_more_has_to_be_bent() -> None:
     settings, state = np.zeros(tl.P_SIZE), np.zeros(tl.S_SIZE, np.int64)
-    settings[tl.P_COOLDOWN_STEPS], settings[tl.P_COOLDOWN_FACTOR], state[tl.S_RELINEARISED_AT] = 100, 8.0, 1000
+    settings[tl.P_COOLDOWN_STEPS], settings[tl.P_COOLDOWN_FACTOR], state[tl.S_RELINEARIZED_AT] = 100, 8.0, 1000
     after = {}
     for dear in (1.0, 4.0):  # times what is dear
         settings[tl.P_COOLDOWN_FLOPS] = dear

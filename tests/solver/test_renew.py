@@ -29,9 +29,9 @@ def steps(world: str, poses: int) -> Iterator[Batch]:
 
 
 def kept(before: dict[int, Clique], solver: Solver) -> list[int]:
-    """Cliques that have a variable relinearised in this step, and the frontals and the separator of before."""
+    """Cliques that have a variable relinearized in this step, and the frontals and the separator of before."""
     tree = tree_of(solver)
-    fresh = tree.node[:, tl.N_LINEARISED] == tree.state[tl.S_STEP]
+    fresh = tree.node[:, tl.N_LINEARIZED] == tree.state[tl.S_STEP]
     same = [
         c
         for c, clique in cliques(solver).items()
@@ -56,17 +56,17 @@ def test_renewed_cliques_have_the_numbers_of_the_new_points(world: str, rounds: 
 
 
 @pytest.mark.parametrize("world", ["manhattan", "city_trees"])
-def test_most_of_what_is_relinearised_is_not_ordered_again(world: str) -> None:
-    solver, renewed, relinearised = Solver(Options.of(**OFTEN)), 0, 0
+def test_most_of_what_is_relinearized_is_not_ordered_again(world: str) -> None:
+    solver, renewed, relinearized = Solver(Options.of(**OFTEN)), 0, 0
     for batch in steps(world, 400):
         before = cliques(solver)
         solver.stage(batch)
         solver.step()
         tree = tree_of(solver)
-        fresh = tree.node[: solver.variable_count, tl.N_LINEARISED] == tree.state[tl.S_STEP]
-        relinearised += int(fresh.sum()) if tree.state[tl.S_RELINEARISED] else 0
+        fresh = tree.node[: solver.variable_count, tl.N_LINEARIZED] == tree.state[tl.S_STEP]
+        relinearized += int(fresh.sum()) if tree.state[tl.S_RELINEARIZED] else 0
         renewed += sum(int(fresh[before[c].frontals].sum()) for c in kept(before, solver))
-    assert renewed > 0.6 * relinearised > 100
+    assert renewed > 0.6 * relinearized > 100
 
 
 def test_a_step_refused_while_cliques_are_renewed_leaves_no_trace() -> None:
@@ -133,7 +133,7 @@ def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> Non
     tree.link, tree.stiff, tree.hessian = tree.link[:1].copy(), tree.stiff[:1].copy(), tree.hessian[:121].copy()
 
     def watched(tree: CliqueTree) -> None:
-        if tree.state[tl.S_RELINEARISED] > 0:
+        if tree.state[tl.S_RELINEARIZED] > 0:
             grown.append(1)
         make_room(tree)
 

@@ -261,7 +261,7 @@ def test_why_says_what_a_loss_leaves_of_a_factor(loss: str) -> None:
 
 
 def test_a_point_by_two_pixels_and_a_camera_by_its_points_are_held() -> None:
-    """None of them has anything else that holds it; nothing is factorised to find that out."""
+    """None of them has anything else that holds it; nothing is factorized to find that out."""
     rng = np.random.default_rng(2)
     points = rng.uniform((-1, -1, 4), (1, 1, 6), (6, 3))
     cameras = [boxplus("se3", LEVEL, np.array([0.4 * n, 0, 0, 0, 0.02 * n, 0])) for n in range(3)]
@@ -406,7 +406,7 @@ def test_a_feature_with_a_linear_factor_stays_one() -> None:
     drive_past(solver)
     before = solver.step(settle=True)
     assert solver.ripe(1e9).size == 12
-    after, _, report, _ = solver.with_changes([Change("marginalise", keys=np.array([symbol("x", 0)]))], settle=True)
+    after, _, report, _ = solver.with_changes([Change("marginalize", keys=np.array([symbol("x", 0)]))], settle=True)
     assert sum(len(g.keys) for g in after.graph()[1] if g.kind == "linear_idp") == 12
     assert report.chi2 <= before.chi2 * (1 + 1e-9)
     assert after.ripe(1e9).size == 0

@@ -109,10 +109,10 @@ REFUSED = {
     ),
     "loss with a scale of zero": ("bad_loss", Batch((), (edge(0, 1)._replace(loss="huber", scale=np.zeros(1)),))),
     "variable without value that nothing reaches": (
-        "uninitialised", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
+        "uninitialized", Batch((Variables("se2", np.array([2, 3])),), (edge(1, 2),)),
     ),
     "pose that only a point could place": (
-        "uninitialised",
+        "uninitialized",
         Batch((Variables("se2", np.array([2])),), (seen(2, 100),)),
     ),
     "keys in two dimensions": ("bad_shape", Batch((Variables("se2", np.array([[2]])),))),

@@ -12,7 +12,7 @@ from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.factors import LENS_AT
 from factorbus.solver.kernels.jit.compile import DISABLED
 from factorbus.solver.lenses.layout import LIMIT
-from factorbus.solver.report import Shares
+from factorbus.solver.report import CompileSplit
 
 TIGHT = {"batch_tolerance": 0.0, "incremental_tolerance": 0.0, "chi2_epsilon": 1e-20, "max_iterations": 100}
 
@@ -65,7 +65,7 @@ def test_the_normal_equations_are_the_twins_and_have_the_bits_of_a_fresh_sum(see
     np.testing.assert_allclose(dense, expected, atol=1e-6, rtol=1e-6)
     np.testing.assert_allclose(blocks.eta[: starts[-1]], eta, atol=1e-6)
     kept = blocks.data[: blocks.fill[1]].tobytes(), blocks.eta[: starts[-1]].tobytes()
-    blocks.relinearise(graph, graph.values)
+    blocks.relinearize(graph, graph.values)
     blocks.swap_lambda()
     blocks.swap_eta()
     assert (blocks.data[: blocks.fill[1]].tobytes(), blocks.eta[: starts[-1]].tobytes()) == kept
@@ -180,8 +180,8 @@ def test_folding_batches_into_one_step_gives_the_same_optimum() -> None:
 @pytest.mark.parametrize(
     ("mode", "phases"),
     [
-        ("inc-l", {"linearise", "order", "symbolic", "numeric", "solve"}),
-        ("bayes-tree", {"linearise", "mark", "order", "symbolic", "eliminate", "commit", "substitute"}),
+        ("inc-l", {"linearize", "order", "symbolic", "numeric", "solve"}),
+        ("bayes-tree", {"linearize", "mark", "order", "symbolic", "eliminate", "commit", "substitute"}),
     ],
 )
 def test_the_clock_is_passed_in(mode: str, phases: set[str]) -> None:
@@ -224,8 +224,8 @@ def test_many_factors_are_staged_in_compiled_loops() -> None:
 
 
 def test_shares_of_a_total() -> None:
-    shares = Shares(("order", "eliminate"), [1, 3], 8.0)
+    shares = CompileSplit(("order", "eliminate"), [1, 3], 8.0)
     assert shares == {"order": 2.0, "eliminate": 6.0}
-    assert Shares(("order",), [0], 0.0) == {"order": 0.0}
+    assert CompileSplit(("order",), [0], 0.0) == {"order": 0.0}
     with pytest.raises(KeyError):
         shares["commit"]

@@ -171,7 +171,7 @@ def test_removed_and_back_with_another_or_none(stamp: int | None) -> None:
     assert kept(changed) == wanted | ({} if stamp is None else {last: stamp})
 
 
-@pytest.mark.parametrize("change", ["remove_variables", "marginalise"])
+@pytest.mark.parametrize("change", ["remove_variables", "marginalize"])
 def test_what_goes_takes_its_stamp(change: str) -> None:
     solver = fed(line())
     gone = np.array([symbol("x", 2), symbol("x", 3)])
@@ -217,7 +217,7 @@ def test_copies_have_them(mode: str) -> None:
     other, renewed, anew = (Solver(Options(mode=mode)) for _ in range(3))
     other.load(solver.dump())
     renewed.renew(solver, solver.variable_count, solver.factor_count)
-    anew.load(solver.dump() | {"lanes": 0})
+    anew.load(solver.dump() | {"executors": 0})
     for made in (other, renewed, anew):
         assert kept(made) == wanted
 

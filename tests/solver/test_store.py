@@ -107,7 +107,7 @@ def test_what_a_drive_leaves_free_is_used_again() -> None:
             used = blocks_of(tree)
             check_tiling(used, tree.numbers, tree.state)
             most = (int(tree.state[tl.S_NUMBERS]) - fr.SCRATCH) / sum(size for _, size in used)
-    # A relinearisation of everything has the old and the new at once, which are two.
+    # A relinearization of everything has the old and the new at once, which are two.
     assert most < 2.1
     kept = solver.dump()["_stepper"]["_tree"]["numbers"]
     assert kept.size == tree.state[tl.S_NUMBERS] < tree.numbers.size

@@ -1,4 +1,4 @@
-"""The tree of cliques keeps R, d and δ of its linearisation points, whatever was affected, split or moved."""
+"""The tree of cliques keeps R, d and δ of its linearization points, whatever was affected, split or moved."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -38,8 +38,8 @@ class Whole:
     factors: list[FactorGroup]
 
 
-def linearised(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
-    """A dense graph at the linearisation points, which shares no code with the solver, and δ."""
+def linearized(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
+    """A dense graph at the linearization points, which shares no code with the solver, and δ."""
     tree, graph, dense = tree_of(solver), solver._graph, DenseGraph()
     variables, factors = solver.graph()
     dense.add(Whole(variables, factors))
@@ -70,7 +70,7 @@ def follow(steps: Iterable[Batch], **options) -> Solver:
 def test_delta_is_the_dense_solution_in_maps_of_all_kinds(seed: int, way: str) -> None:
     solver = follow(random_steps(seed, steps=12), **WAYS[way])
     assert solver.factor_count > 60
-    dense, delta = linearised(solver)
+    dense, delta = linearized(solver)
     information, eta = dense.system()
     assert_is_solution(solver, information, eta, dense.chi2(), delta, least=2e-8)
 
@@ -205,7 +205,7 @@ def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
 
 
 def test_a_long_drive_does_not_drift() -> None:
-    """δ after 10,000 steps is that of R made at once, at the same linearisation points."""
+    """δ after 10,000 steps is that of R made at once, at the same linearization points."""
     solver = Solver(Options.of(**EXACT))
     for step in manhattan(10_000, 5):
         solver.stage(step.batch)

@@ -1,4 +1,4 @@
-"""When bent variables are relinearised: all that wait together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
+"""When bent variables are relinearized: all that wait together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
 
 from collections.abc import Iterator
 
@@ -41,15 +41,15 @@ def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[tuple[CliqueTree, 
 @pytest.mark.parametrize("world", [manhattan, city_trees])
 def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
     options = Options.of(relinearize_same_step_share=np.inf, converged_share=np.inf)
-    solver, waited, relinearised, largest = Solver(options), 0, 0, 0.0
+    solver, waited, relinearized, largest = Solver(options), 0, 0, 0.0
     for tree, before, due in drive(solver, (step.batch for step in world(700, 11))):
         if due:
-            assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
-            relinearised += 1
+            assert (tree.node[before, tl.N_LINEARIZED] == tree.state[tl.S_STEP]).all()
+            relinearized += 1
         waited += waiting(tree).size > 0 and not tree.state[tl.S_DUE]
         share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
         rested = options.tuning.relinearize_cooldown_steps / max(
-            tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARISED_AT], 1
+            tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARIZED_AT], 1
         )
         most = options.tuning.relinearize_next_step_share * min(
             max(rested**2, 1.0), options.tuning.relinearize_cooldown_factor
@@ -60,7 +60,7 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             largest = max(largest, share / most)
-    assert relinearised > 3
+    assert relinearized > 3
     assert waited > 10
     assert largest > 0.1
 
@@ -100,7 +100,7 @@ def test_nothing_waits_longer_than_patience() -> None:
     since: dict[int, int] = {}
     longest = 0
     for n, (tree, _, _) in enumerate(drive(solver, (step.batch for step in manhattan(400, 11)))):
-        fresh = tree.node[:, tl.N_LINEARISED] == tree.state[tl.S_STEP]
+        fresh = tree.node[:, tl.N_LINEARIZED] == tree.state[tl.S_STEP]
         since = {v: n if fresh[v] else since.get(v, n) for v in waiting(tree).tolist()}
         longest = max([longest, *(n - first for first in since.values())])
     assert patience // 2 < longest <= patience + 1
@@ -112,7 +112,7 @@ def test_what_is_bent_far_does_not_wait() -> None:
     solver, found = Solver(Options.of(**{**NEVER, "relinearize_max_error": limit})), 0
     for tree, before, due in drive(solver, (step.batch for step in manhattan(400, 11))):
         if due:
-            assert (tree.node[before, tl.N_LINEARISED] == tree.state[tl.S_STEP]).all()
+            assert (tree.node[before, tl.N_LINEARIZED] == tree.state[tl.S_STEP]).all()
         worst = np.sqrt(tree.stiff[: tree.state[tl.S_FACTORS], tl.B_COUNTED].max(initial=0.0)) / tree.account[tl.A_UNIT]
         assert worst <= limit or tree.state[tl.S_DUE]
         found += bool(tree.state[tl.S_DUE])

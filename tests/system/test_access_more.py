@@ -167,13 +167,13 @@ def test_no_listening_beyond_this_machine_without_protection(endpoint: str) -> N
 def test_protection_has_three_parts_and_all_are_wanted(tmp_path: Path) -> None:
     secured = Secured(tmp_path)
     whole = json.loads(secured.server.read_text())
-    lacking = {
+    missing = {
         "certificate": whole
         | {"transport": {"link": {"tls": whole["transport"]["link"]["tls"] | {"enable_mtls": False}}}},
         "access control": whole | {"access_control": whole["access_control"] | {"enabled": False}},
         "denies by default": whole | {"access_control": whole["access_control"] | {"default_permission": "allow"}},
     }
-    for what, configuration in lacking.items():
+    for what, configuration in missing.items():
         (tmp_path / "less.json5").write_text(json.dumps(configuration))
         ran = serve("--listen", "tls/0.0.0.0:0", "--zenoh", str(tmp_path / "less.json5"))
         assert (ran.returncode, what in ran.stderr) == (2, True), ran.stderr

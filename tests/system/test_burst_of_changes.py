@@ -55,21 +55,21 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
     ):
         fill(changer, 2000)
         changes = [Changes().fix("x900") if n % 2 == 0 else Changes().free("x900") for n in range(BURST)]
-        tickets = [changer.send(Batch(), changes=each) for each in changes]
-        tickets[0].result(PATIENCE_S)
+        pending_inserts = [changer.send(Batch(), changes=each) for each in changes]
+        pending_inserts[0].result(PATIENCE_S)
         passed = []
         for n in range(10):
             before = bystander.stats()["revision"]
             passed.append(bystander.insert(tiny(n)).revision - before - 1)
-        assert not tickets[-1].done(), "else nothing was waited for"
+        assert not pending_inserts[-1].done(), "else nothing was waited for"
         # The one under way; and those between the answer to the question and the arrival of the insert.
         assert np.median(passed) <= 2, f"{passed} changes were made between an insert and its answer"
-        for ticket in tickets:
-            ticket.result(10 * PATIENCE_S)
+        for pending_insert in pending_inserts:
+            pending_insert.result(10 * PATIENCE_S)
         stats = bystander.stats()
         assert stats["inserts"]["accepted"] == 20 + BURST + 10
         assert stats["inserts"]["busy"] > 0, "of the burst no more than `limits.changes` wait at a time"
-        assert stats["journal"]["snapshot_fold"] == 0, "no change has a snapshot of its own"
+        assert stats["journal"]["snapshot_record"] == 0, "no change has a snapshot of its own"
 
 
 @pytest.mark.timeout(900)
@@ -86,8 +86,8 @@ def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
         loops = fill(changer, 2000)
         begun = changer.stats()["revision"]
         chosen = np.resize(loops, BURST).tolist()
-        tickets = [changer.send(Batch(), changes=Changes().loss([each], "huber", 1.5)) for each in chosen]
-        reports = [ticket.result(PATIENCE_S) for ticket in tickets]
+        pending_inserts = [changer.send(Batch(), changes=Changes().loss([each], "huber", 1.5)) for each in chosen]
+        reports = [pending_insert.result(PATIENCE_S) for pending_insert in pending_inserts]
         revisions = np.array([begun, *(each.revision for each in reports)])
         assert (np.diff(revisions) > 0).all(), "each is a step of its own; further steps may lie between"
         assert {each.report["strategy"] for each in reports} <= {"tree", "extend"}
@@ -98,7 +98,7 @@ def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
         for group in asked.variables:
             for key, row in zip(group.keys.tolist(), group.values, strict=True):
                 assert viewer.estimate[key].tobytes() == row.tobytes()
-        assert viewer.stats()["journal"]["snapshot_fold"] == 0
+        assert viewer.stats()["journal"]["snapshot_record"] == 0
 
 
 @pytest.mark.timeout(900)
@@ -123,25 +123,25 @@ def test_killed_in_the_middle_of_changes_none_that_was_answered_is_lost_and_none
             change = Changes().weigh([each], weight)
             plan.append(change.loss([each], "huber", 2.0) if n % 3 == 0 else change)
         chance.shuffle(plan)
-        tickets, sent = [], 0
+        pending_inserts, sent = [], 0
         for kill in range(6):
             for each in plan[sent : sent + len(plan) // 6 + 1]:
-                tickets.append(changer.send(Batch(), changes=each, timeout_s=PATIENCE_S))
-                if len(tickets) % 11 == 10:
-                    tickets.append(changer.send(tiny(len(tickets)), timeout_s=PATIENCE_S))
+                pending_inserts.append(changer.send(Batch(), changes=each, timeout_s=PATIENCE_S))
+                if len(pending_inserts) % 11 == 10:
+                    pending_inserts.append(changer.send(tiny(len(pending_inserts)), timeout_s=PATIENCE_S))
             sent += len(plan) // 6 + 1
             time.sleep(chance.uniform(0.0, 0.1))  # the moments are what this is about
-            answered = [ticket for ticket in tickets if ticket.done()]
+            answered = [pending_insert for pending_insert in pending_inserts if pending_insert.done()]
             running.end(signal.SIGKILL)
             running.start()
             revision = changer.ask_estimate().revision
-            assert all(ticket.result(0).revision <= revision for ticket in answered), f"kill {kill}"
+            assert all(pending_insert.result(0).revision <= revision for pending_insert in answered), f"kill {kill}"
         changer.flush(PATIENCE_S)
         found = {int(i): g.information[n] for g in changer.graph().batch.factors for n, i in enumerate(g.ids)}
         assert not set(gone) & set(found)
         for each, factor in times.items():
             np.testing.assert_array_equal(found[each], base[each] * factor)
-        estimate, count = changer.ask_estimate(), len(tickets) + 4
+        estimate, count = changer.ask_estimate(), len(pending_inserts) + 4
         stats = changer.stats()
         assert stats["variables"] == 400 + sum(n % 11 == 10 for n in range(count))
     running.end(signal.SIGKILL)

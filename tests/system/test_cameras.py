@@ -18,7 +18,7 @@ def test_features_become_points_while_a_mirror_follows(endpoint: str) -> None:
         other.map("sights") as watched,
     ):
         far = Far(joined)
-        front = FrontEnd(monocular(40, 4, points=80), far, points_below=0.1, every=10)
+        front = FrontEnd(monocular(40, 4, points=80), far, convert_below=0.1, every=10)
         front.run()
         graph = joined.graph().batch
         counts = {group.kind: len(group.keys) for group in graph.variables if not group.fixed}

@@ -145,7 +145,7 @@ def test_a_marginal_of_many_poses_is_there_again_after_a_kill(spawn: Callable[..
         drive(joined, 0, 12)
         joined.settle()
         settled = {name: joined.estimate[name] for name in ("x5", "x8", "x11")}
-        done = joined.change(Changes().marginalise("x1", "x2", "x3", "x4"), settle=True)
+        done = joined.change(Changes().marginalize("x1", "x2", "x3", "x4"), settle=True)
         assert done.report["added_factors"] > 3 * 4, "pieces on four poses"
         for name, value in settled.items():
             np.testing.assert_allclose(joined.estimate[name], value, rtol=0, atol=1e-9)

@@ -14,7 +14,7 @@ from processes import PATIENCE_S
 from turned import LONG, SHORT, Deltas, closing, in_one, optimum, prepare, turn
 
 from factorbus.client import Bus, Draft, Map, aio, connect
-from factorbus.journal.records import Fold
+from factorbus.journal.records import JournalRecord
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
 from factorbus.service.journal.library import make_folder
@@ -206,9 +206,9 @@ def test_killed_while_it_goes_on_it_comes_to_the_same_bits(
             ends.append(state(joined))
         running.end(signal.SIGTERM)
     assert ends[0] == ends[1]
-    folds = again(tmp_path / "stopped" / "m2")
-    assert all(same for _, same in folds), "from the first insert on, too"
-    total = sum(fold.further for fold, _ in folds)
+    records = again(tmp_path / "stopped" / "m2")
+    assert all(same for _, same in records), "from the first insert on, too"
+    total = sum(record.further for record, _ in records)
     assert total == ends[0][0] - 2
     assert 0 < written[0] <= written[1] <= written[2]
     assert written[0] < total, "it was stopped in the middle"
@@ -217,13 +217,13 @@ def test_killed_while_it_goes_on_it_comes_to_the_same_bits(
 def further_in(journal: Path) -> int:
     store = open_store(journal, read_only=True)
     try:
-        return sum(fold.further for fold in store.folds())
+        return sum(record.further for record in store.records())
     finally:
         store.close()
 
 
-def again(journal: Path) -> list[tuple[Fold, bool]]:
-    """All that is in a journal, folded again; each with whether it had the same bits."""
+def again(journal: Path) -> list[tuple[JournalRecord, bool]]:
+    """All that is in a journal, applied again; each with whether it had the same bits."""
     store = open_store(journal, read_only=True)
     try:
         header = store.header()

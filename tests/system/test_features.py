@@ -49,7 +49,7 @@ def worker(spawn: Spawn, client: Bare, endpoint: str, name: str) -> Process:
 def measured(client: Bare, name: str) -> None:
     """Until the service knows the way to a worker: its stats are answered while it measures, in turns."""
     rows = iter(lambda: client.stats("m")["workers"], None)
-    assert next(row for table in rows for row in table if row["name"] == name and "trip_ms" in row)
+    assert next(row for table in rows for row in table if row["name"] == name and "latency_ms" in row)
 
 
 def answer(client: Bare, ask: Ask) -> Answer:

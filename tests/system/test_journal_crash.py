@@ -59,8 +59,8 @@ def test_killed_at_any_moment_nothing_answered_is_lost_and_nothing_is_done_twice
         stream.join(PATIENCE_S)
         driven.wait_converged(PATIENCE_S)
         assert not stream.fault
-        assert stream.acknowledged == {ticket.sequence for ticket in stream.tickets}
-        sent, estimate = len(stream.tickets), driven.ask_estimate()
+        assert stream.acknowledged == {pending_insert.sequence for pending_insert in stream.pending_inserts}
+        sent, estimate = len(stream.pending_inserts), driven.ask_estimate()
         stats = driven.stats()
         assert stats["epoch"] == driven.epoch, "the map is the one that was joined"
         assert stats["variables"] == sent
@@ -72,7 +72,7 @@ def test_killed_at_any_moment_nothing_answered_is_lost_and_nothing_is_done_twice
     assert rows(estimate.variables) == whole, "to the bit what a run without interruption gives"
     print(
         f"{mode}, window {window}: {kills} kills and {kills // 5} while it started; {sent} inserts, each there once, "
-        f"in {len(groups)} folds; ready again after {np.median(back_s):.2f} s, at most {max(back_s):.2f} s"
+        f"in {len(groups)} records; ready again after {np.median(back_s):.2f} s, at most {max(back_s):.2f} s"
     )
     assert mirrored == sorted_columns(estimate)
 

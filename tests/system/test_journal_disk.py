@@ -88,11 +88,11 @@ class Events:
 
 
 def health(bus: Bus, name: str) -> tuple[bool, bool, str, list[str]]:
-    """alive, ready, the journal's problem, and what is lacking."""
+    """alive, ready, the journal's problem, and what is missing."""
     account = next(row for row in bus.stats() if any(each["name"] == name for each in row["maps"]))
     journal = next(each["journal"] for each in account["maps"] if each["name"] == name)
     assert journal["blocked"] == bool(journal["problem"])
-    return account["alive"], account["ready"], journal["problem"], account["lacking"]
+    return account["alive"], account["ready"], journal["problem"], account["missing"]
 
 
 def check_refused(endpoint: str, name: str) -> None:
@@ -125,10 +125,10 @@ def test_nothing_is_lost_when_the_disk_takes_nothing_for_a_while(
         stream.allow(AFTER)
         events.wait_for("blocked")
         check_refused(endpoint, "m2")
-        alive, ready, problem, lacking = running.eventually(lambda: health(bus, "m2"), lambda seen: not seen[1])
+        alive, ready, problem, missing = running.eventually(lambda: health(bus, "m2"), lambda seen: not seen[1])
         assert (alive, ready) == (True, False)
         assert "cannot be written" in problem
-        assert any("map m2 takes nothing" in each for each in lacking)
+        assert any("map m2 takes nothing" in each for each in missing)
         answered = set(stream.acknowledged)
         there = {int(key) for group in driven.ask_estimate().variables for key in group.keys}
         assert {int(k) for n in answered for g in batches[n - 1].variables for k in g.keys} <= there

@@ -220,7 +220,7 @@ def test_losses_marginals_and_asyncio(endpoint: str) -> None:
                         step.se2(f"x{i}").between_se2(f"x{i - 1}", f"x{i}", (1, 0.1, 0.4), sigmas=SIGMAS)
                     step.between_se2("x1", "x5", (1.9, 2.7, 1.7), sigmas=SIGMAS, loss=("huber", 1.0))
                     await joined.insert(step, settle=True)
-                await second.change(Changes().marginalise("x3"), settle=True)
+                await second.change(Changes().marginalize("x3"), settle=True)
                 before = {
                     int(k): r
                     for g in (await second.ask_estimate()).variables

@@ -93,8 +93,8 @@ def test_verify_says_from_where_on_a_journal_gives_something_else(
     running.end(signal.SIGTERM)
     assert factorbus("journal", "verify", "hall", "--journal", str(journal))[0] == 0
     for change, code, words in (
-        ("UPDATE fold SET chain = zeroblob(16) WHERE number = 40", 1, "values differ from revision 40 on (of 60)"),
-        ("UPDATE fold SET revision = revision + 1 WHERE number = 40", 5, "led to revision 41, and leads to 40"),
+        ("UPDATE record SET chain = zeroblob(16) WHERE number = 40", 1, "values differ from revision 40 on (of 60)"),
+        ("UPDATE record SET revision = revision + 1 WHERE number = 40", 5, "led to revision 41, and leads to 40"),
         ("UPDATE entry SET message = zeroblob(9) WHERE number = 40", 5, "is not what was written"),
     ):
         shutil.copytree(journal, tmp_path / "changed")

@@ -138,7 +138,7 @@ OUTSIDE: list[tuple[str, str, Any, str, str]] = [
     ("insert", "sequence", 2**63, "bad_message", "sequence"),
     ("insert", "epoch", -1, "bad_message", "epoch"),
     ("insert", "epoch", 2**63, "bad_message", "epoch"),
-    *[("insert", "points_below", bad, "bad_option", "insert.points_below") for bad in (NAN, INF, -1, -TINY)],
+    *[("insert", "convert_below", bad, "bad_option", "insert.convert_below") for bad in (NAN, INF, -1, -TINY)],
     *[("ask/gate", "probability", p, "bad_option", "question.probability") for p in (0, 1, -1, NAN, INF, 1e-300, TINY)],
     *[("ask/repair", "probability", p, "bad_option", "question.probability") for p in (0, 1.0, NAN, 1e-300, TINY)],
     *[("ask/associate", "probability", p, "bad_option", "question.probability") for p in (0.0, 1, 1e300, -INF, TINY)],

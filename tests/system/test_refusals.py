@@ -92,7 +92,7 @@ CASES = {
         "unknown_variable",
     ),
     "nothing holds it": (variable(Variables("se2", keys_of("x9"), np.zeros((1, 3)))), "underconstrained"),
-    "no value and no way to one": (variable(Variables("se2", keys_of("x9"))), "uninitialised"),
+    "no value and no way to one": (variable(Variables("se2", keys_of("x9"))), "uninitialized"),
     "too large": (variable(Variables("se2", np.arange(10_000), np.zeros((10_000, 3)))), "too_large"),
     "too many containers": (raw(Batch(), lambda m: m.update(more=[[[[]]] * 250] * 250)), "too_large"),
     "another epoch": (codec.encode_insert(Insert(1, pose("x3", "x2"), epoch=12345)), "wrong_epoch"),

@@ -85,7 +85,7 @@ def test_many_in_one_insert_and_large_ones_are_as_small_ones(endpoint: str, join
 
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
-def test_undone_marginalised_removed_and_brought_back(endpoint: str, mode: str) -> None:
+def test_undone_marginalized_removed_and_brought_back(endpoint: str, mode: str) -> None:
     with (
         connect(endpoint, client="timed", timeout_s=PATIENCE_S) as bus,
         bus.map(f"edited-stamps-{mode}", mode) as joined,
@@ -95,7 +95,7 @@ def test_undone_marginalised_removed_and_brought_back(endpoint: str, mode: str) 
         joined.change(Changes().undo(*sent[-1]))
         del wanted["x11"]
         everywhere(endpoint, joined, wanted)
-        joined.change(Changes().marginalise(["x4", "x5"]))
+        joined.change(Changes().marginalize(["x4", "x5"]))
         del wanted["x4"], wanted["x5"]
         everywhere(endpoint, joined, wanted)
         again = Draft().se2("x11", stamp=5).between_se2("x10", "x11", (1, 0, 0), sigmas=SIGMAS)

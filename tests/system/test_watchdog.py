@@ -136,7 +136,7 @@ def test_a_stuck_solver_is_not_alive_and_comes_back(
         manager.hear("WATCHDOG=1")
         assert (port.get("live"), port.get("ready")) == ((200, "ok\n"), (200, "ok\n"))
         stuck.touch()
-        ticket = kitchen.send(point("l9"))
+        pending_insert = kitchen.send(point("l9"))
         assert port.until("live", 503) == "stuck: solver kitchen\n"
         assert port.get("ready")[0] == 503
         assert manager.silent_of("WATCHDOG=1", 1.5)
@@ -151,9 +151,9 @@ def test_a_stuck_solver_is_not_alive_and_comes_back(
         assert (told.returncode, "stuck: solver kitchen" in told.stdout) == (1, True)
         assert "stuck: solver kitchen" in doctor(endpoint)
         assert hall.insert(Draft().se2("x0", (0, 0, 0), fixed=True)).revision == 1, "the other map goes on"
-        assert not ticket.done()
+        assert not pending_insert.done()
         stuck.unlink()
-        assert ticket.result(60).sequence
+        assert pending_insert.result(60).sequence
         port.until("live", 200)
         manager.hear("WATCHDOG=1")
         assert port.metrics()[("factorbus_alive",)] == 1

@@ -40,7 +40,7 @@ class Bench:
         name = f"w_{fault}"
         self.workers.tell(f"{name} {fault}")
         self.workers.line(f"born {name}")
-        next(True for row in self.rows(name) if "trip_ms" in row or row["distrusted"] or fault == "only_batch")
+        next(True for row in self.rows(name) if "latency_ms" in row or row["distrusted"] or fault == "only_batch")
         return name
 
     def rows(self, name: str) -> Iterator[dict]:

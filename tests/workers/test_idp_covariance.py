@@ -204,7 +204,7 @@ def turned(turn: np.ndarray) -> np.ndarray:
 
 
 def test_monte_carlo_agrees_with_the_predicted_covariance_of_the_ray() -> None:
-    """20,000 initialisations of one feature with the noise that P and Padd describe."""
+    """20,000 initializations of one feature with the noise that P and Padd describe."""
     rng = np.random.default_rng(12)
     sighting, P = random_sighting(12, 1)
     P = 1e-4 * P  # small enough that the feature is linear in its causes

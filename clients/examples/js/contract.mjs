@@ -2,7 +2,7 @@
 
 /** Fields of type float, §4, §8, §15 and §16; phases_ms is a map of floats. */
 export const FLOATS = new Set([
-  "chi2", "batch", "seconds", "points_below", "retry_after_s", "timeout_s", "probability", "distance", "threshold",
+  "chi2", "batch", "seconds", "convert_below", "retry_after_s", "timeout_s", "probability", "distance", "threshold",
   "rho", "sigma_rho", "sigma_pixel", "influence", "without", "pivot", "conditioning", "residual", "weighted",
   "chi2_before", "damping", "step_ms", "solver_ms", "value", "sigmas", "covariance",
 ]);

@@ -7,6 +7,8 @@
 `factorbus.client.aio` is the same for asyncio.  Light: numpy, msgpack and zenoh, no compiler.
 """
 
+from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
+
 from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
@@ -15,7 +17,6 @@ from factorbus.client.grown import Factored, Grown
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror, Snapshot
-from factorbus.client.ticket import NoAnswerYet, Ticket
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 
@@ -42,7 +43,7 @@ __all__ = [
     "Problem",
     "Refused",
     "Snapshot",
-    "Ticket",
+    "PendingInsert",
     "Unavailable",
     "connect",
 ]

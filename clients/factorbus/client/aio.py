@@ -17,10 +17,11 @@ from contextlib import asynccontextmanager
 from os import PathLike
 from typing import Any
 
+from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
-from factorbus.client.aio_uncertainty import Doubt
+from factorbus.client.aio_uncertainty import Uncertainty
 from factorbus.client.arguments import of_type, seconds
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
@@ -33,7 +34,6 @@ from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import logged
 from factorbus.client.stream import DeltaStream
-from factorbus.client.ticket import NoAnswerYet, Ticket
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, Graph
@@ -130,7 +130,7 @@ class Map:
         self._map = joined
         self._room = asyncio.Semaphore(window)
         self._loop = asyncio.get_running_loop()
-        self.doubt = Doubt(joined.doubt.ask)
+        self.doubt = Uncertainty(joined.doubt.ask)
 
     @property
     def name(self) -> str:
@@ -152,13 +152,13 @@ class Map:
         batch: Batch | Draft,
         *,
         settle: bool = False,
-        points_below: float = 0.0,
+        convert_below: float = 0.0,
         changes: Changes | None = None,
         timeout_s: float | None = None,
     ) -> Accepted:
         """Make `changes`, add `batch` and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
         timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)  # refused before anything is sent
-        sent = await self.send(batch, settle=settle, points_below=points_below, changes=changes)
+        sent = await self.send(batch, settle=settle, convert_below=convert_below, changes=changes)
         return await self.result(sent, timeout_s)
 
     async def settle(self, timeout_s: float | None = None) -> Accepted:
@@ -195,26 +195,26 @@ class Map:
         batch: Batch | Draft,
         *,
         settle: bool = False,
-        points_below: float = 0.0,
+        convert_below: float = 0.0,
         changes: Changes | None = None,
-    ) -> Ticket:
+    ) -> PendingInsert:
         """Send `batch`; waits only while the window is full."""
         await self._room.acquire()
         try:
-            ticket = self._map.send(batch, settle=settle, points_below=points_below, changes=changes)
+            pending_insert = self._map.send(batch, settle=settle, convert_below=convert_below, changes=changes)
         except BaseException:
             self._room.release()
             raise
-        ticket.errand.future.add_done_callback(lambda _: self._on_loop(self._room.release))
-        return ticket
+        pending_insert.request.future.add_done_callback(lambda _: self._on_loop(self._room.release))
+        return pending_insert
 
-    async def result(self, ticket: Ticket, timeout_s: float | None = None) -> Accepted:
+    async def result(self, pending_insert: PendingInsert, timeout_s: float | None = None) -> Accepted:
         """The answer to what was sent.  Raises Refused, NoAnswerYet."""
         timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)
         try:
-            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(ticket.future)), timeout_s)
+            return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(pending_insert.future)), timeout_s)
         except TimeoutError:
-            raise NoAnswerYet(ticket, timeout_s) from None
+            raise NoAnswerYet(pending_insert, timeout_s) from None
 
     async def flush(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered.  Raises Unavailable, and the first refusal nobody has looked at."""
@@ -276,7 +276,7 @@ class Map:
     async def deltas(self) -> AsyncIterator[Delta]:
         """Every change of the estimate from now on, without end.
 
-        A delta whose `previous` is 0 holds the whole estimate: after a resynchronisation, or when this loop fell
+        A delta whose `previous` is 0 holds the whole estimate: after a resynchronization, or when this loop fell
         too far behind.
         """
         ready = asyncio.Event()

@@ -9,16 +9,16 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key
-from factorbus.client.uncertainty import DoubtQuestions, asked_why, factors_of, matrix_of, paired, sightings
+from factorbus.client.uncertainty import UncertaintyQuestions, asked_why, factors_of, matrix_of, paired, sightings
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
 from factorbus.proto.messages import Batch, Factors
 
 
-class Doubt:
-    """Questions and their answers, as in `factorbus.client.uncertainty.Doubt`."""
+class Uncertainty:
+    """Questions and their answers, as in `factorbus.client.uncertainty.Uncertainty`."""
 
-    def __init__(self, ask: DoubtQuestions) -> None:
+    def __init__(self, ask: UncertaintyQuestions) -> None:
         self._ask = ask
 
     async def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:

@@ -6,8 +6,9 @@ from numbers import Integral
 from os import PathLike
 from typing import Any
 
+from factorbus.client.sender import Request, RequestSender
+
 from factorbus.client.arguments import flag, of_type, seconds
-from factorbus.client.courier import Courier, Errand
 from factorbus.client.features import Features
 from factorbus.client.gathering import gather
 from factorbus.client.link import Link, open_link
@@ -51,7 +52,7 @@ class Bus:
     def __init__(self, link: Link, client: str, timeout_s: float) -> None:
         self.client, self.timeout_s = client, timeout_s
         self._link = link
-        self._courier = Courier(link)
+        self._sender = RequestSender(link)
         self._maps: list[Map] = []
         self._features: list[Features] = []
 
@@ -73,7 +74,7 @@ class Bus:
             raise BadOption("window", str(window), "a whole number, 1 or more")
         joined = Map(
             self._link,
-            self._courier,
+            self._sender,
             self.client,
             self.timeout_s,
             window,
@@ -100,7 +101,7 @@ class Bus:
         of_type("camera", camera, Camera, "a Camera")
         made = Features(
             self._link,
-            self._courier,
+            self._sender,
             self.timeout_s,
             camera,
             rho=rho,
@@ -171,15 +172,15 @@ class Bus:
         """Leave all maps and the bus.  What is unanswered fails with Unavailable."""
         for opened in (*self._maps, *self._features):
             opened.close()
-        self._courier.close()
+        self._sender.close()
         self._link.close()
 
     def _existing(self, name: str) -> MapRow:
         """As the map tells of itself: who may only ask a map need not be allowed to list all of them."""
         what = f"map {name!r}, asked for its stats,"
-        asked = Errand(what, keys.ask_key(name, "stats"), codec.encode_map({}), _row, self.timeout_s)
+        asked = Request(what, keys.ask_key(name, "stats"), codec.encode_map({}), _row, self.timeout_s)
         try:
-            return self._courier.carry(asked).future.result()
+            return self._sender.carry(asked).future.result()
         except Refused as refused:
             raise self._named(name, refused) from None
 
@@ -195,8 +196,8 @@ class Bus:
     def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
         timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
         what = f"the service, asked for admin/{operation},"
-        errand = Errand(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
-        return self._courier.carry(errand).future.result()
+        request = Request(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
+        return self._sender.carry(request).future.result()
 
 
 def _rows(data: bytes) -> list[MapRow]:

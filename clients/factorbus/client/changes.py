@@ -76,14 +76,14 @@ class Changes:
         """These variables are estimated again."""
         return self._add(Change("free", keys=_keys(keys)))
 
-    def marginalise(self, *keys: Key | Sequence[Key]) -> Changes:
+    def marginalize(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables go; what their factors say of the others is kept, as linear factors.
 
         Refused (too_connected) where what hangs together shares factors with more than 128 variables that stay.  Before
         any loss, weigh or place of the same insert.  What is kept of more than two variables is one factor in pieces:
         they stay or go together (else not_positive_definite).
         """
-        return self._add(Change("marginalise", keys=_keys(keys)))
+        return self._add(Change("marginalize", keys=_keys(keys)))
 
     def place(self, groups: Iterable[Variables], carry: bool = False) -> Changes:
         """Variables go to the values in `groups`, as in an estimate; the map goes on from there.

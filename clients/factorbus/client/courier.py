@@ -3,7 +3,7 @@
 While there has been nothing but silence, it looks whether the services that are there speak another version of the
 protocol, and then gives up at once; not once somebody has answered: that service may be on its way back.
 
-The first try goes out on the caller's thread, for latency; later ones on the courier's own thread, because a
+The first try goes out on the caller's thread, for latency; later ones on the sender's own thread, because a
 callback of the bus must not call the bus.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from factorbus.client.link import Link
-from factorbus.client.promise import Promise
+from factorbus.client.promise import InterruptibleFuture
 from factorbus.client.replies import Again, Reply, Silence, judge
 from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import ClosedHere, Problem, Refused, Unavailable
@@ -27,12 +27,12 @@ TRY_S = 5.0
 _SILENT, _LOOK_AGAIN_S = 3, 2.0
 
 
-class Errand:
+class Request:
     """One question or insert on its way: its future, and when it went and came back (time.perf_counter seconds).
 
-    timeout_s: give up with Unavailable after so long; None: keep trying until the courier is closed.
+    timeout_s: give up with Unavailable after so long; None: keep trying until the sender is closed.
     passing: which refusals will not last, so that it is sent again (besides busy and shutting_down).
-    then: called with (errand, answer or Problem) right before those who wait for the future are woken.
+    then: called with (request, answer or Problem) right before those who wait for the future are woken.
     """
 
     def __init__(
@@ -43,44 +43,44 @@ class Errand:
         decode: Callable[[bytes], Any],
         timeout_s: float | None = None,
         passing: Callable[[Refused], bool] | None = None,
-        then: Callable[["Errand", Any], None] | None = None,
+        then: Callable[["Request", Any], None] | None = None,
     ) -> None:
         self.what, self.key, self.payload, self.decode = what, key, payload, decode
         self.passing, self.then = passing, then
         self.deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        self.future: Promise[Any] = Promise()
+        self.future: InterruptibleFuture[Any] = InterruptibleFuture()
         self.attempt = 0
         self.because = "the first try is out"
         self.sent_at = self.answered_at = 0.0
 
 
-class Courier:
-    """All errands of one bus."""
+class RequestSender:
+    """All requests of one bus."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._due: list[tuple[float, int, Errand]] = []
+        self._due: list[tuple[float, int, Request]] = []
         self._order = itertools.count()
-        self._open: set[Errand] = set()
+        self._open: set[Request] = set()
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
         self._changed = threading.Condition(self._lock)
         self._closed = False
         self._heard = False  # somebody has answered here, if only with a problem
         self._look_at = 0.0
-        self._thread = threading.Thread(target=self._run, name="factorbus-courier", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="factorbus-sender", daemon=True)
         self._thread.start()
 
-    def carry(self, errand: Errand) -> Errand:
-        """Send `errand`; its future gets `decode(answer)`, or a Problem."""
+    def carry(self, request: Request) -> Request:
+        """Send `request`; its future gets `decode(answer)`, or a Problem."""
         with self._lock:
-            self._open.add(errand)
+            self._open.add(request)
             closed = self._closed
-        errand.sent_at = time.perf_counter()
+        request.sent_at = time.perf_counter()
         if closed:
-            self._finish(errand, ClosedHere(errand.what, connection=True))
+            self._finish(request, ClosedHere(request.what, connection=True))
         else:
-            self._try(errand)
-        return errand
+            self._try(request)
+        return request
 
     def hurry(self, prefix: str) -> None:
         """Try everything now whose key begins with `prefix`: somebody is there again.
@@ -91,13 +91,13 @@ class Courier:
             now = time.monotonic()
             self._due = [each for each in self._due if not each[2].key.startswith(prefix)]
             again = sorted((e for e in self._open if e.key.startswith(prefix)), key=lambda e: e.sent_at)
-            self._due += [(now, next(self._order), errand) for errand in again]
+            self._due += [(now, next(self._order), request) for request in again]
             heapq.heapify(self._due)
             self._changed.notify()
 
-    def abandon(self, errand: Errand, problem: Problem) -> None:
-        """Stop carrying `errand`; its future gets `problem` unless it is already answered."""
-        self._finish(errand, problem)
+    def abandon(self, request: Request, problem: Problem) -> None:
+        """Stop carrying `request`; its future gets `problem` unless it is already answered."""
+        self._finish(request, problem)
 
     def close(self) -> None:
         """Stop.  What is still unanswered fails with Unavailable."""
@@ -106,64 +106,64 @@ class Courier:
             left = list(self._open)
             self._changed.notify()
         self._thread.join()
-        for errand in left:
-            self._finish(errand, Unavailable(errand.what, self._waited(errand), "the connection was closed first"))
+        for request in left:
+            self._finish(request, Unavailable(request.what, self._waited(request), "the connection was closed first"))
 
-    def _try(self, errand: Errand) -> None:
-        errand.attempt = attempt = errand.attempt + 1
+    def _try(self, request: Request) -> None:
+        request.attempt = attempt = request.attempt + 1
         timeout_s = TRY_S
-        if errand.deadline is not None:
-            timeout_s = min(TRY_S, max(errand.deadline - time.monotonic(), 0.001))
-        self._link.ask(errand.key, errand.payload, timeout_s, lambda reply: self._take(errand, attempt, reply))
+        if request.deadline is not None:
+            timeout_s = min(TRY_S, max(request.deadline - time.monotonic(), 0.001))
+        self._link.ask(request.key, request.payload, timeout_s, lambda reply: self._take(request, attempt, reply))
 
-    def _take(self, errand: Errand, attempt: int, reply: Reply) -> None:
+    def _take(self, request: Request, attempt: int, reply: Reply) -> None:
         """On zenoh's thread: only decode, hand over, or put back."""
         self._heard = self._heard or not isinstance(reply, Silence)
-        verdict = judge(reply, attempt, errand.passing)
+        verdict = judge(reply, attempt, request.passing)
         if isinstance(verdict, bytes):
             try:
-                self._finish(errand, errand.decode(verdict))
+                self._finish(request, request.decode(verdict))
             except Problem as unreadable:
-                self._finish(errand, unreadable)
+                self._finish(request, unreadable)
         elif isinstance(verdict, Again):
-            if attempt == errand.attempt:  # else a later try is on its way
-                self._put_back(errand, verdict)
+            if attempt == request.attempt:  # else a later try is on its way
+                self._put_back(request, verdict)
         else:
-            self._finish(errand, verdict)
+            self._finish(request, verdict)
 
-    def _put_back(self, errand: Errand, again: Again) -> None:
-        sent = f"{counted(len(errand.payload), 'byte')} sent, {counted(errand.attempt, 'try', 'tries')}"
-        errand.because = f"{again.because} on {errand.key} ({sent})"
+    def _put_back(self, request: Request, again: Again) -> None:
+        sent = f"{counted(len(request.payload), 'byte')} sent, {counted(request.attempt, 'try', 'tries')}"
+        request.because = f"{again.because} on {request.key} ({sent})"
         at = time.monotonic() + again.pause_s
-        if errand.deadline is not None and at >= errand.deadline:
-            self._finish(errand, Unavailable(errand.what, self._waited(errand), errand.because))
+        if request.deadline is not None and at >= request.deadline:
+            self._finish(request, Unavailable(request.what, self._waited(request), request.because))
             return
         with self._lock:
-            if errand in self._open:
-                heapq.heappush(self._due, (at, next(self._order), errand))
+            if request in self._open:
+                heapq.heappush(self._due, (at, next(self._order), request))
                 self._changed.notify()
 
-    def _finish(self, errand: Errand, result: Any) -> None:
+    def _finish(self, request: Request, result: Any) -> None:
         with self._lock:
-            if errand not in self._open:
+            if request not in self._open:
                 return
-            self._open.remove(errand)
-        errand.answered_at = time.perf_counter()
-        if errand.then is not None:
-            errand.then(errand, result)
+            self._open.remove(request)
+        request.answered_at = time.perf_counter()
+        if request.then is not None:
+            request.then(request, result)
         if isinstance(result, BaseException):
-            errand.future.set_exception(result)
+            request.future.set_exception(result)
         else:
-            errand.future.set_result(result)
+            request.future.set_result(result)
 
-    def _waited(self, errand: Errand) -> float:
-        return round(time.perf_counter() - errand.sent_at, 3)
+    def _waited(self, request: Request) -> float:
+        return round(time.perf_counter() - request.sent_at, 3)
 
     def _run(self) -> None:
-        while (errand := self._next()) is not None:
-            if not errand.future.done():
-                self._try(errand)
-                if errand.attempt >= _SILENT:
+        while (request := self._next()) is not None:
+            if not request.future.done():
+                self._try(request)
+                if request.attempt >= _SILENT:
                     self._look_for_other_versions()
 
     def _look_for_other_versions(self) -> None:
@@ -176,10 +176,10 @@ class Courier:
         if not self._heard and (other := other_protocol(versions)) is not None:
             with self._lock:
                 left = list(self._open)
-            for errand in left:
-                self._finish(errand, other)
+            for request in left:
+                self._finish(request, other)
 
-    def _next(self) -> Errand | None:
+    def _next(self) -> Request | None:
         with self._lock:
             while not self._closed:
                 if not self._due:

@@ -15,7 +15,7 @@ from factorbus.client.arguments import flag, of_type
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.linear import linear_pieces
-from factorbus.client.mounted import moved_se2, moved_se3
+from factorbus.client.mounted import transform_se2, transform_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -104,7 +104,7 @@ class Draft:
         """
         if mount is not None:
             where = self._between(first, second, "between_se2")
-            measured, A = moved_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
+            measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
             certainty = carried(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
 
@@ -126,7 +126,9 @@ class Draft:
         """
         if mount is not None:
             where = self._between(first, second, "between_se3")
-            measured, A = moved_se3(where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7))
+            measured, A = transform_se3(
+                where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
+            )
             certainty = carried(where, 6, certainty, A, "between_se3")
         return self.factor("between_se3", (first, second), measured, **certainty)
 
@@ -213,7 +215,7 @@ class Draft:
         kinds: Sequence[str] | None = None,
         **certainty: Unpack[Certainty],
     ) -> Draft:
-        """What you have linearised yourself, of up to 128 variables: r = sum H (x - y) + b.
+        """What you have linearized yourself, of up to 128 variables: r = sum H (x - y) + b.
 
         x - y is the local increment of a pose, the difference of anything else; values: y of each, as it is stored;
         jacobians: H of each, (m, 3) of an se2 or point3, (m, 6) of an se3 or idp, (m, 2) of a point2; residual: b,

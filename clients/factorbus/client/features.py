@@ -13,13 +13,13 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 
 import numpy as np
+from factorbus.client.pool import SharedAllocation, SharedMemoryPool
+from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import seconds
-from factorbus.client.courier import Courier, Errand
 from factorbus.client.grown import Factored, Grown, factored, grown
 from factorbus.client.link import Link
-from factorbus.client.memories import Lent, Memories
 from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import keys
 from factorbus.proto.arrays import F64
@@ -47,7 +47,7 @@ class Features:
     def __init__(
         self,
         link: Link,
-        courier: Courier,
+        sender: RequestSender,
         timeout_s: float,
         camera: Camera,
         *,
@@ -57,8 +57,8 @@ class Features:
         service: str = "",
     ) -> None:
         self.camera, self.rho, self.sigma_rho, self.sigma_pixel = camera, rho, sigma_rho, sigma_pixel
-        self._link, self._courier, self._timeout_s, self._service = link, courier, timeout_s, service
-        self._memories = Memories()
+        self._link, self._sender, self._timeout_s, self._service = link, sender, timeout_s, service
+        self._pool = SharedMemoryPool()
         self._shared = True  # until an answer shows that nobody there shares memory with us
         self._stack = ExitStack()
         self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
@@ -87,7 +87,7 @@ class Features:
         m, n = sighting.width, sighting.count
         lent = None
         if self._shared and rows_size(n, m) >= _SHARED_FROM_BYTES:
-            lent = self._memories.try_lend(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
+            lent = self._pool.try_allocate(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
         ask = Ask(sighting, "rows", lent.segment) if lent else Ask(sighting, "half")
         return Growing(self, state, covariance, ask, lent, self._ask(ask, timeout_s))
 
@@ -103,14 +103,14 @@ class Features:
     def close(self) -> None:
         """Ask nothing more."""
         self._stack.close()
-        self._memories.close()
+        self._pool.close()
 
-    def settle(self, lent: Lent, clean: bool, stored: bool) -> None:
+    def settle(self, lent: SharedAllocation, clean: bool, stored: bool) -> None:
         """For Growing: what became of the memory of an answer."""
         self._shared &= stored
-        self._memories.settle(lent, clean)
+        self._pool.settle(lent, clean)
 
-    def again_without_memory(self, ask: Ask, timeout_s: float | None = None) -> Errand:
+    def again_without_memory(self, ask: Ask, timeout_s: float | None = None) -> Request:
         """For Growing: the same question, for somebody who shares no memory with us."""
         self._shared = False
         return self._ask(Ask(ask.sighting, "half"), timeout_s)
@@ -124,7 +124,7 @@ class Features:
         state, rows = x[:CAMERA_STATE], P[:CAMERA_STATE]
         return Sighting(self.camera, state, rows, seen, self.rho, self.sigma_rho, self.sigma_pixel)
 
-    def _ask(self, ask: Ask, timeout_s: float | None) -> Errand:
+    def _ask(self, ask: Ask, timeout_s: float | None) -> Request:
         self._link.check_open("features")
         timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
         if answer_size(ask) > ANSWER_LIMITS.max_bytes:
@@ -133,7 +133,7 @@ class Features:
         service = self._service or self._any_service(timeout_s)
         left = max(0.001, timeout_s - (time.monotonic() - started))
         what = f"service {service}, asked for {counted(ask.sighting.count, 'feature')},"
-        return self._courier.carry(Errand(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
+        return self._sender.carry(Request(what, keys.features_key(service), encode_ask(ask), decode_answer, left))
 
     def _any_service(self, timeout_s: float) -> str:
         with self._lock:
@@ -154,15 +154,17 @@ class Features:
 class Growing:
     """A filter's growth that is on its way."""
 
-    def __init__(self, features: Features, x: F64, P: F64, ask: Ask, lent: Lent | None, errand: Errand) -> None:
+    def __init__(
+        self, features: Features, x: F64, P: F64, ask: Ask, lent: SharedAllocation | None, request: Request
+    ) -> None:
         self._features, self._x, self._P, self._ask, self._lent = features, x, P, ask, lent
-        self._errand = errand
+        self._request = request
         self._result: Grown | None = None
 
     @property
     def future(self) -> Future[Answer]:
         """For callbacks and asyncio: it is done when `result` need not wait for the bus."""
-        return self._errand.future
+        return self._request.future
 
     def result(self) -> Grown:
         """Wait for it, and put it together on this thread.  Raises as `Features.grow`."""
@@ -172,7 +174,7 @@ class Growing:
 
     def _put_together(self) -> Grown:
         try:
-            answer = self._errand.future.result()
+            answer = self._request.future.result()
         except Refused as refused:
             if self._lent is None or refused.code != "too_large":
                 self._settle(clean=False, stored=True)
@@ -187,7 +189,7 @@ class Growing:
         matrix = self._lent.matrix if self._lent else None
         result = grown(self._x, self._P, self._ask.sighting, answer, matrix)
         stored = all(done.shard.stored for done in answer.shards)
-        self._settle(clean=answer.clean and self._errand.attempt == 1, stored=stored)
+        self._settle(clean=answer.clean and self._request.attempt == 1, stored=stored)
         return result
 
     def _settle(self, clean: bool, stored: bool) -> None:

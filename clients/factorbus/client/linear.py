@@ -1,4 +1,4 @@
-"""What a front end has linearised itself, as factors that a map takes in: one where it can be, else in pieces."""
+"""What a front end has linearized itself, as factors that a map takes in: one where it can be, else in pieces."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from zenoh.handlers import Callback
 
 from factorbus.client.listening import heard
 from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, TimedOut
-from factorbus.proto import discreet, keys
+from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.kept_state import keep_state
 from factorbus.proto.problems import BadSetting, ClosedHere, NobodyListens, Unavailable
@@ -195,10 +195,10 @@ def open_session(
         except zenoh.ZError:
             waited_s = time.monotonic() - start
             if listening_s is not None and waited_s >= min(listening_s, timeout_s) and not heard(endpoints):
-                raise NobodyListens(discreet.endpoint(" and ".join(endpoints))) from None
+                raise NobodyListens(redact.endpoint(" and ".join(endpoints))) from None
             if waited_s + pause > timeout_s:
                 raise Unavailable(
-                    discreet.endpoint(" and ".join(endpoints)),
+                    redact.endpoint(" and ".join(endpoints)),
                     timeout_s,
                     "start a service there with `factorbus serve`, or check the address; one that asks for a "
                     "certificate or a password, and does not get the right one, does not answer either",
@@ -213,12 +213,12 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) ->
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:
-        raise BadSetting(file, discreet.reason(error)) from None
+        raise BadSetting(file, redact.reason(error)) from None
     for path, value in (_settings(endpoints) | dict(settings)).items():
         try:
             config.insert_json5(path, json.dumps(value))
         except (zenoh.ZError, TypeError) as error:
-            raise BadSetting(path, discreet.reason(error)) from None
+            raise BadSetting(path, redact.reason(error)) from None
     return config
 
 

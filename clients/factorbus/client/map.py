@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any
 
+from factorbus.client.pending_insert import PendingInsert
+from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import flag, of_type, seconds
 from factorbus.client.changes import Changes
-from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
@@ -23,8 +24,7 @@ from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
 from factorbus.client.questions import Questions, logged
 from factorbus.client.supported import check_changes, check_stamps
-from factorbus.client.ticket import Ticket
-from factorbus.client.uncertainty import Doubt, DoubtQuestions
+from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
@@ -76,13 +76,13 @@ class Map:
     def __init__(
         self,
         link: Link,
-        courier: Courier,
+        sender: RequestSender,
         client: str,
         timeout_s: float,
         window: int,
         join: Callable[[], MapRow],
     ) -> None:
-        self._link, self._courier, self._client, self.timeout_s = link, courier, client, timeout_s
+        self._link, self._sender, self._client, self.timeout_s = link, sender, client, timeout_s
         self._size, self._join = window, join
         self._stack, self._presence = ExitStack(), ExitStack()
         self._mirror: Mirror | None = None
@@ -91,8 +91,8 @@ class Map:
         self._sending = threading.Lock()
         self._closed = False
         self._enter(join())
-        self.ask = Questions(courier, self.name, timeout_s)
-        self.doubt = Doubt(DoubtQuestions(courier, self.name, timeout_s))
+        self.ask = Questions(sender, self.name, timeout_s)
+        self.doubt = Uncertainty(UncertaintyQuestions(sender, self.name, timeout_s))
 
     def __enter__(self) -> Map:
         return self
@@ -121,21 +121,21 @@ class Map:
         batch: Batch | Draft,
         *,
         settle: bool = False,
-        points_below: float = 0.0,
+        convert_below: float = 0.0,
         changes: Changes | None = None,
         timeout_s: float | None = None,
     ) -> Accepted:
         """Add `batch` to the map and wait until it is in the estimate, the mirror included.
 
-        points_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
+        convert_below: afterwards idp features whose linearity index is below this (0.1, say) become points.
         changes: are made first; all of it happens or none.
 
-        Raises Refused: the map is as it was.  Raises Unavailable: see `Ticket.result`.  Raises as `send`.
+        Raises Refused: the map is as it was.  Raises Unavailable: see `PendingInsert.result`.  Raises as `send`.
         """
         end = time.monotonic() + seconds("timeout_s", timeout_s, self.timeout_s)
         left = max(end - time.monotonic(), 0.0)
-        ticket = self.send(batch, settle=settle, points_below=points_below, changes=changes, timeout_s=left)
-        accepted = ticket.result(max(end - time.monotonic(), 0.0))
+        pending_insert = self.send(batch, settle=settle, convert_below=convert_below, changes=changes, timeout_s=left)
+        accepted = pending_insert.result(max(end - time.monotonic(), 0.0))
         self._catch_up(max(end - time.monotonic(), 0.0))
         return accepted
 
@@ -185,10 +185,10 @@ class Map:
         batch: Batch | Draft,
         *,
         settle: bool = False,
-        points_below: float = 0.0,
+        convert_below: float = 0.0,
         changes: Changes | None = None,
         timeout_s: float | None = None,
-    ) -> Ticket:
+    ) -> PendingInsert:
         """Send `batch` without waiting for its answer.  Waits only while `window` inserts are unanswered.
 
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
@@ -201,12 +201,12 @@ class Map:
             with self._lock:
                 self._wait_for_room(timeout_s)
             check_changes(self._protocol, listed)
-            insert = Insert(self._window.next, batch, settle, self.epoch, points_below, listed)
-            ticket = self._ticket(insert, timeout_s)
+            insert = Insert(self._window.next, batch, settle, self.epoch, convert_below, listed)
+            pending_insert = self._pending_insert(insert, timeout_s)
             with self._lock:
-                self._window.sent(ticket)
-            self._courier.carry(ticket.errand)
-        return ticket
+                self._window.sent(pending_insert)
+            self._sender.carry(pending_insert.request)
+        return pending_insert
 
     def flush(self, timeout_s: float | None = None) -> None:
         """Wait until everything sent is answered, and the mirror has it.
@@ -221,8 +221,8 @@ class Map:
                     f"map {self.name!r}", timeout_s, f"{counted(left, 'insert')} without an answer, still being sent"
                 )
             refused = self._window.take_refused()
-        for ticket, refusal in refused:
-            if not ticket.seen:
+        for pending_insert, refusal in refused:
+            if not pending_insert.seen:
                 raise refusal
         self._catch_up(timeout_s)
 
@@ -341,14 +341,14 @@ class Map:
         self._row, self._protocol = row, row.protocol
         self.client = f"{self._client}-{os.urandom(4).hex()}"
         self._key = keys.insert_key(self.name, self.client)
-        self._window: Window[Ticket] = Window(self._size)
+        self._window: Window[PendingInsert] = Window(self._size)
         self._presence.close()
         self._presence.enter_context(self._link.present(keys.client_token(self.name, self.client)))
 
-    def _ticket(self, insert: Insert, timeout_s: float) -> Ticket:
+    def _pending_insert(self, insert: Insert, timeout_s: float) -> PendingInsert:
         window = self._window
 
-        def then(_: Errand, result: Any) -> None:
+        def then(_: Request, result: Any) -> None:
             if isinstance(result, Accepted) and self._mirror is not None:
                 self._mirror.expect(result.revision, result.epoch)
             with self._lock:
@@ -363,8 +363,8 @@ class Map:
         payload = codec.encode_insert(insert)
         if len(payload) > REQUEST_LIMITS.max_bytes:  # the bus would drop it without a word
             raise TooLarge("the insert", len(payload), REQUEST_LIMITS.max_bytes, "bytes")
-        errand = Errand(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
-        return Ticket(errand, insert.sequence, timeout_s)
+        request = Request(f"map {self.name!r}", self._key, payload, codec.decode_accepted, passing=passing, then=then)
+        return PendingInsert(request, insert.sequence, timeout_s)
 
     def _catch_up(self, timeout_s: float) -> None:
         """Let the mirror reach what has been accepted; if it does not, it says that it is stale."""
@@ -383,12 +383,12 @@ class Map:
         """Under `_sending`."""
         with self._lock:
             unanswered = self._window.unanswered
-        for ticket in unanswered:
-            waited_s = round(time.perf_counter() - ticket.errand.sent_at, 3)
-            self._courier.abandon(ticket.errand, Unavailable(f"map {self.name!r}", waited_s, hint))
+        for pending_insert in unanswered:
+            waited_s = round(time.perf_counter() - pending_insert.request.sent_at, 3)
+            self._sender.abandon(pending_insert.request, Unavailable(f"map {self.name!r}", waited_s, hint))
 
     def _see_owner(self, token: str, alive: bool) -> None:
         if self._mirror is not None:
             self._mirror.owner(token, alive)
         if alive:
-            self._courier.hurry(keys.map_root(self.name) + "/")
+            self._sender.hurry(keys.map_root(self.name) + "/")

@@ -16,7 +16,7 @@ _KEPT_BYTES = 1 << 30
 _LARGEST_SPARE = 4  # times what is needed
 
 
-class Lent(NamedTuple):
+class SharedAllocation(NamedTuple):
     """Memory for one answer: what to send along, and the matrix (rows, columns) that it is for."""
 
     memory: Memory
@@ -24,7 +24,7 @@ class Lent(NamedTuple):
     matrix: F64
 
 
-class Memories:
+class SharedMemoryPool:
     """The shared memory of one front end.  Thread-safe."""
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class Memories:
         self._spare: list[Memory] = []
         self._closed = False
 
-    def try_lend(self, start: int, shape: tuple[int, int], first_row: int) -> Lent | None:
+    def try_allocate(self, start: int, shape: tuple[int, int], first_row: int) -> SharedAllocation | None:
         """Memory for a matrix of `shape` from byte `start` on, of which rows from `first_row` on will be written.
 
         None where there is no room, or no shared memory.
@@ -43,9 +43,9 @@ class Memories:
         except OSError:
             return None
         matrix = memory.array(start, shape)
-        return Lent(memory, memory.segment(start + 8 * first_row * shape[1]), matrix)
+        return SharedAllocation(memory, memory.segment(start + 8 * first_row * shape[1]), matrix)
 
-    def settle(self, lent: Lent, clean: bool) -> None:
+    def settle(self, lent: SharedAllocation, clean: bool) -> None:
         """The answer is there (or will not be used).  clean: nobody will write to the memory any more.
 
         It is used again once the matrix, and everything made of it, is gone.

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from factorbus.client.transform_linear import is_relative, says_nothing
 from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft, batch_of
@@ -23,8 +24,7 @@ from factorbus.client.frames import (
     inverse,
     moved_values,
 )
-from factorbus.client.moved import moved_factors
-from factorbus.client.moved_linear import is_relative, says_nothing
+from factorbus.client.moved import transform_factors
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
@@ -134,7 +134,7 @@ def fit_into(
         given = _tie(here, renamed, T, sigmas).batch()
     moved = Batch(
         tuple(g._replace(values=moved_values(g.kind, _values(g), T)) for g in kept.variables),
-        tuple(moved_factors(g, T) for g in kept.factors),
+        tuple(transform_factors(g, T) for g in kept.factors),
     )
     return Fitted(_together(moved, given), T, left_out, given.factor_count)
 

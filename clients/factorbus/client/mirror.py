@@ -122,7 +122,7 @@ class Mirror:
 
     @property
     def converged(self) -> bool | None:
-        """Whether the map had converged at `revision`; None: the service is being asked, after a resynchronisation."""
+        """Whether the map had converged at `revision`; None: the service is being asked, after a resynchronization."""
         return self._following.converged
 
     @property
@@ -186,7 +186,7 @@ class Mirror:
     def on_delta(self, callback: Callable[[Delta], None]) -> Callable[[], None]:
         """Have `callback` called with every delta after it is applied; returns what takes it off again.
 
-        It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronisation it gets
+        It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronization it gets
         one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.
         """
         with self._lock:
@@ -197,7 +197,7 @@ class Mirror:
         """Subscribe, then ask; `stack` gets what ends it.  Returns when the estimate is here.  Raises Unavailable."""
         stack.callback(self._stop)
         self._thread.start()
-        for key, word in ((keys.delta_key(self._map), "delta"), (keys.keyframe_key(self._map), "keyframe")):
+        for key, word in ((keys.delta_key(self._map), "delta"), (keys.snapshot_key(self._map), "keyframe")):
             stack.enter_context(self._link.listening(key, lambda data, word=word: self._hear(word, data)))
         self._inbox.put(("ask", None))
         self.wait_for(0)

@@ -29,14 +29,14 @@ from factorbus.proto.problems import BadShape
 _TOLERANCE = 1e-3
 
 
-def moved_se2(measured: F64, mount: F64) -> tuple[F64, F64]:
+def transform_se2(measured: F64, mount: F64) -> tuple[F64, F64]:
     """(z', A) of z and L, both x y (metres) theta (radians); A (3, 3): r = A r'."""
     Q, A = rotation(mount), np.eye(3)
     A[:2, :2], A[:2, 2] = Q.T, Q.T @ (-mount[1], mount[0])
     return _carried(measured, mount), A
 
 
-def moved_se3(where: str, measured: F64, mount: F64) -> tuple[F64, F64]:
+def transform_se3(where: str, measured: F64, mount: F64) -> tuple[F64, F64]:
     """(z', A) of z and L, both x y z (metres) qx qy qz qw; A (6, 6): r = A r'.  Raises BadShape: no unit quaternion."""
     _check_unit(f"{where}: mount", mount)
     _check_unit(f"{where}: measured", measured)

@@ -1,22 +1,22 @@
 """Factors of a map that goes into another frame: most relative ones are the same in every frame."""
 
 import numpy as np
+from factorbus.client.transform_linear import transform_linear
 
 from factorbus.client.frames import rotation
-from factorbus.client.moved_linear import moved_linear
 from factorbus.proto.arrays import F64
 from factorbus.proto.linear import LINEAR_PAIRS
 from factorbus.proto.messages import Factors
 
 
-def moved_factors(group: Factors, T_a_b: F64) -> Factors:
+def transform_factors(group: Factors, T_a_b: F64) -> Factors:
     """Relative factors given in b, as they are in a."""
     if group.kind in LINEAR_PAIRS:
-        return moved_linear(group, T_a_b)
-    return _moved_first(group, T_a_b) if group.kind == "idp_first" else group
+        return transform_linear(group, T_a_b)
+    return _transform_first(group, T_a_b) if group.kind == "idp_first" else group
 
 
-def _moved_first(group: Factors, T_a_b: F64) -> Factors:
+def _transform_first(group: Factors, T_a_b: F64) -> Factors:
     """`idp_first`: the first three rows of the residual are along the map's axes: Ω turns with them."""
     rows, columns = np.triu_indices(6)
     turn = np.eye(6)

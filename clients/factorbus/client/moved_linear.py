@@ -40,7 +40,7 @@ def says_nothing(group: Factors, others: Iterable[Factors]) -> np.ndarray:
     return _largest(group) <= _ROUNDING * whole
 
 
-def moved_linear(group: Factors, T_a_b: F64) -> Factors:
+def transform_linear(group: Factors, T_a_b: F64) -> Factors:
     """y moves with x.  Of a pose x ⊟ y is local, and the same; of a point it turns with the frame, and H against it."""
     parts = parts_of(group.kind, group.measured)
     y = [moved_values(kind, values, T_a_b) for kind, values in zip(parts.kinds, parts.y, strict=True)]

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 
-class Promise(Future[T]):
+class InterruptibleFuture(Future[T]):
     """A future that is running from the start, so that an asyncio wrapper cannot cancel what is on its way."""
 
     def __init__(self) -> None:

@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
+from factorbus.client.sender import Request, RequestSender
+
 from factorbus.client.arguments import flag, seconds
-from factorbus.client.courier import Courier, Errand
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
@@ -28,8 +29,8 @@ class Exported(NamedTuple):
 class Questions:
     """What one map can be asked.  The futures get the answer, Refused, or Unavailable after `timeout_s`."""
 
-    def __init__(self, courier: Courier, map_name: str, timeout_s: float) -> None:
-        self._courier, self._map, self._timeout_s = courier, map_name, timeout_s
+    def __init__(self, sender: RequestSender, map_name: str, timeout_s: float) -> None:
+        self._sender, self._map, self._timeout_s = sender, map_name, timeout_s
 
     def estimate(self, of: Sequence[Key] | Key | None, timeout_s: float | None) -> Future[Estimate]:
         """Values at one revision: all, or of some variables."""
@@ -76,7 +77,7 @@ class Questions:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
         timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
-        return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
+        return self._sender.carry(Request(what, key, payload, decode, timeout_s)).future
 
 
 def logged(name: str, exported: Exported) -> str:

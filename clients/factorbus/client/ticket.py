@@ -2,17 +2,18 @@
 
 from concurrent.futures import Future
 
+from factorbus.client.sender import Request
+
 from factorbus.client.arguments import seconds
-from factorbus.client.courier import Errand
 from factorbus.proto.messages import Accepted
 from factorbus.proto.problems import Unavailable
 
 
-class Ticket:
+class PendingInsert:
     """An insert that was sent: it will be delivered once, as long as its map is open here and keeps its epoch."""
 
-    def __init__(self, errand: Errand, sequence: int, timeout_s: float) -> None:
-        self.errand = errand
+    def __init__(self, request: Request, sequence: int, timeout_s: float) -> None:
+        self.request = request
         self.sequence = sequence
         self.seen = False
         self._timeout_s = timeout_s
@@ -21,16 +22,16 @@ class Ticket:
     def future(self) -> Future[Accepted]:
         """For callbacks and asyncio; looking at the answer through it counts as having seen it."""
         self.seen = True
-        return self.errand.future
+        return self.request.future
 
     @property
     def round_trip_s(self) -> float | None:
         """Seconds from the first sending to the answer; None while there is none."""
-        return self.errand.answered_at - self.errand.sent_at if self.done() else None
+        return self.request.answered_at - self.request.sent_at if self.done() else None
 
     def done(self) -> bool:
         """There is an answer."""
-        return self.errand.future.done()
+        return self.request.future.done()
 
     def result(self, timeout_s: float | None = None) -> Accepted:
         """Wait for the answer.  Raises Refused (the map is as it was), or NoAnswerYet, an Unavailable.
@@ -47,10 +48,12 @@ class Ticket:
 
 
 class NoAnswerYet(Unavailable):
-    """An insert's answer did not come in time; `ticket` still stands for it."""
+    """An insert's answer did not come in time; `pending_insert` still stands for it."""
 
-    def __init__(self, ticket: Ticket, waited_s: float) -> None:
-        self.ticket = ticket
-        hint = "it keeps being sent with its number: wait on .ticket.result() or flush(), do not insert it again"
-        what = f"{ticket.errand.what}, insert {ticket.sequence},"
-        super().__init__(what, round(waited_s, 3), f"{ticket.errand.because}; {hint}")
+    def __init__(self, pending_insert: PendingInsert, waited_s: float) -> None:
+        self.pending_insert = pending_insert
+        hint = (
+            "it keeps being sent with its number: wait on .pending_insert.result() or flush(), do not insert it again"
+        )
+        what = f"{pending_insert.request.what}, insert {pending_insert.sequence},"
+        super().__init__(what, round(waited_s, 3), f"{pending_insert.request.because}; {hint}")

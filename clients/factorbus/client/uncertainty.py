@@ -15,10 +15,10 @@ from concurrent.futures import Future
 from typing import Any, TypeVar
 
 import numpy as np
+from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import of_type, seconds
-from factorbus.client.courier import Courier, Errand
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.proto import asking_codec, keys
@@ -43,11 +43,11 @@ from factorbus.wording import counted
 T = TypeVar("T")
 
 
-class DoubtQuestions:
+class UncertaintyQuestions:
     """Each method sends a question and returns the future of its answer, Refused, or Unavailable after `timeout_s`."""
 
-    def __init__(self, courier: Courier, map_name: str, timeout_s: float) -> None:
-        self._courier, self._map, self._timeout_s = courier, map_name, timeout_s
+    def __init__(self, sender: RequestSender, map_name: str, timeout_s: float) -> None:
+        self._sender, self._map, self._timeout_s = sender, map_name, timeout_s
 
     def covariance(
         self, blocks: str, of: Sequence[Key] | Key | None, others: Sequence[Key] | Key | None, timeout_s: float | None
@@ -83,13 +83,13 @@ class DoubtQuestions:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
         timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
-        return self._courier.carry(Errand(what, key, payload, decode, timeout_s)).future
+        return self._sender.carry(Request(what, key, payload, decode, timeout_s)).future
 
 
-class Doubt:
+class Uncertainty:
     """The same, waiting for the answers.  All raise Refused and Unavailable; every answer names its revision."""
 
-    def __init__(self, ask: DoubtQuestions) -> None:
+    def __init__(self, ask: UncertaintyQuestions) -> None:
         self.ask = ask
 
     def covariance(self, of: Sequence[Key] | Key | None = None, timeout_s: float | None = None) -> Covariances:

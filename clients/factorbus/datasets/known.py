@@ -92,7 +92,7 @@ CATALOGUE = (
     ),
     Dataset(
         name="killian",
-        what="the long corridors of MIT, measurements of an optimised trajectory: the optimum is all but 0",
+        what="the long corridors of MIT, measurements of an optimized trajectory: the optimum is all but 0",
         paper="Killian",
         kind="2D",
         poses=1941,

@@ -8,7 +8,7 @@ import time
 from collections import Counter, deque
 from typing import Any
 
-from factorbus.client import Draft, Map, Problem, Refused, Ticket, Unavailable
+from factorbus.client import Draft, Map, PendingInsert, Problem, Refused, Unavailable
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
 from factorbus.proto.symbols import symbol
@@ -37,7 +37,7 @@ class Bridge:
     def __init__(self, joined: Map, node: Node, messages: Messages, settings: Settings) -> None:
         self._map, self._messages, self._settings = joined, messages, settings
         self._inbox: queue.Queue[tuple[str, str, bytes]] = queue.Queue(_BACKLOG)
-        self._out: deque[Ticket] = deque()
+        self._out: deque[PendingInsert] = deque()
         self._tolerance_ns = int(1e9 * settings.tolerance_s)
         self.counts: Counter[str] = Counter()
         self._told: Counter[tuple[str, str]] = Counter()
@@ -166,9 +166,9 @@ class Bridge:
         """Those after a refused insert lean on it: see them all answered, then go on from what is in the map."""
         log.error("the map refused an insert: %s [%s]", refused.message, refused.code)
         self.counts["refused"] += 1
-        for ticket in self._out:
+        for pending_insert in self._out:
             try:
-                ticket.result()
+                pending_insert.result()
             except Problem as also:
                 log.info("and one after it: %s [%s]", also.message, also.code)
         self._out.clear()

@@ -52,7 +52,7 @@ def from_plane(x: float, y: float, yaw: float) -> Transform:
 
 
 def from_quaternion(t: Sequence[float], quat_xyzw: Sequence[float]) -> Transform:
-    """From a translation and a quaternion, which is normalised.  Raises ValueError: it cannot be, or is too far."""
+    """From a translation and a quaternion, which is normalized.  Raises ValueError: it cannot be, or is too far."""
     numbers = np.array([*t, *quat_xyzw], np.float64)
     if numbers.shape != (7,):
         raise ValueError(counted(len(numbers), "number"))

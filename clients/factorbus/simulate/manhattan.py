@@ -88,7 +88,7 @@ class _Closures:
         self._visits: dict[tuple[int, int], list[tuple[int, int]]] = {}
 
     def at(self, number: int, place: Place) -> list[tuple[int, Place]]:
-        """Earlier poses that pose `number` recognises, with their places; `number` is remembered from now on."""
+        """Earlier poses that pose `number` recognizes, with their places; `number` is remembered from now on."""
         x, y, heading = place
         found: list[tuple[int, Place]] = []
         if self._chance.random() < self._share:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 
 import numpy as np
+from factorbus.viz.rate_limited import RateLimited
 
 from factorbus.client import Map
 from factorbus.proto.arrays import F64, I64
@@ -14,7 +15,6 @@ from factorbus.proto.asking import Covariances
 from factorbus.proto.messages import Variables
 from factorbus.viz.ellipses import Spread, spread_of
 from factorbus.viz.geometry import POSITION
-from factorbus.viz.polite import Polite
 
 _LETTER_BITS = 56
 _NOBODY = Covariances(0, 0, "diagonal", ())
@@ -44,18 +44,18 @@ class MapCertainty:
     def __init__(self, joined: Map, most: int, told: Callable[[], None] = lambda: None) -> None:
         self._map, self._most = joined, most
         self._variables: Sequence[Variables] = ()
-        self._polite = Polite(self._ask, _NOBODY, told)
+        self._rate_limited = RateLimited(self._ask, _NOBODY, told)
 
     def spread(self, epoch: int, revision: int, variables: Sequence[Variables]) -> Spread:
         """Around where things are in that revision, by the newest covariances there are; never waits."""
         self._variables = variables
-        answer = self._polite.refresh(lambda had: (had.epoch, had.revision) != (epoch, revision))
+        answer = self._rate_limited.refresh(lambda had: (had.epoch, had.revision) != (epoch, revision))
         return spread_of(variables, blocks_of(answer) if answer.epoch == epoch else {})
 
     def wait(self, variables: Sequence[Variables], timeout_s: float) -> None:
         """Until there are covariances of now.  Raises Refused, Unavailable."""
         self._variables = variables
-        self._polite.put(self._ask().result(timeout_s))
+        self._rate_limited.put(self._ask().result(timeout_s))
 
     def _ask(self) -> Future[Covariances]:
         keys = chosen(self._variables, self._most)

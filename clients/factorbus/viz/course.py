@@ -15,7 +15,7 @@ def _none() -> F64:
 class Course:
     """Per step of a drive: chi2 (n,), step_ms (n,), work (n, 3); each may be empty.
 
-    work: variables in the map, eliminated, relinearised.
+    work: variables in the map, eliminated, relinearized.
     optimum (m, 2): steps and the χ² of the batch optimum at them.
     not_converged (m, 2): the same where the search for it ended before it had converged.
     """

@@ -85,10 +85,10 @@ def _sum(axes: Any, step_ms: F64) -> None:
 
 
 def _work(axes: Any, work: F64) -> None:
-    """Of how many variables there are, how many a step eliminated and relinearised."""
+    """Of how many variables there are, how many a step eliminated and relinearized."""
     steps = np.arange(1, len(work) + 1)
     axes.plot(steps, work[:, 0], color=style.INK, linewidth=1.2, label="in the map")
-    for column, name, colour, mark in ((1, "eliminated", style.ESTIMATE, "o"), (2, "relinearised", style.LOOPS, "D")):
+    for column, name, colour, mark in ((1, "eliminated", style.ESTIMATE, "o"), (2, "relinearized", style.LOOPS, "D")):
         done = work[:, column] > 0
         axes.plot(steps[done], work[done, column], mark, markersize=2.6, color=colour, markeredgewidth=0, label=name)
     axes.set_title("variables: in the map, and worked on by a step", loc="left")

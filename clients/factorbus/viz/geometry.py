@@ -106,8 +106,8 @@ def limits(kept: F64, tried: F64, *, margin: float = 0.04, beyond: float = 0.12)
         low = np.maximum(np.minimum(low, np.nanmin(tried, axis=0)), low - beyond * size)
         high = np.minimum(np.maximum(high, np.nanmax(tried, axis=0)), high + beyond * size)
     least = _NARROWEST * float((high - low).max()) if len(low) == 2 else 0.0
-    lacking = np.maximum(least - (high - low), 0.0) / 2
-    return np.stack([low - lacking - margin * size, high + lacking + margin * size])
+    missing = np.maximum(least - (high - low), 0.0) / 2
+    return np.stack([low - missing - margin * size, high + missing + margin * size])
 
 
 def _positions(variables: Sequence[Variables], prefix: str) -> Track:

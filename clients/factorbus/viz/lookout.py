@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from factorbus.viz.rate_limited import RateLimited
 
 from factorbus.client import Map, Snapshot
 from factorbus.client.stream import DeltaStream
@@ -17,7 +18,6 @@ from factorbus.proto.messages import Batch, Delta, Factors, Graph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.viz.certainty import MapCertainty
 from factorbus.viz.ellipses import Spread
-from factorbus.viz.polite import Polite
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Look:
         return np.concatenate([np.empty(0, np.int64), *(group.keys for group in self.deltas[-1].variables)])
 
 
-class Lookout:
+class MapFollower:
     """Follows a joined map that has a mirror.  One thread looks; close it, or use it in `with`.
 
     ellipses: of about how many poses, and points, to know where they may be.
@@ -52,11 +52,11 @@ class Lookout:
         self._map, self._mirror = joined, joined.estimate
         self._news = threading.Event()
         self._stream = DeltaStream(self._mirror, self._news.set)
-        self._graph = Polite(lambda: joined.ask.graph(None), Graph(0, 0, Batch()), self._news.set)
+        self._graph = RateLimited(lambda: joined.ask.graph(None), Graph(0, 0, Batch()), self._news.set)
         self._with_factors = with_factors
         self._certainty = MapCertainty(joined, ellipses, self._news.set) if ellipses else None
 
-    def __enter__(self) -> "Lookout":
+    def __enter__(self) -> "MapFollower":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -12,7 +12,7 @@ _SPARE = 10
 _LEAST_PAUSE_S = 0.5
 
 
-class Polite(Generic[T]):
+class RateLimited(Generic[T]):
     """The last answer to a question that is put again when it is out of date.  For one thread.
 
     ask: puts the question and returns at once.  told: called, on any thread, when an answer has come.

@@ -92,7 +92,7 @@ def cut(
     D = np.sqrt(np.maximum(information.diagonal(), 0.0))
     inverse = np.where(D > 0.0, 1.0 / np.where(D > 0.0, D, 1.0), 0.0)
     # 1. Without units, and without what rounding has made negative.
-    S, most, least = _normalised(information, eta, inverse)
+    S, most, least = _normalized(information, eta, inverse)
     of_kind = {kind: np.array([v for v in range(n) if kinds[v] == kind]) for kind in _ORDER if kind in kinds}
     places = {kind: start[of, None] + np.arange(_DIM[kind]) for kind, of in of_kind.items()}
     taken = {kind: np.zeros((len(of), _DIM[kind], _DIM[kind])) for kind, of in of_kind.items()}
@@ -153,7 +153,7 @@ def _pairs(a: int, b: int, same: bool) -> tuple[I64, I64]:
     return first, second
 
 
-def _normalised(information: F64, eta: F64, inverse: F64) -> tuple[F64, float, float]:
+def _normalized(information: F64, eta: F64, inverse: F64) -> tuple[F64, float, float]:
     """(S = D⁻¹ Λ D⁻¹ without negative eigenvalues, its largest one, ηᵀ Λ⁺ η)."""
     S = information * inverse * inverse[:, None]
     S = 0.5 * (S + S.T)

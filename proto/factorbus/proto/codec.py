@@ -37,8 +37,8 @@ def encode_insert(message: Insert) -> bytes:
     }
     if message.settle:
         content["settle"] = True
-    if message.points_below:
-        content["points_below"] = message.points_below
+    if message.convert_below:
+        content["convert_below"] = message.convert_below
     if message.changes:
         content["changes"] = changes_to_maps(message.changes)
     return _pack(content)
@@ -52,7 +52,7 @@ def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
         batch=read_batch(content, limits),
         settle=fields.flag("", content, "settle"),
         epoch=fields.integer("", content, "epoch", default=0),
-        points_below=fields.parameter("insert", content, "points_below", _INDEX, "0 or more, and finite", 0.0),
+        convert_below=fields.parameter("insert", content, "convert_below", _INDEX, "0 or more, and finite", 0.0),
         changes=read_changes(content) if "changes" in content else (),
     )
 
@@ -65,7 +65,7 @@ def encode_accepted(message: Accepted) -> bytes:
             "epoch": message.epoch,
             "revision": message.revision,
             "first_factor": message.first_factor,
-            "folded": message.folded,
+            "applied": message.applied,
             "report": message.report,
         }
     )
@@ -84,7 +84,7 @@ def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:
         epoch=fields.integer("", content, "epoch"),
         revision=fields.integer("", content, "revision"),
         first_factor=fields.integer("", content, "first_factor"),
-        folded=fields.integer("", content, "folded"),
+        applied=fields.integer("", content, "applied"),
         report=Report(fields.mapping("", content, "report")),
     )
 

@@ -68,7 +68,7 @@ def delta_key(map_name: str) -> str:
     return f"{map_root(map_name)}/out/delta"
 
 
-def keyframe_key(map_name: str) -> str:
+def snapshot_key(map_name: str) -> str:
     """Where the whole estimate is published now and then."""
     return f"{map_root(map_name)}/out/keyframe"
 

@@ -260,6 +260,6 @@ CHANGES = {
         ChangeKind("fix", "keys"),
         ChangeKind("free", "keys"),
         ChangeKind("place", "keys", "values"),
-        ChangeKind("marginalise", "keys"),
+        ChangeKind("marginalize", "keys"),
     )
 }

@@ -60,7 +60,7 @@ class Change(NamedTuple):
     loss              factors, loss, scale (n,)  their loss from now on; "": none
     weigh             factors, weight (n,)       their information is multiplied by it
     fix, free         keys                       held where they are; estimated again
-    marginalise       keys                       they go; what their factors say of others is kept
+    marginalize       keys                       they go; what their factors say of others is kept
     place             kind, keys, values, carry  variables of one kind go to these values (n, size); carry: what is not
                                                  placed by this insert goes along with what it hangs on
     """
@@ -97,7 +97,7 @@ class Batch(NamedTuple):
 class Insert(NamedTuple):
     """A client's request to add `batch`; with `settle`, iterate until converged afterwards.
 
-    points_below: afterwards idp features whose linearity index is below this become points; 0: none do.
+    convert_below: afterwards idp features whose linearity index is below this become points; 0: none do.
 
     sequence: 1, 2, 3, ... per client and map; the same number again gets the first answer again.
     epoch: the epoch of the map the client joined, or 0 for "whichever"; another one is refused.
@@ -108,7 +108,7 @@ class Insert(NamedTuple):
     batch: Batch
     settle: bool = False
     epoch: int = 0
-    points_below: float = 0.0
+    convert_below: float = 0.0
     changes: tuple[Change, ...] = ()
 
 
@@ -117,7 +117,7 @@ class Accepted:
     """The answer to an insert: from `revision` on the estimate includes it.
 
     first_factor: id of the insert's first factor; the others follow in the order of the message.
-    folded: inserts that this step took in together.  report: the step's account of work (see StepReport keys
+    applied: inserts that this step took in together.  report: the step's account of work (see StepReport keys
     in `proto/README.md`): strategy, because, chi2, iterations, step_ms, ...
     """
 
@@ -125,7 +125,7 @@ class Accepted:
     epoch: int
     revision: int
     first_factor: int
-    folded: int
+    applied: int
     report: Mapping[str, Any] = field(default_factory=Report)
 
 
@@ -201,7 +201,7 @@ class JobDone:
 
 @dataclass(frozen=True, slots=True)
 class Optimum:
-    """The payload that answers a job of kind `batch`: the graph optimised from scratch, its χ² and its values.
+    """The payload that answers a job of kind `batch`: the graph optimized from scratch, its χ² and its values.
 
     start: what led there, one of `STARTS`; "": not told.  converged: false where the search ended before it had.
     """

@@ -7,7 +7,7 @@ from factorbus.proto.kinds import CHANGES, FACTOR_KINDS, LOSSES, VARIABLE_KINDS
 from factorbus.proto.version import __version__
 
 # The fields of an insert: a reader skips those that it does not know.
-INSERT_FIELDS = ("sequence", "epoch", "settle", "points_below", "changes", "variables", "factors")
+INSERT_FIELDS = ("sequence", "epoch", "settle", "convert_below", "changes", "variables", "factors")
 # Those of a group of variables in it, likewise.
 VARIABLE_FIELDS = ("kind", "keys", "values", "fixed", "stamps")
 

@@ -68,7 +68,7 @@ def _exchange(session: zenoh.Session) -> dict[str, bytes]:
     _ask(session, keys.admin_key("fork"), codec.encode_map({"map": MAP, "as": PIECES}))
     # A landmark that three poses have seen goes: what it said of them stays, as one linear factor in pieces.
     third = Factors("landmark_se2", np.array([[X[3], L[0]]]), np.array([[-0.9, 1.1]]), np.array([POINT]))
-    changes = (Change("marginalise", keys=np.array(L[:1])),)
+    changes = (Change("marginalize", keys=np.array(L[:1])),)
     for sequence, insert in enumerate(
         (Insert(1, Batch(factors=(third,)), True), Insert(2, Batch(), changes=changes)), 1
     ):

@@ -12,7 +12,7 @@ from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.offsets import Offsets, has_lever, is_moved, seen_from_pose
 from factorbus.formats.records import SWITCH_PRIOR, Edge
-from factorbus.formats.rotations import isam_edges3, normalised_poses
+from factorbus.formats.rotations import isam_edges3, normalized_poses
 from factorbus.formats.weights import checked_information, packed_upper, squared
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
@@ -99,7 +99,7 @@ def _columns(name: str, record: Edge, bucket: Bucket, reading: Reading) -> EdgeC
     measured, weights = numbers[:, : record.measured], numbers[:, record.measured :]
     ends, measured, information = _converted(file, name, record, lines, ends, measured, weights)
     if measured.shape[1] == 7:
-        measured = normalised_poses(file, name, lines, measured)
+        measured = normalized_poses(file, name, lines, measured)
     if record.kind == "bearing_range_se2":
         refuse_first(
             file, lines, measured[:, 1] <= 0, lambda row: f"{name} with range {measured[row, 1]:g}", "a range above 0"

@@ -22,7 +22,7 @@ from factorbus.formats.left_out import LeftOut
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.records import OFFSETS
-from factorbus.formats.rotations import inverse, matrices, normalised_poses, product
+from factorbus.formats.rotations import inverse, matrices, normalized_poses, product
 from factorbus.formats.weights import packed_upper, unpacked_symmetric
 from factorbus.proto.arrays import F64, I64
 
@@ -90,7 +90,7 @@ def _declared(file: str, name: str, space: str, bucket: Bucket, more: int = 0) -
     lines = np.array(bucket.numbers, np.int64)
     poses = numbers[:, : width - 1]
     if space == "se3":
-        poses = normalised_poses(file, name, lines, poses)
+        poses = normalized_poses(file, name, lines, poses)
     found: dict[int, F64] = {}
     for number, pose, line in zip(ids[:, 0].tolist(), poses, bucket.numbers, strict=True):
         if number in found and (found[number] != pose).any():

@@ -13,7 +13,7 @@ from factorbus.formats.errors import FormatError
 from factorbus.formats.graph import GraphFile
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
-from factorbus.formats.rotations import normalised_poses
+from factorbus.formats.rotations import normalized_poses
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.stamps import LEAST_STAMP, MOST_STAMP
@@ -45,7 +45,7 @@ def read_trajectory(file: str, buckets: Mapping[str, Bucket]) -> GraphFile:
     stamps = np.array([_nanoseconds(file, line, time) for line, time, _ in rows], np.int64)
     _, values = read_numbers(file, _POSE, poses, 0, 7, "tx ty tz qx qy qz qw after the time")
     lines: I64 = np.array(poses.numbers, np.int64)
-    values = np.ascontiguousarray(normalised_poses(file, _POSE, lines, values))
+    values = np.ascontiguousarray(normalized_poses(file, _POSE, lines, values))
     keys = symbol("x", 0) + np.arange(len(rows))
     return GraphFile(file, TUM, Batch((Variables("se3", keys, values, False, stamps),)), ())
 

@@ -19,7 +19,7 @@ from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
 from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
 from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
-from factorbus.formats.rotations import normalised_poses
+from factorbus.formats.rotations import normalized_poses
 from factorbus.formats.sniff import named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
@@ -43,7 +43,7 @@ def read(
     dialect: "g2o", "toro", "isam", "slam++" or "tum"; without it the names of the records decide, and the ending where
     they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.  Keys are
     symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols and time
-    stamps are, all keys are the ids themselves.  Quaternions are normalised; angles stay as they are.  Records that
+    stamps are, all keys are the ids themselves.  Quaternions are normalized; angles stay as they are.  Records that
     have no kind here are left out, which `notes` and `left_out` say; with `strict` they are refused.  So are vertices
     that no step of a replay would have, unless the graph is wanted `whole`, as it is written to another file.  Raises
     FormatError, which names the file and the line.
@@ -156,7 +156,7 @@ def _vertices(file: str, name: str, record: Vertex, bucket: Bucket) -> VertexCol
     ids, values = read_numbers(file, name, bucket, record.ids, record.width, record.fields)
     lines = np.array(bucket.numbers, np.int64)
     if record.kind == "se3":
-        values = normalised_poses(file, name, lines, values)
+        values = normalized_poses(file, name, lines, values)
     return VertexColumns(record.kind, lines, ids[:, 0], np.ascontiguousarray(values))
 
 

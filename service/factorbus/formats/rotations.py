@@ -1,4 +1,4 @@
-"""Rotations as files have them: quaternions to be normalised, and the roll, pitch and yaw of iSAM."""
+"""Rotations as files have them: quaternions to be normalized, and the roll, pitch and yaw of iSAM."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _UNIT = 8 * np.finfo(float).eps
 _RPY_FROM_YPR = (0, 1, 2, 5, 4, 3)
 
 
-def normalised_poses(file: str, name: str, lines: I64, poses: F64) -> F64:
+def normalized_poses(file: str, name: str, lines: I64, poses: F64) -> F64:
     """SE3 poses (n, 7) with quaternions of norm 1.  Those that have it are kept bit for bit.
 
     Raises FormatError where a norm is far from 1.

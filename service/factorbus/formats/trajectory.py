@@ -62,17 +62,17 @@ def one_trajectory(batch: Batch, form: str, robot: str | None = None) -> list[St
 
 def untimed(rows: list[Stamped]) -> list[Stamped]:
     """The poses without a time stamp of a trajectory in which others have one: there is no time to give them."""
-    lacking = [row for row in rows if row.stamp is None]
-    return lacking if len(lacking) < len(rows) else []
+    missing = [row for row in rows if row.stamp is None]
+    return missing if len(missing) < len(rows) else []
 
 
 def untimed_note(rows: list[Stamped]) -> str:
     """What is to be said of those, for people; empty: there are none."""
-    lacking = untimed(rows)
-    if not lacking:
+    missing = untimed(rows)
+    if not missing:
         return ""
-    names, has = shown([format_symbol(row.key) for row in lacking]), "has" if len(lacking) == 1 else "have"
-    return f"{counted(len(lacking), 'pose')} left out: {names} {has} no time stamp, and others have one"
+    names, has = shown([format_symbol(row.key) for row in missing]), "has" if len(missing) == 1 else "have"
+    return f"{counted(len(missing), 'pose')} left out: {names} {has} no time stamp, and others have one"
 
 
 def write_trajectories(

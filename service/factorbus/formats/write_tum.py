@@ -36,8 +36,8 @@ def tum_notes(batch: Batch, robot: str | None = None) -> tuple[str, ...]:
 
 
 def _text(rows: list[Stamped]) -> str:
-    lacking = {row.key for row in untimed(rows)}
-    return "".join(f"{_time(row)} {' '.join(map(repr, row.pose))}\n" for row in rows if row.key not in lacking)
+    missing = {row.key for row in untimed(rows)}
+    return "".join(f"{_time(row)} {' '.join(map(repr, row.pose))}\n" for row in rows if row.key not in missing)
 
 
 def _time(row: Stamped) -> str:

@@ -15,7 +15,7 @@ from factorbus.journal.store import NAME, open_store, what_reading_failed_with
 from factorbus.ownership import private_file
 
 _PIECE = 32 << 20
-_TABLE = "CREATE TABLE piece (fold INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
+_TABLE = "CREATE TABLE piece (record INTEGER NOT NULL, number INTEGER NOT NULL, bytes BLOB NOT NULL)"
 
 
 def export_map(folder: Path, file: Path) -> int:
@@ -34,9 +34,9 @@ def export_map(folder: Path, file: Path) -> int:
     try:
         with _opened(beside) as database:
             database.execute(_TABLE)
-            (revision,) = database.execute("SELECT COALESCE(MAX(revision), 0) FROM fold").fetchone()
+            (revision,) = database.execute("SELECT COALESCE(MAX(revision), 0) FROM record").fetchone()
             for each in saved:
-                if _put(database, each.fold, file_of(folder, each.fold)):
+                if _put(database, each.record, file_of(folder, each.record)):
                     break
         beside.rename(file)
         sync_folder(file.absolute().parent)
@@ -63,8 +63,8 @@ def import_map(file: Path, folder: Path) -> None:
             shutil.copyfileobj(source, target)
         open_store(beside, read_only=True).close()
         with _opened(beside / NAME) as database:
-            for fold, content in _pieces(database):
-                with open(file_of(beside, fold), "ab", opener=private_file) as snapshot:
+            for record, content in _pieces(database):
+                with open(file_of(beside, record), "ab", opener=private_file) as snapshot:
                     snapshot.write(content)
             database.execute("DROP TABLE IF EXISTS piece")
             database.execute("UPDATE header SET value = ? WHERE name = 'map'", (folder.name,))
@@ -105,13 +105,13 @@ class _Database:
             self._connection.close()
 
 
-def _put(database: sqlite3.Connection, fold: int, path: Path) -> bool:
+def _put(database: sqlite3.Connection, record: int, path: Path) -> bool:
     """Whether the snapshot is there and is now in the database, too."""
     try:
         with path.open("rb") as file:
             number = 0
             while content := file.read(_PIECE):
-                database.execute("INSERT INTO piece VALUES (?, ?, ?)", (fold, number, content))
+                database.execute("INSERT INTO piece VALUES (?, ?, ?)", (record, number, content))
                 number += 1
     except FileNotFoundError:
         return False
@@ -120,7 +120,7 @@ def _put(database: sqlite3.Connection, fold: int, path: Path) -> bool:
 
 def _pieces(database: sqlite3.Connection) -> Iterator[tuple[int, bytes]]:
     if database.execute("SELECT name FROM sqlite_master WHERE name = 'piece'").fetchone():
-        yield from database.execute("SELECT fold, bytes FROM piece ORDER BY fold, number")
+        yield from database.execute("SELECT record, bytes FROM piece ORDER BY record, number")
 
 
 def _check(folder: Path) -> None:

@@ -16,9 +16,9 @@ log = logging.getLogger(__name__)
 
 
 def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, Any], saved: Saved) -> None:
-    """The journal in `source`, which may be at work, up to a fold into `target`, which must not be there yet.
+    """The journal in `source`, which may be at work, up to a record into `target`, which must not be there yet.
 
-    state: of the solver after that fold, so that a restart is quick; saved: which fold that is, and what the state is
+    state: of the solver after that record, so that a restart is quick; saved: which record that is, and what the state is
     of.  The inserts are there too.  All of it or nothing.
     Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, JournalFailed.
     """
@@ -27,7 +27,7 @@ def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, A
     try:
         make_beside(beside)
         _copy(source, beside)
-        _begin(beside, target.name, epoch, saved.fold, _written(beside, state, saved))
+        _begin(beside, target.name, epoch, saved.record, _written(beside, state, saved))
         sync_folder(beside)
         beside.rename(target)
         sync_folder(target.parent)
@@ -47,9 +47,9 @@ def _copy(source: Path, beside: Path) -> None:
 
 def _written(beside: Path, state: Mapping[str, Any], saved: Saved) -> Saved | None:
     """The snapshot, if there is room for it: without one a restart takes longer."""
-    if not saved.fold:
+    if not saved.record:
         return None
-    path = file_of(beside, saved.fold)
+    path = file_of(beside, saved.record)
     try:
         return saved._replace(bytes=write_snapshot(path, state))
     except OSError as error:
@@ -57,9 +57,9 @@ def _written(beside: Path, state: Mapping[str, Any], saved: Saved) -> Saved | No
         return None
 
 
-def _begin(beside: Path, name: str, epoch: Epoch, fold: int, saved: Saved | None) -> None:
+def _begin(beside: Path, name: str, epoch: Epoch, record: int, saved: Saved | None) -> None:
     store = open_store(beside)
     try:
-        store.become(name, fold, epoch, saved)
+        store.become(name, record, epoch, saved)
     finally:
         store.close()

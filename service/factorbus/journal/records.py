@@ -28,7 +28,7 @@ class Entry(NamedTuple):
     message: bytes
 
 
-class Fold(NamedTuple):
+class JournalRecord(NamedTuple):
     """Inserts that went to the solver together, in this order, and the revision that came of it.
 
     number: 1, 2, 3, ...   rebuilt: the solver failed meanwhile and was replaced   chain: a digest of every value that
@@ -44,21 +44,21 @@ class Fold(NamedTuple):
 
 
 class Maker(NamedTuple):
-    """The build of the solver that made a fold and those after it, up to the next maker's.
+    """The build of the solver that made a record and those after it, up to the next maker's.
 
     build: its parts by name, as the solver names them.
     """
 
-    fold: int
+    record: int
     build: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
 class Epoch:
-    """One life of the map: its number, the fold it begins with, and why it began."""
+    """One life of the map: its number, the record it begins with, and why it began."""
 
     epoch: int
-    fold: int
+    record: int
     because: str
 
 

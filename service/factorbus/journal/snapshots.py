@@ -25,9 +25,9 @@ _MAGIC = b"FBSNAP01"
 _BLOCK = 1 << 20
 
 
-def file_of(folder: Path, fold: int) -> Path:
-    """Where the snapshot after fold `fold` is."""
-    return folder / f"snapshot-{fold}.fbs"
+def file_of(folder: Path, record: int) -> Path:
+    """Where the snapshot after record `record` is."""
+    return folder / f"snapshot-{record}.fbs"
 
 
 def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
@@ -74,7 +74,7 @@ def read_snapshot(path: Path) -> dict[str, Any]:
 
 def remove_strangers(folder: Path, known: set[int]) -> None:
     """Remove snapshot files that the journal does not know: begun, and not noted before the end came."""
-    names = {file_of(folder, fold).name for fold in known}
+    names = {file_of(folder, record).name for record in known}
     for path in [*folder.glob("snapshot-*.fbs"), *folder.glob("snapshot-*.part")]:
         if path.name not in names:
             path.unlink(missing_ok=True)

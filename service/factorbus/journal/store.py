@@ -1,6 +1,6 @@
 """A journal's database: what is in its tables, and how it is written.
 
-Written by one process, and read by others at the same time (WAL).  One transaction takes in all folds that wait for it
+Written by one process, and read by others at the same time (WAL).  One transaction takes in all records that wait for it
 (group commit); it is there after a crash wholly or not at all.
 """
 
@@ -19,40 +19,40 @@ from factorbus.journal.connecting import APPLICATION, FORM, connected, connectio
 from factorbus.journal.digest import digest_of
 from factorbus.journal.folders import UNFINISHED, check_own, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, NoJournal
-from factorbus.journal.records import Entry, Epoch, Fold, Header, Maker, Sender
+from factorbus.journal.records import Entry, Epoch, Header, JournalRecord, Maker, Sender
 from factorbus.ownership import private_file
 
 NAME = "journal.db"
 _SCHEMA = """
 CREATE TABLE header (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, fold INTEGER NOT NULL, because TEXT NOT NULL);
+CREATE TABLE epoch (number INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, record INTEGER NOT NULL, because TEXT NOT NULL);
 -- rebuilt: 0, or 1 where the solver failed meanwhile and was replaced, or 2 for a step without an insert
-CREATE TABLE fold (
+CREATE TABLE record (
     number INTEGER PRIMARY KEY, revision INTEGER NOT NULL, rebuilt INTEGER NOT NULL, chain BLOB NOT NULL
 );
 CREATE TABLE entry (
-    number INTEGER PRIMARY KEY, fold INTEGER NOT NULL, client TEXT NOT NULL, sequence INTEGER NOT NULL,
+    number INTEGER PRIMARY KEY, record INTEGER NOT NULL, client TEXT NOT NULL, sequence INTEGER NOT NULL,
     digest INTEGER NOT NULL, outcome INTEGER NOT NULL, revision INTEGER NOT NULL, first_factor INTEGER NOT NULL,
     together INTEGER NOT NULL, answer BLOB NOT NULL, message BLOB NOT NULL
 );
 CREATE INDEX entry_of_client ON entry (client);
 CREATE TABLE snapshot (
-    fold INTEGER PRIMARY KEY, format INTEGER NOT NULL, build TEXT NOT NULL, differs TEXT NOT NULL,
+    record INTEGER PRIMARY KEY, format INTEGER NOT NULL, build TEXT NOT NULL, differs TEXT NOT NULL,
     bytes INTEGER NOT NULL
 );
-CREATE TABLE maker (fold INTEGER PRIMARY KEY, build TEXT NOT NULL);
+CREATE TABLE maker (record INTEGER PRIMARY KEY, build TEXT NOT NULL);
 """
 _REBUILT, _FURTHER = 1, 2
 _ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
 
 
 class Saved(NamedTuple):
-    """A snapshot that was written: after which fold, in which format of a state, by which build, how large.
+    """A snapshot that was written: after which record, in which format of a state, by which build, how large.
 
     differs: why a replay of the journal up to there may give other bits; empty: as far as is known it gives the same.
     """
 
-    fold: int
+    record: int
     format: int
     build: Mapping[str, str]
     differs: str = ""
@@ -62,7 +62,7 @@ class Saved(NamedTuple):
 class Last(NamedTuple):
     """Where a journal ends."""
 
-    fold: int
+    record: int
     revision: int
     chain: bytes
 
@@ -88,102 +88,104 @@ class Store:
     def last(self) -> Last:
         """Where it ends.  Raises JournalDamaged."""
         with self._reading():
-            row = self._db.execute("SELECT number, revision, chain FROM fold ORDER BY number DESC LIMIT 1").fetchone()
+            row = self._db.execute("SELECT number, revision, chain FROM record ORDER BY number DESC LIMIT 1").fetchone()
         return Last(*row) if row else Last(0, 0, chain.START)
 
-    def at(self, fold: int) -> Last:
-        """Where it was after `fold`.  Raises JournalDamaged."""
+    def at(self, record: int) -> Last:
+        """Where it was after `record`.  Raises JournalDamaged."""
         with self._reading():
-            row = self._db.execute("SELECT number, revision, chain FROM fold WHERE number = ?", (fold,)).fetchone()
+            row = self._db.execute("SELECT number, revision, chain FROM record WHERE number = ?", (record,)).fetchone()
         if row is None:
-            raise JournalDamaged(self.path, f"fold {fold}, which a snapshot was made after, is missing")
+            raise JournalDamaged(self.path, f"record {record}, which a snapshot was made after, is missing")
         return Last(*row)
 
-    def folds(self, after: int = 0) -> Iterator[Fold]:
-        """What was folded after fold `after`, in order.  Raises JournalDamaged."""
+    def records(self, after: int = 0) -> Iterator[JournalRecord]:
+        """What was applied after record `after`, in order.  Raises JournalDamaged."""
         with self._reading():
             entries = self._db.execute(
-                f"SELECT fold, {_ENTRY}, message FROM entry WHERE fold > ? ORDER BY number", (after,)
+                f"SELECT record, {_ENTRY}, message FROM entry WHERE record > ? ORDER BY number", (after,)
             )
             row = entries.fetchone()
-            for fold in self._db.execute("SELECT * FROM fold WHERE number > ? ORDER BY number", (after,)):
-                number, revision, rebuilt, digest = fold
+            for record in self._db.execute("SELECT * FROM record WHERE number > ? ORDER BY number", (after,)):
+                number, revision, rebuilt, digest = record
                 if number != after + 1:
-                    raise JournalDamaged(self.path, f"fold {after + 1} is missing")
+                    raise JournalDamaged(self.path, f"record {after + 1} is missing")
                 after, taken = number, []
                 while row is not None and row[0] == number:
                     taken.append(self._checked(Entry(*row[1:])))
                     row = entries.fetchone()
                 if row is not None and row[0] < number:
-                    raise JournalDamaged(self.path, f"an insert of fold {row[0]} is out of order")
-                yield Fold(number, revision, rebuilt == _REBUILT, digest, tuple(taken), rebuilt == _FURTHER)
+                    raise JournalDamaged(self.path, f"an insert of record {row[0]} is out of order")
+                yield JournalRecord(number, revision, rebuilt == _REBUILT, digest, tuple(taken), rebuilt == _FURTHER)
             if row is not None:
-                raise JournalDamaged(self.path, f"an insert belongs to fold {row[0]}, which is missing")
+                raise JournalDamaged(self.path, f"an insert belongs to record {row[0]}, which is missing")
 
     def makers(self) -> list[Maker]:
-        """The builds that made its folds, in their order; one that made none is left out.  Raises JournalDamaged."""
+        """The builds that made its records, in their order; one that made none is left out.  Raises JournalDamaged."""
         with self._reading():
             rows = self._db.execute(
-                "SELECT * FROM maker WHERE fold <= (SELECT MAX(number) FROM fold) ORDER BY fold"
+                "SELECT * FROM maker WHERE record <= (SELECT MAX(number) FROM record) ORDER BY record"
             ).fetchall()
-            return [Maker(fold, json.loads(build)) for fold, build in rows]
+            return [Maker(record, json.loads(build)) for record, build in rows]
 
-    def senders(self, first_fold: int, clients: int, entries: int) -> list[Sender]:
+    def senders(self, first_record: int, clients: int, entries: int) -> list[Sender]:
         """The `clients` heard last, each with up to `entries` of its last inserts.
 
-        Of the present epoch, which began with `first_fold`.  The client heard longest ago comes first.
+        Of the present epoch, which began with `first_record`.  The client heard longest ago comes first.
         """
         with self._reading():
             names = self._db.execute(
-                "SELECT client, MAX(number) AS heard FROM entry WHERE fold >= ? GROUP BY client "
-                "ORDER BY heard DESC LIMIT ?", (first_fold, clients),
+                "SELECT client, MAX(number) AS heard FROM entry WHERE record >= ? GROUP BY client "
+                "ORDER BY heard DESC LIMIT ?", (first_record, clients),
             ).fetchall()  # fmt: skip
-            return [self._sender(name, first_fold, entries) for name, _ in reversed(names)]
+            return [self._sender(name, first_record, entries) for name, _ in reversed(names)]
 
     def counts(self) -> dict[str, int]:
         """Folds, inserts, clients and bytes of all messages."""
         with self._reading():
-            (folds,) = self._db.execute("SELECT COUNT(*) FROM fold").fetchone()
+            (records,) = self._db.execute("SELECT COUNT(*) FROM record").fetchone()
             row = self._db.execute(
                 "SELECT COUNT(*), COUNT(DISTINCT client), SUM(LENGTH(message)) FROM entry"
             ).fetchone()
-        return {"folds": folds, "inserts": row[0], "clients": row[1], "message_bytes": row[2] or 0}
+        return {"records": records, "inserts": row[0], "clients": row[1], "message_bytes": row[2] or 0}
 
     def snapshots(self) -> list[Saved]:
         """The snapshots that were written, newest first."""
         with self._reading():
-            rows = self._db.execute("SELECT * FROM snapshot ORDER BY fold DESC").fetchall()
-            return [Saved(fold, form, json.loads(build), *more) for fold, form, build, *more in rows]
+            rows = self._db.execute("SELECT * FROM snapshot ORDER BY record DESC").fetchall()
+            return [Saved(record, form, json.loads(build), *more) for record, form, build, *more in rows]
 
-    def append(self, folds: Sequence[Fold]) -> None:
-        """Write `folds` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
+    def append(self, records: Sequence[JournalRecord]) -> None:
+        """Write `records` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
         with self._writing():
             self._db.executemany(
-                "INSERT INTO fold VALUES (?, ?, ?, ?)", [(f.number, f.revision, _kind(f), f.chain) for f in folds]
+                "INSERT INTO record VALUES (?, ?, ?, ?)", [(f.number, f.revision, _kind(f), f.chain) for f in records]
             )
             self._db.executemany(
-                f"INSERT INTO entry (fold, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                [(fold.number, *entry) for fold in folds for entry in fold.entries],
+                f"INSERT INTO entry (record, {_ENTRY}, message) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [(record.number, *entry) for record in records for entry in record.entries],
             )
 
     def add_snapshot(self, saved: Saved, keep: int) -> list[int]:
-        """Note a snapshot, and forget all but the last `keep`: gives the folds of those.  Raises JournalFailed."""
+        """Note a snapshot, and forget all but the last `keep`: gives the records of those.  Raises JournalFailed."""
         with self._writing():
             self._insert_snapshot(saved)
-            old = self._db.execute("SELECT fold FROM snapshot ORDER BY fold DESC LIMIT -1 OFFSET ?", (keep,)).fetchall()
-            self._db.executemany("DELETE FROM snapshot WHERE fold = ?", old)
-        return [fold for (fold,) in old]
+            old = self._db.execute(
+                "SELECT record FROM snapshot ORDER BY record DESC LIMIT -1 OFFSET ?", (keep,)
+            ).fetchall()
+            self._db.executemany("DELETE FROM snapshot WHERE record = ?", old)
+        return [record for (record,) in old]
 
     def begin(self, durability: str, epoch: Epoch | None = None, maker: Maker | None = None) -> None:
         """Somebody is at work with it from now on, in a new epoch if there is one.
 
-        maker: who makes the next fold, if it is not who made the last one.  Raises JournalFailed.
+        maker: who makes the next record, if it is not who made the last one.  Raises JournalFailed.
         """
         with self._writing():
             self._set({"clean": "0", "durability": durability})
-            self._db.execute("DELETE FROM maker WHERE fold > (SELECT COALESCE(MAX(number), 0) FROM fold)")
+            self._db.execute("DELETE FROM maker WHERE record > (SELECT COALESCE(MAX(number), 0) FROM record)")
             if maker is not None:
-                self._db.execute("INSERT INTO maker VALUES (?, ?)", (maker.fold, _text(maker.build)))
+                self._db.execute("INSERT INTO maker VALUES (?, ?)", (maker.record, _text(maker.build)))
             if epoch is not None:
                 self._add_epoch(epoch)
                 self._seal()
@@ -193,16 +195,16 @@ class Store:
         with self._writing():
             self._set({"clean": "1"})
 
-    def become(self, name: str, fold: int, epoch: Epoch, saved: Saved | None) -> None:
-        """A copy of another map's is the journal of map `name`: with nothing after `fold`, in an epoch of its own.
+    def become(self, name: str, record: int, epoch: Epoch, saved: Saved | None) -> None:
+        """A copy of another map's is the journal of map `name`: with nothing after `record`, in an epoch of its own.
 
         saved: the one snapshot that it has.  Raises JournalFailed.
         """
         with self._writing():
-            self._db.execute("DELETE FROM entry WHERE fold > ?", (fold,))
-            self._db.execute("DELETE FROM fold WHERE number > ?", (fold,))
-            self._db.execute("DELETE FROM epoch WHERE fold > ?", (epoch.fold,))
-            self._db.execute("DELETE FROM maker WHERE fold > ?", (fold,))
+            self._db.execute("DELETE FROM entry WHERE record > ?", (record,))
+            self._db.execute("DELETE FROM record WHERE number > ?", (record,))
+            self._db.execute("DELETE FROM epoch WHERE record > ?", (epoch.record,))
+            self._db.execute("DELETE FROM maker WHERE record > ?", (record,))
             self._add_epoch(epoch)
             self._db.execute("DELETE FROM snapshot")
             if saved is not None:
@@ -232,10 +234,10 @@ class Store:
                     yield said
             yield from self._check_sequences()
             revision = 0
-            for fold in self.folds():
-                if fold.revision < revision:
-                    yield f"fold {fold.number} goes back from revision {revision} to {fold.revision}"
-                revision = fold.revision
+            for record in self.records():
+                if record.revision < revision:
+                    yield f"record {record.number} goes back from revision {revision} to {record.revision}"
+                revision = record.revision
             self.header()
         except JournalDamaged as damaged:
             yield str(damaged.detail["what"])
@@ -288,18 +290,18 @@ class Store:
         return dict(self._db.execute("SELECT name, value FROM header"))
 
     def _epochs(self) -> list[Epoch]:
-        return [Epoch(*row) for row in self._db.execute("SELECT epoch, fold, because FROM epoch ORDER BY number")]
+        return [Epoch(*row) for row in self._db.execute("SELECT epoch, record, because FROM epoch ORDER BY number")]
 
     def _seal(self) -> None:
         self._set({"seal": _sealed(self._header(), self._epochs())})
 
     def _add_epoch(self, epoch: Epoch) -> None:
         self._db.execute(
-            "INSERT INTO epoch (epoch, fold, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.fold, epoch.because)
+            "INSERT INTO epoch (epoch, record, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.record, epoch.because)
         )
 
     def _insert_snapshot(self, saved: Saved) -> None:
-        row = saved.fold, saved.format, _text(saved.build), saved.differs, saved.bytes
+        row = saved.record, saved.format, _text(saved.build), saved.differs, saved.bytes
         self._db.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?, ?, ?)", row)
 
     def _checked(self, entry: Entry) -> Entry:
@@ -307,10 +309,10 @@ class Store:
             raise JournalDamaged(self.path, f"insert {entry.sequence} of client {entry.client} is not what was written")
         return entry
 
-    def _sender(self, name: str, first_fold: int, most: int) -> Sender:
+    def _sender(self, name: str, first_record: int, most: int) -> Sender:
         rows = self._db.execute(
-            f"SELECT {_ENTRY}, message FROM entry WHERE client = ? AND fold >= ? ORDER BY number DESC LIMIT ?",
-            (name, first_fold, most),
+            f"SELECT {_ENTRY}, message FROM entry WHERE client = ? AND record >= ? ORDER BY number DESC LIMIT ?",
+            (name, first_record, most),
         )
         entries: list[Entry] = []
         for row in rows:
@@ -324,11 +326,11 @@ class Store:
 
     def _check_sequences(self) -> Iterator[str]:
         """Each client's numbers are 1, 2, 3, ... in every epoch."""
-        begins = [fold for (fold,) in self._db.execute("SELECT fold FROM epoch ORDER BY number")]
+        begins = [record for (record,) in self._db.execute("SELECT record FROM epoch ORDER BY number")]
         for first, end in pairwise([*begins, 1 << 62]):
             rows = self._db.execute(
                 "SELECT client, sequence, sequence - LAG(sequence, 1, 0) OVER (PARTITION BY client ORDER BY number) "
-                "FROM entry WHERE fold >= ? AND fold < ?", (first, end),
+                "FROM entry WHERE record >= ? AND record < ?", (first, end),
             )  # fmt: skip
             for client, sequence, by in rows:
                 if by != 1 and sequence != 1:
@@ -366,14 +368,14 @@ def open_store(folder: Path, durability: str = "commit", read_only: bool = False
 
 def _sealed(named: Mapping[str, str], epochs: Sequence[Epoch]) -> str:
     """A digest of what makes a map's steps, and of its lives."""
-    rows = [[each.epoch, each.fold, each.because] for each in epochs]
+    rows = [[each.epoch, each.record, each.because] for each in epochs]
     content = json.dumps([named.get("mode"), named.get("options"), rows])
     return blake2b(content.encode("utf-8", "surrogatepass"), digest_size=16).hexdigest()
 
 
-def _kind(fold: Fold) -> int:
+def _kind(record: JournalRecord) -> int:
     """As the table has it, in the column `rebuilt`."""
-    return _FURTHER if fold.further else _REBUILT * fold.rebuilt
+    return _FURTHER if record.further else _REBUILT * record.rebuilt
 
 
 def _text(build: Mapping[str, str]) -> str:
@@ -387,7 +389,7 @@ def _fill(path: Path, name: str, mode: str, options: dict[str, Any], epoch: int,
         with store._writing():
             for statement in _SCHEMA.split(";"):
                 store._db.execute(statement)
-            store._db.execute("INSERT INTO epoch (epoch, fold, because) VALUES (?, 1, 'created')", (epoch,))
+            store._db.execute("INSERT INTO epoch (epoch, record, because) VALUES (?, 1, 'created')", (epoch,))
             store._set(
                 {"map": name, "mode": mode, "options": json.dumps(options), "durability": durability, "clean": "0"}
             )

@@ -1,11 +1,11 @@
 """The service at work: what comes over the bus goes to the maps, what they want done is done.
 
 threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand over; one of them at a time may
-                           fold an insert in instead, and send what comes of it, when that is soon done
-          solver <map>     folds and steps, and encodes what comes of it
+                           record an insert in instead, and send what comes of it, when that is soon done
+          solver <map>     records and steps, and encodes what comes of it
           outbox           answers to inserts, and publications, in order
           refusals         of inserts and questions
-          desk             maps that come and go, jobs for workers
+          control             maps that come and go, jobs for workers
           answers 0..3     answers to questions, which can be large
           computed 0, 1    answers to questions that take long to compute: covariances of many, repair, files
           in-place <kind>  jobs when there is no worker
@@ -44,14 +44,14 @@ from factorbus.service.core.events import Asked, Asker, Refuse
 from factorbus.service.jobs.features import FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
-from factorbus.service.jobs.worker_latency import Trips
+from factorbus.service.jobs.worker_latency import WorkerLatency
 from factorbus.service.journal.library import Library, log_owner, open_library
-from factorbus.service.maps.serial_executor import Lane
-from factorbus.service.operations.health_report import Vitals
+from factorbus.service.maps.serial_executor import SerialExecutor
+from factorbus.service.operations.health_report import HealthReport
 from factorbus.service.operations.metrics import open_metrics
 from factorbus.service.operations.start import ready_to_compute
 from factorbus.service.process.health import Health
-from factorbus.service.process.worker_threads import LentCores
+from factorbus.service.process.worker_threads import WorkerThreads
 from factorbus.service.questions.admin import NotHere, read_create, read_drop, read_fork
 from factorbus.service.questions.answers import Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
@@ -85,7 +85,7 @@ def serve(
             if config.standby:
                 library = open_library(config, log_owner, stop)
             if not stop.is_set():
-                with closing(LentCores(config.cores)) as cores:
+                with closing(WorkerThreads(config.cores)) as cores:
                     _serve(config, library, cores, on_ready, stop, on_look)
     finally:
         if library is not None:
@@ -95,7 +95,7 @@ def serve(
 def _serve(
     config: Config,
     library: Library | None,
-    cores: LentCores,
+    cores: WorkerThreads,
     on_ready: Callable[[list[str]], None],
     stop: threading.Event,
     on_look: Callable[[Health], None],
@@ -103,10 +103,10 @@ def _serve(
     bus = open_service_bus(config)
     try:
         shell = Shell(bus, config, library)
-        shell.vitals.chapters["cores"] = cores.account
+        shell.health_report.chapters["cores"] = cores.account
         try:
             shell.maps.create_all(config.create)
-            shell.vitals.health.open = True
+            shell.health_report.health.open = True
             shell.tick()  # so that the first who asks is told of all maps
             endpoints = bus.endpoints()
             if library is not None:
@@ -115,7 +115,7 @@ def _serve(
             while not stop.wait(_TICK_S):
                 shell.tick()
                 cores.tick()
-                on_look(shell.vitals.health)
+                on_look(shell.health_report.health)
         finally:
             shell.close()
     finally:
@@ -129,25 +129,25 @@ class Shell:
         self._bus, self._config = bus, config
         self._service = config.name or f"s{secrets.token_hex(4)}"
         self._decoding = config.limits.message()
-        self._desk = Lane("desk")
-        self._senders = Senders(self._desk, bus.know)
+        self._control = SerialExecutor("control")
+        self._senders = Senders(self._control, bus.know)
         self._delivery = Delivery(config.limits.questions, self._about, self._find_optimum, self._fork)
-        lanes = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "desk": self._desk}
-        self.vitals = Vitals(config, self._service, lanes, lambda: self.maps.hosts())
-        self.maps = Maps(bus, config, self._service, library, self._delivery, self._desk, self.vitals.memory)
-        self.vitals.chapters["protocol"] = known
-        self.vitals.chapters["unopened"] = self.maps.unopened
+        executors = {"outbox": self._delivery.outbox, "refusals": self._delivery.refusals, "control": self._control}
+        self.health_report = HealthReport(config, self._service, executors, lambda: self.maps.hosts())
+        self.maps = Maps(bus, config, self._service, library, self._delivery, self._control, self.health_report.memory)
+        self.health_report.chapters["protocol"] = known
+        self.health_report.chapters["unopened"] = self.maps.unopened
         self._worker_rows: list[dict[str, Any]] = []
-        self.vitals.chapters["workers"] = lambda: self._worker_rows
+        self.health_report.chapters["workers"] = lambda: self._worker_rows
         self._stuck: set[str] = set()
-        self._jobs = Jobs(self._desk, bus.send_job)
-        self.vitals.chapters["wrong_answers"] = lambda: self._jobs.wrong_answers
-        self._trips = Trips(self._desk, bus.send_job, self._jobs)
+        self._jobs = Jobs(self._control, bus.send_job)
+        self.health_report.chapters["wrong_answers"] = lambda: self._jobs.wrong_answers
+        self._latencies = WorkerLatency(self._control, bus.send_job, self._jobs)
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = FeatureQuestions(
-            self._desk, self._jobs, self._trips, reply, refuse, self._decoding, limits.jobs, deadline_s,
-            Room(self.vitals.memory, limits.answer_bytes),
+            self._control, self._jobs, self._latencies, reply, refuse, self._decoding, limits.jobs, deadline_s,
+            Room(self.health_report.memory, limits.answer_bytes),
         )  # fmt: skip
         if config.warm:
             rates = self._features.measure()
@@ -165,7 +165,7 @@ class Shell:
         bus.answer_on(keys.admin_key("*"), self._on_admin)
         bus.answer_on(keys.features_key(self._service), self._on_features)
         bus.watch(keys.any_worker_token(), self._on_worker)
-        self._metrics = open_metrics(config.metrics, self.vitals)
+        self._metrics = open_metrics(config.metrics, self.health_report)
         self.maps.announce()
         self._withdraw_features = bus.announce(keys.features_token(self._service))
 
@@ -173,22 +173,22 @@ class Shell:
         """Time went by."""
         for host in self.maps.hosts().values():
             host.tick()
-        stuck = self.vitals.look()
+        stuck = self.health_report.look()
         if stuck != self._stuck:
-            self._desk.hand(self.maps.show, stuck ^ self._stuck, stuck)
+            self._control.hand(self.maps.show, stuck ^ self._stuck, stuck)
             self._stuck = stuck
-        self._desk.hand(self._jobs.tick)
-        self._desk.hand(self._look_for_workers)
+        self._control.hand(self._jobs.tick)
+        self._control.hand(self._look_for_workers)
 
     def close(self) -> None:
         """Withdraw, finish everything accepted, answer it, and undeclare."""
-        self.vitals.health.open = False
+        self.health_report.health.open = False
         self._withdraw_features()
         self.maps.finish()
         self._delivery.settle()
         self._features.stop()
-        self._desk.hand(self._jobs.close)
-        self._desk.close()
+        self._control.hand(self._jobs.close)
+        self._control.close()
         self._features.close()
         self._delivery.close()
         self._metrics.close()
@@ -213,7 +213,7 @@ class Shell:
             found.host.unread(client, read)
             return
         self._senders.remember(key, sender)
-        if (full := self.vitals.memory.no_room(read.size)) is not None:
+        if (full := self.health_report.memory.no_room(read.size)) is not None:
             read = read._replace(content=full, message=b"")
         found.host.insert(read)
 
@@ -226,8 +226,8 @@ class Shell:
             found.host.ask(Asked(query, question, payload_of(query)))
 
     def _on_admin(self, query: Asker) -> None:
-        if (waiting := self._desk.waiting) < _ADMIN_WAITING:
-            self._desk.hand(self._administer, query)
+        if (waiting := self._control.waiting) < _ADMIN_WAITING:
+            self._control.hand(self._administer, query)
         else:
             refuse(query, Busy(waiting, 0.1))
 
@@ -241,11 +241,11 @@ class Shell:
             log.warning("a worker's token without a number of slots: %s", token)
             return
         if alive:
-            self._desk.hand(self._jobs.joined, worker, slots)
-            self._desk.hand(self._trips.joined, worker)
+            self._control.hand(self._jobs.joined, worker, slots)
+            self._control.hand(self._latencies.joined, worker)
         else:
-            self._desk.hand(self._jobs.left, worker)
-            self._desk.hand(self._trips.left, worker)
+            self._control.hand(self._jobs.left, worker)
+            self._control.hand(self._latencies.left, worker)
 
     def _about(self) -> dict[str, Any]:
         from factorbus.service.operations.warm import compiled_seconds
@@ -259,10 +259,10 @@ class Shell:
         }
 
     def _find_optimum(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
-        self._desk.hand(self._optima.batch, asker, question, taken)
+        self._control.hand(self._optima.batch, asker, question, taken)
 
     def _fork(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
-        self._desk.hand(self.maps.forked, asker, question, taken)
+        self._control.hand(self.maps.forked, asker, question, taken)
 
     def _no_map(self, query: Asker, name: str, following: int | None = None) -> None:
         if problem := self.maps.missing(name):
@@ -270,7 +270,7 @@ class Shell:
         else:
             ignore(query)
 
-    # ---- on the desk, which sends nothing itself to whoever might not take it ---------------------------------------
+    # ---- on the control, which sends nothing itself to whoever might not take it ---------------------------------------
 
     def _administer(self, query: Asker) -> None:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)
@@ -279,7 +279,7 @@ class Shell:
                 told = {"maps": self.maps.rows(), "service": self._service, "version": __version__, "protocol": known()}
                 self._delivery.answer(query, codec.encode_map(told))
             elif operation == "stats":
-                self._delivery.answer(query, codec.encode_map(self.vitals.account()))
+                self._delivery.answer(query, codec.encode_map(self.health_report.account()))
             elif operation == "create":
                 self._delivery.answer(
                     query, codec.encode_map(self.maps.create(*read_create(payload)) | {"protocol": known()})
@@ -305,8 +305,8 @@ class Shell:
             self._delivery.refuse(query, Internal(reference))
 
     def _look_for_workers(self) -> None:
-        self._trips.look_for(self._jobs.suspects, self._jobs.distrusted)
-        self._worker_rows = [row | self._trips.row(row["name"]) for row in self._jobs.workers()]
+        self._latencies.look_for(self._jobs.suspects, self._jobs.distrusted)
+        self._worker_rows = [row | self._latencies.row(row["name"]) for row in self._jobs.workers()]
 
     def _refuse_if_kept_elsewhere(self, tokens: str) -> None:
         """Two processes must not keep one map: at a router, look who is there.  Raises BadConfig."""

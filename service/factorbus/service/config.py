@@ -40,8 +40,8 @@ class Limits:
     changes: int = 64  # inserts with changes of one client, admitted or parked, that have no answer yet
     questions: int = 256  # waiting for the solver to come to a revision
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
-    fold: int = 64  # inserts that one step takes in ...
-    fold_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
+    record: int = 64  # inserts that one step takes in ...
+    step_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
     unwritten: int = 1024  # inserts that the journal has yet to write before the solver gets more
     parked_s: float = 5.0  # how long an insert waits for the one before it
     message_bytes: int = 64 << 20

@@ -1,6 +1,6 @@
 """The maps of a service: found on disk, made, dropped, each with its host and its place on the bus.
 
-Made and dropped on the desk only, or before it has work; looked up from any thread.
+Made and dropped on the control only, or before it has work; looked up from any thread.
 """
 
 import logging
@@ -22,7 +22,7 @@ from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.library import CopiedAt, Kept, Library, make_folder, restored
 from factorbus.service.maps.host import Host
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
 from factorbus.service.process.memory import MemoryLimit, OutOfMemory
 from factorbus.service.questions.admin import (
@@ -38,7 +38,7 @@ from factorbus.service.questions.admin import (
 )
 from factorbus.service.questions.answers import Copied, Question, QuestionCopies
 from factorbus.service.questions.question_memory import Room
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 
 log = logging.getLogger(__name__)
 
@@ -67,17 +67,17 @@ class Maps:
     """All maps of one service.  named: of the service, in tokens."""
 
     def __init__(
-        self, bus: ServiceBus, config: Config, named: str, library: Library | None, delivery: Delivery, desk: Lane,
+        self, bus: ServiceBus, config: Config, named: str, library: Library | None, delivery: Delivery, control: SerialExecutor,
         memory: MemoryLimit,
     ) -> None:  # fmt: skip
         self._bus, self._config, self._service, self._library = bus, config, named, library
-        self._delivery, self._desk, self._memory = delivery, desk, memory
+        self._delivery, self._control, self._memory = delivery, control, memory
         self._maps: dict[str, OpenMap] = {}
         self._leaving: list[OpenMap] = []
         self._unopened: dict[str, Problem] = {}  # that are on disk and do not open
         self._forks: dict[str, Fork] = {}  # what maps were forked from, since this service began
         self._stopping = False
-        self._seat = threading.Lock()  # of the one callback that may solve
+        self._inline_run = threading.Lock()  # of the one callback that may solve
 
     def get(self, name: str) -> OpenMap | None:
         """Map `name`, if it is here."""
@@ -164,7 +164,7 @@ class Maps:
             return
         self._forks[asked.fork.target] = asked.fork
         self._delivery.answer(asker, codec.encode_map(row | {"protocol": known()}))
-        self._desk.hand(give_back)
+        self._control.hand(give_back)
 
     def drop(self, asker: Asker, drop: Drop) -> None:
         """Drop a map as `drop` says, and answer when it is gone.
@@ -182,7 +182,7 @@ class Maps:
             raise self.missing(name) or NotHere(name, self._config.maps)
 
         def on_drained() -> None:
-            self._desk.hand(self._dropped, asker, found)
+            self._control.hand(self._dropped, asker, found)
             found.drained.set()
 
         before, found.on_drained = found.on_drained, on_drained
@@ -232,7 +232,7 @@ class Maps:
         """mode: None for that of the map which is there.  Raises Problem."""
         return self._at_work(*self._begin(name, mode))
 
-    def _at_work(self, core: MapCore, folder: Folder, kept: Kept | None) -> OpenMap:
+    def _at_work(self, core: MapCore, folder: MapSolver, kept: Kept | None) -> OpenMap:
         name = core.name
         folder.bound(Room(self._memory, self._config.limits.answer_bytes))
         place, options = self._bus.place(name, self._service), folder.options()
@@ -241,11 +241,11 @@ class Maps:
             return {"options": options, **made.host.journal()}
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
-        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._seat, by.send_both, kept)
+        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._inline_run, by.send_both, kept)
         made = OpenMap(host, place, options)
         return made
 
-    def _begin(self, name: str, mode: str | None) -> tuple[MapCore, Folder, Kept | None]:
+    def _begin(self, name: str, mode: str | None) -> tuple[MapCore, MapSolver, Kept | None]:
         """What a map is made of, as it was or new.  Raises Problem."""
         limits, library, now = self._config.limits, self._library, time.monotonic()
         if problem := self._unopened.get(name):
@@ -313,7 +313,7 @@ class Maps:
         limits, was, now = self._config.limits, found.host.core, time.monotonic()
         kept = None
         if self._library is not None:
-            copy = CopiedAt(taken.fold, copied.state, was.differs or "")
+            copy = CopiedAt(taken.record, copied.state, was.differs or "")
             kept = self._library.fork(fork.source, fork.target, copy, limits)
             epoch, folder = kept.header.epoch, kept.folder
         else:
@@ -329,7 +329,7 @@ class Maps:
         self._leaving.remove(found)
         found.host.end(keep=False)
         self._delivery.outbox.hand(found.place.close)  # behind the map's last publications
-        self._desk.hand(give_back)
+        self._control.hand(give_back)
         if self._library is not None:
             try:
                 self._library.remove(name)
@@ -337,18 +337,18 @@ class Maps:
                 log.error("the journal of map %s stays: %s", name, problem)
                 self._delivery.refuse(asker, problem)
                 return
-        self._desk.hand(self._delivery.answer, asker, codec.encode_map({}))
+        self._control.hand(self._delivery.answer, asker, codec.encode_map({}))
         log.info("map %s dropped", name, extra={"map": name})
 
     def _no_more(self) -> list[OpenMap]:
-        """The maps there are once the desk is done with what it had: no map is created after this."""
+        """The maps there are once the control is done with what it had: no map is created after this."""
         reached = threading.Event()
 
         def stop() -> None:
             self._stopping = True
             reached.set()
 
-        self._desk.hand(stop)
+        self._control.hand(stop)
         reached.wait()
         return list(self._maps.values())
 

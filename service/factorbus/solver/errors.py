@@ -25,11 +25,11 @@
     ├── UnknownFactor          unknown_factor          a factor id that the map does not have, or not any more
     ├── NotInMap               unknown_variable        a change of a variable that the map does not have
     ├── InUse                  in_use                  variables to be removed alone that other factors are on
-    ├── TooConnected           too_connected           variables to be marginalised with too large a border
+    ├── TooConnected           too_connected           variables to be marginalized with too large a border
     ├── BadOrder               bad_order               changes in an order that has no meaning
     ├── NamedTwice             named_twice             a change that names a factor or a variable twice
     ├── BadWeight              bad_weight              a weight out of its range
-    ├── Uninitialised          uninitialised           a variable without value that no factor of its batch reaches
+    ├── Uninitialized          uninitialized           a variable without value that no factor of its batch reaches
     └── Underconstrained       underconstrained        a variable that the factors leave free to move
 
 `code`, `message` and `detail` (plain types) are what a service needs to pass any of them on.
@@ -318,8 +318,8 @@ class TooConnected(SolverError):
     def __init__(self, key: int, count: int, border: Sequence[int], most: int) -> None:
         listed = ", ".join(map(printed, border[:8])) + (", ..." if len(border) > 8 else "")
         super().__init__(
-            f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalised: they share "
-            f"factors with {counted(len(border), 'other')}, {listed}; wanted at most {most}: marginalise some of these "
+            f"{printed(key)} and what hangs together with it ({count} in all) cannot be marginalized: they share "
+            f"factors with {counted(len(border), 'other')}, {listed}; wanted at most {most}: marginalize some of these "
             "as well, or remove some of its factors first",
             key=key,
             border=list(border),
@@ -353,8 +353,8 @@ class BadWeight(SolverError):
         )
 
 
-class Uninitialised(SolverError):
-    code = "uninitialised"
+class Uninitialized(SolverError):
+    code = "uninitialized"
 
     def __init__(self, key: int) -> None:
         super().__init__(

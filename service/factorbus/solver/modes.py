@@ -9,8 +9,8 @@ from factorbus.solver.errors import UnknownMode
 class Mode:
     """One mode.
 
-    updates      R and d follow Λ and η by updates; else every step that solves factorises anew
-    batch_every  new variables after which the whole system is solved anew, and only then is the linearisation point
+    updates      R and d follow Λ and η by updates; else every step that solves factorizes anew
+    batch_every  new variables after which the whole system is solved anew, and only then is the linearization point
                  moved: between batches the estimate is that of the linear problem; 0: whenever a step needs it
     tree         the tree of cliques, MATH §9
     """

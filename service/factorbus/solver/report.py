@@ -12,7 +12,7 @@ class StepReport(NamedTuple):
 
     mode         the solver's mode
     strategy     "extend": the gradient was zero, there was nothing to solve; "omega", "lambda", "full": how R was
-                 brought up to date in the incremental modes (MATH §8); "all-batch": all was factorised, in that mode;
+                 brought up to date in the incremental modes (MATH §8); "all-batch": all was factorized, in that mode;
                  "tree", "batch": part of R was made again, or all was solved by Gauss-Newton, in the mode "bayes-tree"
     because      the reason for the strategy, for a person
     iterations   Gauss-Newton or Levenberg-Marquardt steps that were accepted
@@ -20,11 +20,11 @@ class StepReport(NamedTuple):
                  new factors included, new variables at their first values (`Options.initialize_locally`)
     new_variables, new_factors   taken in by this step
     changed      variables whose values differ from before, the new ones included
-    relinearised linearisation points that were moved, counted once per iteration
-    eliminated   variables eliminated, counted once per factorisation
+    relinearized linearization points that were moved, counted once per iteration
+    eliminated   variables eliminated, counted once per factorization
     asleep       sights without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
-                 linearised); `Solver.asleep` tells which and why
-    nnz_r, flops of one factorisation; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
+                 linearized); `Solver.asleep` tells which and why
+    nnz_r, flops of one factorization; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
     converged    a full Gauss-Newton step from the estimate would not lower χ² by more than `Options.converged_share` of
                  it, in the mode "bayes-tree" by a bound; in the others the last iteration did not by more than the
                  tolerance
@@ -41,7 +41,7 @@ class StepReport(NamedTuple):
     new_variables: int = 0
     new_factors: int = 0
     changed: int = 0
-    relinearised: int = 0
+    relinearized: int = 0
     eliminated: int = 0
     asleep: int = 0
     nnz_r: int = 0
@@ -61,7 +61,7 @@ class StepReport(NamedTuple):
         return told
 
 
-class Shares(Mapping[str, float]):
+class CompileSplit(Mapping[str, float]):
     """A total by name, in proportion to counts; worked out when somebody asks, since every step has one and few do."""
 
     __slots__ = ("_counts", "_names", "_total")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.changes.convert_to_points import find_ripe, pick_features, with_points
+from factorbus.solver.changes.convert_to_points import find_convertible, pick_features, with_points
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.in_place import try_in_place
 from factorbus.solver.changes.requested import ChangeLike, Edits, collect, unchanged
@@ -29,7 +29,7 @@ from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.stepper import Stepper
 
-_LANES = "lanes"
+_LANES = "executors"
 _VALUES = MappingProxyType({kind.__name__: kind for kind in STATE_TYPES})
 
 
@@ -112,7 +112,7 @@ class Solver:
 
     def ripe(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
-        return self._graph.keys[find_ripe(self._graph, below)]
+        return self._graph.keys[find_convertible(self._graph, below)]
 
     def with_points(self, keys: I64) -> tuple["Solver", StepReport]:
         """A solver in which these features are points, under their keys, and its first step; this one stays as it is.
@@ -128,7 +128,7 @@ class Solver:
         """A solver of the same map with `changes` made, in their order, and then `batch` added; this one stays.
 
         Gives it, the id of the first factor of `batch`, the report of its first step, and what was changed.  That step
-        relinearises everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
+        relinearizes everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
         Raises as `changes.collect`, `stage` and `step` do.
         """
         edits = collect(self._graph, changes)
@@ -148,7 +148,7 @@ class Solver:
         """Make `changes` of factors, add `batch`, and step, in this solver: it eliminates what they touch, no more.
 
         Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
-        it is where they remove, fix, free, place or marginalise variables, where linear factors are among them, where
+        it is where they remove, fix, free, place or marginalize variables, where linear factors are among them, where
         something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.
         Raises as `changes.collect` and `stage` do.
         """

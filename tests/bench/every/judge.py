@@ -1,8 +1,8 @@
 """χ² of an estimate, and of the batch optimum from there, by full passes over the graph as it is after each step.
 
 The optimum is that of Gauss-Newton on all factors, with Levenberg-Marquardt's damping where a step would raise χ²,
-begun at the estimate.  Nothing of the incremental solver takes part: each pass linearises everything, orders and
-factorises it anew.  `oracle` has the same in NumPy and SciPy alone, and the tests hold one against the other.
+begun at the estimate.  Nothing of the incremental solver takes part: each pass linearizes everything, orders and
+factorizes it anew.  `oracle` has the same in NumPy and SciPy alone, and the tests hold one against the other.
 """
 
 from collections.abc import Iterable
@@ -72,7 +72,7 @@ class Judge:
     def look(self, estimate: Iterable[Group], coarse: float = COARSE) -> Look:
         """Judge an estimate of all variables.  Raises ValueError when one is missing or not finite."""
         start = self._values(estimate)
-        chi2, optimum, there, passes = self._minimise(start, coarse)
+        chi2, optimum, there, passes = self._minimize(start, coarse)
         excess = [self._root(f, start) - self._root(f, there) for f in self._odometry]
         return Look(chi2, optimum, max(excess, default=0.0), passes)
 
@@ -82,16 +82,16 @@ class Judge:
 
     def optimum(self, estimate: Iterable[Group]) -> tuple[float, F64]:
         """χ² and all values, in the order of insertion, at the optimum from an estimate."""
-        _, chi2, values, _ = self._minimise(self._values(estimate), FINE)
+        _, chi2, values, _ = self._minimize(self._values(estimate), FINE)
         return chi2, values[: self._mark[at.VALUES]]
 
-    def _minimise(self, start: F64, coarse: float) -> tuple[float, float, F64, int]:
+    def _minimize(self, start: F64, coarse: float) -> tuple[float, float, F64, int]:
         """(χ² there, χ² at the optimum, the values of it, passes) from `start`."""
         if not self._mark[at.COLUMNS]:
             chi2 = self._chi2(start)
             return chi2, chi2, start, 0
         x, trial, damping = start, np.empty_like(start), 0.0
-        chi2 = first = self._linearise(x)
+        chi2 = first = self._linearize(x)
         for passes in range(1, _MOST_PASSES + 1):
             if self._factorize(damping) >= 0:
                 damping = _more(damping)
@@ -109,11 +109,11 @@ class Judge:
                 damping = _more(damping)
                 continue
             damping = 0.0 if damping < 1e-6 else 0.1 * damping
-            x, chi2 = trial, self._linearise(trial)
+            x, chi2 = trial, self._linearize(trial)
         return first, chi2, x, _MOST_PASSES
 
-    def _linearise(self, values: F64) -> float:
-        chi2 = self._blocks.relinearise(self._graph, values)
+    def _linearize(self, values: F64) -> float:
+        chi2 = self._blocks.relinearize(self._graph, values)
         self._blocks.swap_lambda()
         self._blocks.swap_eta()
         return chi2

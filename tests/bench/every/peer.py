@@ -45,11 +45,11 @@ class Isam2Judge:
         chi2 = 2 * self._graph.error(estimate)
         if self._fits and chi2 - self._optimum <= (_FAR - 1) * max(self._optimum, UNIT):
             return Look(chi2, min(self._optimum, chi2), max(_root(factor, estimate) for factor in self._odometry), 0)
-        self._optimum, values, passes = self._minimise(estimate, chi2)
+        self._optimum, values, passes = self._minimize(estimate, chi2)
         excess = [_root(factor, estimate) - _root(factor, values) for factor in self._odometry]
         return Look(chi2, self._optimum, max(excess, default=0.0), passes)
 
-    def _minimise(self, values: Any, chi2: float) -> tuple[float, Any, int]:
+    def _minimize(self, values: Any, chi2: float) -> tuple[float, Any, int]:
         """(χ², values, passes) at the optimum from `values`, where it is `chi2`."""
         ordering = self._graph.orderingCOLAMD()
         for passes in range(1, _MOST_PASSES + 1):

@@ -137,7 +137,7 @@ def _gauss_newton() -> Entry:
         "one Gauss-Newton step at loops",
         {},
         OUR_PACKAGES,
-        "relinearise, order, analyse, factorise and solve, all of it, once at every step that closes a loop",
+        "relinearize, order, analyse, factorize and solve, all of it, once at every step that closes a loop",
     )
 
 

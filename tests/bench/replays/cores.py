@@ -16,7 +16,7 @@ import numpy as np
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Options, Solver, warm
-from factorbus.solver.sparse.lending import Lender
+from factorbus.solver.sparse.lending import WorkerThread
 
 from .clock import percentiles
 from .feed import fed
@@ -61,7 +61,7 @@ def cores(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]]
 @contextmanager
 def lent_core() -> Iterator[None]:
     """Another thread lends its core meanwhile."""
-    lender = Lender()
+    lender = WorkerThread()
     thread = threading.Thread(target=lender.lend)
     thread.start()
     try:

@@ -1,7 +1,7 @@
-"""A whole batch pass over a final system: ours, linearisation included, against CHOLMOD without it.
+"""A whole batch pass over a final system: ours, linearization included, against CHOLMOD without it.
 
-ours      relinearise + order + analyse + factorise + solve
-CHOLMOD   analyse (with its ordering) + factorise + solve, by scikit-sparse, of a matrix that is there already; the
+ours      relinearize + order + analyse + factorize + solve
+CHOLMOD   analyse (with its ordering) + factorize + solve, by scikit-sparse, of a matrix that is there already; the
           fastest of its modes and orderings counts
 
 Both at the optimum that the reference found.  CHOLMOD is as fast as its BLAS: with the reference BLAS the comparison
@@ -81,8 +81,8 @@ class OurPass:
     def run(self) -> tuple[Laps, F64]:
         """(seconds by phase, δ)."""
         graph, blocks, dims, watch = self._graph, self._blocks, self._dims, _Watch()
-        blocks.relinearise(graph, graph.values)
-        watch.lap("linearise")
+        blocks.relinearize(graph, graph.values)
+        watch.lap("linearize")
         perm = order(dims, blocks.rows, blocks.cols)
         watch.lap("order")
         symbolic = analyze(dims, blocks.rows, blocks.cols, perm)

@@ -1,7 +1,7 @@
 """A strong and simple rival, made of our batch kernels: one Gauss-Newton step on a fresh block Cholesky at every loop.
 
-No threshold, nothing kept: whenever a step brings more than new variables need, everything is linearised at the present
-point, ordered, analysed, factorised and solved once, and all variables move.  In between poses are composed.
+No threshold, nothing kept: whenever a step brings more than new variables need, everything is linearized at the present
+point, ordered, analysed, factorized and solved once, and all variables move.  In between poses are composed.
 """
 
 from typing import Any
@@ -68,7 +68,7 @@ class GaussNewtonAtLoops:
 
     def _solve(self) -> None:
         graph, blocks = self._graph, self._blocks
-        blocks.relinearise(graph, graph.values)
+        blocks.relinearize(graph, graph.values)
         blocks.swap_lambda()
         blocks.swap_eta()
         dims = graph.dims[: self._mark[at.COLUMNS]]

@@ -37,7 +37,7 @@ class Isam2:
         self._estimate = gtsam.Values()
         self._last_pose = ("se2", -1)
         self._kinds: set[str] = set()
-        self._sums = {"relinearised": 0, "eliminated": 0}
+        self._sums = {"relinearized": 0, "eliminated": 0}
         self._updates = 0
         self._result: Any = None
 
@@ -95,7 +95,7 @@ class Isam2:
 
     def _count(self) -> None:
         if self._result is not None:
-            self._sums["relinearised"] += self._result.getVariablesRelinearized()
+            self._sums["relinearized"] += self._result.getVariablesRelinearized()
             self._sums["eliminated"] += self._result.getVariablesReeliminated()
             self._updates, self._result = self._updates + 1, None
 

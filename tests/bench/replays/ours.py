@@ -61,7 +61,7 @@ class Ours:
         if self._report is not None:
             report, self._report = self._report, None
             self._strategies[report.strategy] += 1
-            for name in ("iterations", "relinearised", "eliminated"):
+            for name in ("iterations", "relinearized", "eliminated"):
                 self._sums[name] += int(getattr(report, name))
             self._nnz_r = report.nnz_r or self._nnz_r
 

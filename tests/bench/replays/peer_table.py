@@ -84,7 +84,7 @@ def cores_table(found: dict[str, Any]) -> str:
 
 def pass_table(found: dict[str, dict[str, Any]]) -> str:
     """Milliseconds by phase of both."""
-    phases = ("linearise", "order", "symbolic", "numeric", "solve", "total")
+    phases = ("linearize", "order", "symbolic", "numeric", "solve", "total")
     head = ["", "scalars", *phases, "CHOLMOD analyse", "numeric", "solve", "total", "CHOLMOD / ours", "by"]
     lines = [line(head), line(["---", *["---:"] * (len(head) - 2), "---"])]
     for dataset, passed in found.items():
@@ -130,5 +130,5 @@ same step, in replays that are not timed; where an optimum is below 1, an excess
 iterating until converged, at the end."""
 
 _PASS_LEGEND = """\
-Thread CPU milliseconds at the optimum, medians of interleaved repetitions. Ours linearises as well; CHOLMOD, through \
+Thread CPU milliseconds at the optimum, medians of interleaved repetitions. Ours linearizes as well; CHOLMOD, through \
 scikit-sparse, gets the matrix, and the fastest of its modes and orderings counts."""

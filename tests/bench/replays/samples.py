@@ -26,7 +26,7 @@ def sample_steps(steps: int, most: int = 100) -> tuple[int, ...]:
     """At most `most` steps, evenly spread, the last one among them.
 
     One step is taken from each of equal stretches, at a place in it that goes on by the golden section: a regular
-    grid of every hundredth step would always see a solver that optimises at every tenth or hundredth pose at the
+    grid of every hundredth step would always see a solver that optimizes at every tenth or hundredth pose at the
     same moment, right after it has done so.
     """
     if steps <= most:

@@ -17,7 +17,7 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.proto import codec, discreet, keys
+from factorbus.proto import codec, keys, redact
 from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
@@ -71,7 +71,7 @@ def _open(config: Config, stop: threading.Event) -> zenoh.Session | None:
         try:
             return zenoh.open(settings)
         except zenoh.ZError as error:
-            log.info("nothing at %s yet (%s)", discreet.endpoint(", ".join(config.connect)), discreet.reason(error))
+            log.info("nothing at %s yet (%s)", redact.endpoint(", ".join(config.connect)), redact.reason(error))
         stop.wait(pause)
         pause = min(2 * pause, _LONGEST_PAUSE_S)
     return None
@@ -95,7 +95,7 @@ def _settings(config: Config) -> zenoh.Config:
     except zenoh.ZError as error:
         # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
-        raise BadConfig(f"Zenoh does not take this configuration ({where}): {discreet.reason(error)}") from None
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
     return settings
 
 

@@ -1,6 +1,6 @@
 """What each kind of job does.  A job is a pure function of its payload, so that any worker, or two, may do it.
 
-batch    a Graph            → Optimum: the graph optimised from scratch
+batch    a Graph            → Optimum: the graph optimized from scratch
 idp      a Shard            → ShardDone: new features of a monocular filter, with their covariance
 """
 

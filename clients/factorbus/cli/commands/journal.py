@@ -46,9 +46,9 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
         counts = store.counts()
         rows.append(
             {"map": name, "mode": header.mode, "epoch": header.epoch, "revision": last.revision, **counts}
-            | {"snapshots": [saved.fold for saved in store.snapshots()], "durability": header.durability}
+            | {"snapshots": [saved.record for saved in store.snapshots()], "durability": header.durability}
             | {"epochs": [epoch.because for epoch in header.epochs], "closed_in_order": header.clean}
-            | {"builds": [{"from_fold": maker.fold, **maker.build} for maker in store.makers()]}
+            | {"builds": [{"from_record": maker.record, **maker.build} for maker in store.makers()]}
             | {"differs": next((saved.differs for saved in store.snapshots()), "")}
         )
     if as_json:
@@ -82,7 +82,7 @@ def _wrong_with(folder: Path) -> Iterator[str]:
             yield from store.check()
             for saved in store.snapshots():
                 try:
-                    read_snapshot(file_of(store.path.parent, saved.fold))
+                    read_snapshot(file_of(store.path.parent, saved.record))
                 except (OSError, ValueError) as error:
                     yield f"{error}; the map opens without it, and takes longer"
     except Problem as problem:
@@ -93,7 +93,7 @@ def _wrong_with(folder: Path) -> Iterator[str]:
 @_MAP
 @_FOLDER
 def verify(names: tuple[str, ...], folder: Path) -> int:
-    """Fold everything in again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
+    """JournalRecord everything in again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
 
     Another processor, or another version of factorbus, may well round otherwise: then the first revision is named at
     which the values differ.
@@ -105,18 +105,18 @@ def verify(names: tuple[str, ...], folder: Path) -> int:
 
     alike = True
     for name, store in _stores(folder, names):
-        header, total = store.header(), store.last().fold
+        header, total = store.header(), store.last().record
         again = make_folder(header.mode, header.options, header.epoch, Limits())
         revision, differs = 0, 0
         with screen.progress(name, total) as show_progress:
-            for fold, same in run_again(store, again):
-                revision = fold.revision
+            for record, same in run_again(store, again):
+                revision = record.revision
                 differs = differs or (0 if same else revision)
-                show_progress(fold.number, f"revision {revision}")
+                show_progress(record.number, f"revision {revision}")
         if differs:
             click.echo(f"{name}: values differ from revision {differs} on (of {revision})")
         else:
-            click.echo(f"{name}: {counted(total, 'fold')}, {counted(revision, 'revision')}, all the same to the bit")
+            click.echo(f"{name}: {counted(total, 'record')}, {counted(revision, 'revision')}, all the same to the bit")
         alike = alike and not differs
     return OK if alike else FAILED
 

@@ -64,15 +64,16 @@ def command(
 
 
 def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event") -> None:
+    from factorbus.viz.follower import MapFollower
+
     from factorbus.cli.output.console import note
-    from factorbus.viz.lookout import Lookout
     from factorbus.viz.mcap import Recording
 
-    with Lookout(joined) as lookout, Recording(path) as recording:
-        recording.begin(lookout.last_look(joined.timeout_s))
+    with MapFollower(joined) as follower, Recording(path) as recording:
+        recording.begin(follower.last_look(joined.timeout_s))
         click.echo(f"ready {path}")
         while not stop.wait(every_s) and (until is None or joined.estimate.revision < until):
-            recording.take(lookout.look())
-        recording.take(lookout.last_look(joined.timeout_s))
+            recording.take(follower.look())
+        recording.take(follower.last_look(joined.timeout_s))
     what = f"{counted(recording.deltas, 'delta')}, {counted(recording.factors, 'factor')}"
     note(f"{path}: {what}, up to revision {recording.revision}")

@@ -39,7 +39,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
       answer ms  from asking for these numbers to having them, over the bus
     """
     from factorbus.cli.output import console as screen
-    from factorbus.cli.output.stats_table import Gauges
+    from factorbus.cli.output.stats_table import Indicators
     from factorbus.cli.process.bus import open_bus
     from factorbus.cli.process.stopping import stop_on_signals
 
@@ -50,7 +50,7 @@ def command(endpoint: str, zenoh: str, every_s: float, once: bool, until_eof: bo
             "take --once for one look, or --json for a program"
         )
     with stop_on_signals(until_eof) as stop, open_bus(endpoint, "top", zenoh) as bus:
-        gauges = Gauges(bus)
+        gauges = Indicators(bus)
         seen = gauges.read()
         if once or as_json:
             stop.wait(every_s)
@@ -152,7 +152,7 @@ def _inserts(rows: list[dict[str, Any]]) -> int:
 def _workers(seen: dict[str, Any]) -> _Table:
     rows = []
     for row in seen["workers"]:
-        trip = "" if row.get("trip_ms") is None else f"{row['trip_ms']:.2f}"
+        trip = "" if row.get("latency_ms") is None else f"{row['latency_ms']:.2f}"
         trip = "distrusted" if row.get("distrusted") else trip
         rows.append((row["name"], str(row["slots"]), str(row["in_flight"]), trip))
     return ("worker", "slots", "in flight", "trip ms"), rows
@@ -179,10 +179,10 @@ def _drawn(names: list[str], rows: list[list[str]], longest: int | None) -> Any:
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     # A long name goes on in the next line; numbers do not.
-    table.add_column(names[0], style="bold", overflow="fold", max_width=longest)
+    table.add_column(names[0], style="bold", overflow="record", max_width=longest)
     for name in names[1:]:
         if name in _LEFT:
-            table.add_column(name, overflow="fold", max_width=longest)
+            table.add_column(name, overflow="record", max_width=longest)
         else:
             table.add_column(name, justify="right", no_wrap=True)
     for row in rows:

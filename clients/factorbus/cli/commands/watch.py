@@ -54,11 +54,12 @@ def command(
     if save and serving:
         raise click.UsageError("--save and --serve exclude each other")
     require("watch", "factorbus watch")
+    from factorbus.viz.follower import MapFollower
+
     from factorbus.cli.output.console import note
     from factorbus.cli.process.bus import joined_when_there, open_bus
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.viz.live import LiveView
-    from factorbus.viz.lookout import Lookout
 
     with (
         stop_on_signals(until_eof) as stop,
@@ -71,13 +72,13 @@ def command(
         view = LiveView(map_name)
         try:
             where = _open(view, save, host if serving or not _has_display() else None, web_port, data_port)
-            with Lookout(joined, ellipses=ellipses) as lookout:
-                view.show(lookout.last_look(joined.timeout_s))
+            with MapFollower(joined, ellipses=ellipses) as follower:
+                view.show(follower.last_look(joined.timeout_s))
                 click.echo(f"ready {where}")
                 while not stop.wait(1 / rate) and (until is None or joined.estimate.revision < until):
-                    if lookout.wait(0):
-                        view.show(lookout.look())
-                view.show(lookout.last_look(joined.timeout_s))
+                    if follower.wait(0):
+                        view.show(follower.look())
+                view.show(follower.last_look(joined.timeout_s))
         finally:
             view.close()
     unconverged = ", which had not converged" if joined.estimate.converged is False else ""

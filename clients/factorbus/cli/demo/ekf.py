@@ -58,14 +58,14 @@ class Filter:
         K = np.linalg.solve(S, HP).T
         P = self.P - K @ S @ K.T
         self.x, self.P = self.x + K @ innovation, (P + P.T) / 2
-        self._normalise()
+        self._normalize()
 
     def drop(self, kept: list[int]) -> None:
         """Keep these features only."""
         rows = [*range(CAMERA), *(CAMERA + FEATURE * i + j for i in kept for j in range(FEATURE))]
         self.x, self.P = self.x[rows], self.P[np.ix_(rows, rows)]
 
-    def _normalise(self) -> None:
+    def _normalize(self) -> None:
         """The quaternion to unit length, with what that does to P.  MATH (7.3)"""
         q = self.x[_Q]
         length = np.linalg.norm(q)

@@ -77,7 +77,7 @@ class Sightseer:
 
     def _grow(self, number: int, frame: Frame) -> None:
         order = np.arange(len(frame.points))
-        if number == 0:  # the points of the target are first, and recognised without fail
+        if number == 0:  # the points of the target are first, and recognized without fail
             order = np.argsort(frame.outlier, kind="stable")
         for feature in self.visual.grow(number, frame.points, frame.pixels, order.tolist()):
             distance = float(np.linalg.norm(self._world.points[feature.track] - frame.pose[:3]))

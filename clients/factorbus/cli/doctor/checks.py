@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.cli.output.exits import EXTRAS, Stopped, lacking
+from factorbus.cli.output.exits import EXTRAS, Stopped, missing
 from factorbus.cli.output.installing import install_command
 from factorbus.cli.output.versions import LIBRARIES, installed
 from factorbus.cli.process.options import USUAL_ENDPOINT
@@ -44,10 +44,10 @@ def libraries() -> Finding:
     """the libraries"""
     have = {name: installed(name) for name in LIBRARIES}
     seen = ", ".join([f"factorbus {__version__}", *(f"{name} {version}" for name, version in have.items() if version)])
-    if lacking("service"):
+    if missing("service"):
         mend = f"fine for a front end; for solver and workers: {install_command('service')}"
         return Finding("libraries", "warn", f"{seen}; a light client without the solver", mend)
-    if lacking("viz"):
+    if missing("viz"):
         return Finding("libraries", "warn", f"{seen}; no pictures", install_command("viz"))
     return Finding("libraries", "ok", seen)
 
@@ -118,7 +118,7 @@ def port() -> Finding:
 
 def bus() -> Finding:
     """a round trip over the bus"""
-    if lacking("service"):
+    if missing("service"):
         return Finding("bus", "warn", "not tried: it needs a solver process", install_command("service"))
     from factorbus.cli.process.children import service
     from factorbus.client import connect
@@ -184,7 +184,7 @@ def wall_clock() -> Finding:
     if not hasattr(libc, "adjtimex"):
         return Finding("wall clock", "ok", "not looked at: this system does not say how it is kept")
     state = libc.adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # modes 0: only asks
-    if state == _UNSYNCHRONISED:
+    if state == _UNSYNCHRONIZED:
         mend = "stamps of several machines will not line up: start chrony, or systemd-timesyncd"
         return Finding("wall clock", "warn", "nobody keeps it right (no NTP)", mend)
     if state < 0:
@@ -194,7 +194,7 @@ def wall_clock() -> Finding:
 
 def extras() -> Finding:
     """the extras"""
-    have = [name for name in EXTRAS if not lacking(name)]
+    have = [name for name in EXTRAS if not missing(name)]
     missing = [name for name in EXTRAS if name not in have]
     seen = f"{', '.join(have) or 'none'} installed" + (f"; without {', '.join(missing)}" if missing else "")
     mend = f"if wanted: {install_command(*missing)}" if missing else ""
@@ -217,7 +217,7 @@ def permissions() -> Finding:
 
 
 # Larger than `struct timex` on every Linux; its first field, modes, is zero.
-_TIMEX_BYTES, _UNSYNCHRONISED = 512, 5
+_TIMEX_BYTES, _UNSYNCHRONIZED = 512, 5
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
     python, libraries, extras, cholmod, cache, machine, clock, wall_clock, shared_memory, permissions, port, bus,

@@ -127,7 +127,7 @@ class Driven:
         self.factors += batch.factor_count
 
     def measures(self) -> dict[str, Any]:
-        """Counts, times and strategies, for JSON.  A step that folded several inserts counts once."""
+        """Counts, times and strategies, for JSON.  A step that applied several inserts counts once."""
         reports = list({step.revision: step.report for step in self.steps}.values())
         bus = [step.bus_ms for step in self.steps if step.bus_ms is not None]
         return {

@@ -98,7 +98,7 @@ def chi2_unsolved(batches: Iterable[Batch]) -> float:
 
 
 def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
-    """Key → covariance of its tangent, of some variables of a graph, linearised at the values that it has.
+    """Key → covariance of its tangent, of some variables of a graph, linearized at the values that it has.
 
     Raises SolverError.
     """

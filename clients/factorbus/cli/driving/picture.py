@@ -50,7 +50,7 @@ def reckoned(graph: Batch) -> tuple[Variables, ...]:
 
 def course_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> Course:
     """χ², time and work of every step, and χ² of the batch optimum where it was found, those not converged apart."""
-    names = ("new_variables", "eliminated", "relinearised")
+    names = ("new_variables", "eliminated", "relinearized")
     work = np.array([[report[name] for name in names] for report in reports], float).reshape(-1, 3)
     work[:, 0] = work[:, 0].cumsum()
     return Course(

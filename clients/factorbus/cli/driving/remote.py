@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from factorbus.cli.driving.drive import Compared, DriveStep
-from factorbus.client import Changes, Map, Ticket
+from factorbus.client import Changes, Map, PendingInsert
 from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Variables
 
 # A step of a large map may take long; a service that is gone is noticed otherwise.
@@ -21,7 +21,7 @@ class RemoteMap:
     def __init__(self, joined: Map, window: int = 1) -> None:
         self._map, self._window = joined, window
         self._mirror = joined.estimate
-        self._out: deque[Ticket] = deque()
+        self._out: deque[PendingInsert] = deque()
         self._start = self._waited = self._mirror.revision
         self._received: dict[int, Mapping[str, Any]] = {}
         self._latest: Mapping[str, Any] = {}
@@ -128,7 +128,7 @@ class RemoteMap:
         self._forget()
 
     def _on_delta(self, delta: Delta) -> None:
-        """Count a step's own delta; a resynchronisation (previous 0, everything in one) is not one."""
+        """Count a step's own delta; a resynchronization (previous 0, everything in one) is not one."""
         if delta.previous == delta.revision - 1 and delta.revision > self._start:
             self._received[delta.revision] = self._latest = delta.report
         with self._lock:
@@ -138,9 +138,9 @@ class RemoteMap:
     def _collect(self, wait: bool) -> list[DriveStep]:
         steps = []
         while self._out and (wait or self._out[0].done()):
-            ticket = self._out.popleft()
-            accepted = ticket.result(_ANSWER_S)
-            steps.append(_stepped(accepted, ticket.round_trip_s or 0.0))
+            pending_insert = self._out.popleft()
+            accepted = pending_insert.result(_ANSWER_S)
+            steps.append(_stepped(accepted, pending_insert.round_trip_s or 0.0))
         return steps
 
 

@@ -8,7 +8,7 @@ from factorbus.client import Bus, Map, Problem, Unavailable
 _ANSWER_S = 3.0
 
 
-class Gauges:
+class Indicators:
     """Reads a service's counters; rates are those between two readings."""
 
     def __init__(self, bus: Bus) -> None:

@@ -8,7 +8,7 @@ import ipaddress
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from factorbus.proto import discreet
+from factorbus.proto import redact
 from factorbus.service.config import BadConfig
 
 _ENCRYPTED = ("tls", "quic")
@@ -20,13 +20,13 @@ class Exposed(BadConfig):
 
     code = "exposed"
 
-    def __init__(self, endpoint: str, lacking: Sequence[str]) -> None:
-        shown = discreet.endpoint(endpoint)
+    def __init__(self, endpoint: str, missing: Sequence[str]) -> None:
+        shown = redact.endpoint(endpoint)
         super().__init__(
-            f"{shown} can be reached from other machines, and there is no {' and no '.join(lacking)}; see deploy/zenoh "
+            f"{shown} can be reached from other machines, and there is no {' and no '.join(missing)}; see deploy/zenoh "
             f"for a configuration that has it, listen on 127.0.0.1, or say --insecure to be open to everybody"
         )
-        self.detail |= {"endpoint": shown, "lacking": list(lacking)}
+        self.detail |= {"endpoint": shown, "missing": list(missing)}
 
 
 def refuse_exposed(listen: Sequence[str], setting: Callable[[str], Any]) -> None:
@@ -35,8 +35,8 @@ def refuse_exposed(listen: Sequence[str], setting: Callable[[str], Any]) -> None
         protocol = endpoint.partition("/")[0]
         if protocol in _LOCAL or _is_loopback(endpoint):
             continue
-        if lacking := [what for what, there in _protection(protocol, setting) if not there]:
-            raise Exposed(endpoint, lacking)
+        if missing := [what for what, there in _protection(protocol, setting) if not there]:
+            raise Exposed(endpoint, missing)
 
 
 def _protection(protocol: str, setting: Callable[[str], Any]) -> list[tuple[str, bool]]:

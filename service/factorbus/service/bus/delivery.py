@@ -2,7 +2,7 @@
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
-lanes a second, then Zenoh closes that client's transport.  Refusals have a lane of their own: of these a client can
+executors a second, then Zenoh closes that client's transport.  Refusals have a executor of their own: of these a client can
 have filled its queue with tens of thousands before the first is taken.  So have answers that are still to be computed,
 which may take a minute: what is ready, such as stats, does not wait for them.
 """
@@ -16,7 +16,7 @@ from factorbus.proto import codec
 from factorbus.proto.problems import Busy, Internal, Problem
 from factorbus.service.bus.zenoh_session import MapPlace, refuse, reply
 from factorbus.service.core.events import Answer, Asker, Drained, Effect, Publish, Read, Refuse, Tell
-from factorbus.service.maps.serial_executor import Lane, Lanes
+from factorbus.service.maps.serial_executor import SerialExecutor, SerialExecutors
 from factorbus.service.questions.answers import Question, QuestionCopies, answer, check_ready, is_computed
 from factorbus.solver.errors import SolverError
 
@@ -28,7 +28,7 @@ _RETRY_S = 1.0  # where many answers are still to be computed
 
 
 class Delivery:
-    """The outbox, the lanes that answer, that compute answers, that of refusals, and what goes on which.
+    """The outbox, the executors that answer, that compute answers, that of refusals, and what goes on which.
 
     most: answers that may wait to be computed.  about: what this service adds to the stats of a map.  batch: finds
     batch optima; (asker, question, snapshot).  copied: the same with a copy of a map, which is to be another one.
@@ -41,8 +41,12 @@ class Delivery:
         batch: Callable[[Asker, Question, QuestionCopies], None],
         copied: Callable[[Asker, Question, QuestionCopies], None],
     ) -> None:
-        self.outbox, self.refusals, self._answers = Lane("outbox"), Lane("refusals"), Lanes("answers", _ANSWERERS)
-        self._computed, self._most = Lanes("computed", _COMPUTERS), most
+        self.outbox, self.refusals, self._answers = (
+            SerialExecutor("outbox"),
+            SerialExecutor("refusals"),
+            SerialExecutors("answers", _ANSWERERS),
+        )
+        self._computed, self._most = SerialExecutors("computed", _COMPUTERS), most
         self._about, self._batch, self._copied = about, batch, copied
 
     def of_map(self, place: MapPlace, tell: Callable[[], dict[str, Any]], drained: Callable[[], None]) -> "MapDelivery":
@@ -69,7 +73,7 @@ class Delivery:
         self.refusals.close()
         self.outbox.close()
 
-    # ---- on the answering lanes: who does not take an answer holds up one of them for a second ----------------------
+    # ---- on the answering executors: who does not take an answer holds up one of them for a second ----------------------
 
     def tell(self, asker: Asker, content: dict[str, Any]) -> None:
         """Answer with `content` and what the service adds."""

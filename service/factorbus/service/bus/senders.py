@@ -8,7 +8,7 @@ it remembers the way.  What a client declares stays with the client, so the keys
 from collections.abc import Callable
 
 from factorbus.proto import keys
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.maps.serial_executor import SerialExecutor
 
 _MOST = 4096
 
@@ -16,13 +16,15 @@ _MOST = 4096
 class Senders:
     """The (map, client) of keys of inserts.  `find` is for any thread.
 
-    declare(key) makes a key known and gives what takes that back; it runs on the desk.
+    declare(key) makes a key known and gives what takes that back; it runs on the control.
     """
 
-    def __init__(self, desk: Lane, declare: Callable[[str], Callable[[], None]], most: int = _MOST) -> None:
-        self._desk, self._declare, self._most = desk, declare, most
+    def __init__(
+        self, control: SerialExecutor, declare: Callable[[str], Callable[[], None]], most: int = _MOST
+    ) -> None:
+        self._control, self._declare, self._most = control, declare, most
         self._found: dict[str, tuple[str, str]] = {}
-        self._forget: dict[str, Callable[[], None]] = {}  # on the desk only
+        self._forget: dict[str, Callable[[], None]] = {}  # on the control only
 
     def find(self, key: str) -> tuple[str, str]:
         """(map, client) of `key`.  Raises BadName."""
@@ -32,7 +34,7 @@ class Senders:
         """Something that can be read came from there: more will."""
         if key not in self._found:
             self._found[key] = sender
-            self._desk.hand(self._make_known, key)
+            self._control.hand(self._make_known, key)
 
     def _make_known(self, key: str) -> None:
         if key in self._forget:

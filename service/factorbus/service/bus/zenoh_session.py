@@ -14,7 +14,7 @@ from typing import Any
 import zenoh
 from zenoh.handlers import Callback
 
-from factorbus.proto import codec, discreet, keys
+from factorbus.proto import codec, keys, redact
 from factorbus.proto.kept_state import keep_state
 from factorbus.proto.messages import Job
 from factorbus.proto.ports import check_endpoints
@@ -49,7 +49,7 @@ def open_service_bus(config: Config) -> "ServiceBus":
     except zenoh.ZError as error:
         # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
-        raise BadConfig(f"Zenoh does not take this configuration ({where}): {discreet.reason(error)}") from None
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
 
     def setting(path: str) -> Any:
         return json.loads(settings.get_json(path))
@@ -63,9 +63,9 @@ def open_service_bus(config: Config) -> "ServiceBus":
     except zenoh.ZError as error:
         if config.mode != "client":
             check_endpoints(config.listen)
-        where = discreet.endpoint(", ".join(config.listen if config.mode != "client" else config.connect))
+        where = redact.endpoint(", ".join(config.listen if config.mode != "client" else config.connect))
         raise BadConfig(
-            f"cannot open {where}: {discreet.reason(error)}; is the address right, and its certificate there?"
+            f"cannot open {where}: {redact.reason(error)}; is the address right, and its certificate there?"
         ) from None
 
 
@@ -150,7 +150,7 @@ class MapPlace:
     """One map's publications, and its token."""
 
     def __init__(self, session: zenoh.Session, name: str, service: str) -> None:
-        channels = {"delta": keys.delta_key, "event": keys.event_key, "keyframe": keys.keyframe_key}
+        channels = {"delta": keys.delta_key, "event": keys.event_key, "keyframe": keys.snapshot_key}
         # DROP: one stuck subscriber must not hold up all others; whoever misses a delta sees the gap and asks.
         self._channels = {
             channel: session.declare_publisher(

@@ -18,7 +18,7 @@ BOUNDS_S = (
 
 
 class InsertDone(NamedTuple):
-    """An insert that was folded in by a step of its own; seconds are those since it arrived."""
+    """An insert that was applied in by a step of its own; seconds are those since it arrived."""
 
     strategy: str
     chi2: float

@@ -130,7 +130,7 @@ class Admission:
         A change comes alone.
         """
         taken: list[Arrived] = []
-        room = self._limits.fold_bytes
+        room = self._limits.step_bytes
         while self._turns and len(taken) < most:
             begin, _, name = self._turns[0]
             client = self._clients[name]
@@ -212,7 +212,7 @@ class Admission:
         self._clients[name] = client
 
     def took(self, inserts: int, seconds: float) -> None:
-        """Learn the pace: `inserts` were folded in `seconds`."""
+        """Learn the pace: `inserts` were applied in `seconds`."""
         if inserts:
             self._pace_s += 0.1 * (seconds / inserts - self._pace_s)
 

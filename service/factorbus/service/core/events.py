@@ -21,7 +21,7 @@ Asker: TypeAlias = Any
 # ---- events -----------------------------------------------------------------------------------------------------
 
 
-class Located(NamedTuple):
+class ParsedInsert(NamedTuple):
     """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
 
     message: bytes
@@ -43,7 +43,7 @@ class Arrived(NamedTuple):
     epoch: int
     size: int
     digest: int
-    content: Insert | Located | Problem
+    content: Insert | ParsedInsert | Problem
     now: float
     message: bytes = b""
 
@@ -73,7 +73,7 @@ class Outcome(NamedTuple):
     first_factor: int = -1
 
 
-class Judged(NamedTuple):
+class Verdict(NamedTuple):
     """The solver accepted or refused these inserts.
 
     revision, together: of the step that took in those that were accepted, and how many they were.
@@ -105,8 +105,8 @@ class Stepped(NamedTuple):
     unfinished: bool = False
 
 
-class Folded(NamedTuple):
-    """The solver is done with a Run; how large the map is now, and what its thread has used.
+class Applied(NamedTuple):
+    """The solver is done with a InsertBatch; how large the map is now, and what its thread has used.
 
     refused: a further step was, and the map is where it was.
     """
@@ -118,8 +118,8 @@ class Folded(NamedTuple):
     refused: bool = False
 
 
-class Alone(NamedTuple):
-    """One insert was taken in by a step of its own: what Judged, Stepped and Folded say of it, in one."""
+class SingleInsertResult(NamedTuple):
+    """One insert was taken in by a step of its own: what Verdict, Stepped and Applied say of it, in one."""
 
     insert: Arrived
     answer: bytes
@@ -185,8 +185,8 @@ class Publish(NamedTuple):
     message: bytes
 
 
-class Run(NamedTuple):
-    """Work for the solver: first answer `reads` from the present revision, then fold `inserts`.
+class InsertBatch(NamedTuple):
+    """Work for the solver: first answer `reads` from the present revision, then record `inserts`.
 
     short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
     the journal has.  further: there are no inserts, and one step is to go on from the last one.
@@ -204,4 +204,4 @@ class Drained:
     """Nothing is waiting any more and nothing will be taken: the map can be closed."""
 
 
-Effect: TypeAlias = Answer | Tell | Refuse | Publish | Run | Drained
+Effect: TypeAlias = Answer | Tell | Refuse | Publish | InsertBatch | Drained

@@ -1,11 +1,11 @@
 """One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
-    Asked ───▶ reads ──────────────┴▶ Run ─▶ Folded ────┼─▶ Publish           delta of every step
-                                    (solver thread)     └─▶ Run               what came in meanwhile; nothing did, and
+    Asked ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
+                                    (solver thread)     └─▶ InsertBatch               what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
-At most one Run is out at a time, so what the solver does next is decided when it is free, from all that waits then.
+At most one InsertBatch is out at a time, so what the solver does next is decided when it is free, from all that waits then.
 """
 
 import math
@@ -21,29 +21,29 @@ from factorbus.service.core.account import Account, InsertDone
 from factorbus.service.core.admission import Admission
 from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
-    Alone,
+    Applied,
     Arrived,
     Asked,
     Asker,
     Drained,
     Effect,
-    Folded,
-    Judged,
-    Located,
+    InsertBatch,
+    ParsedInsert,
     Publish,
     Read,
     Refuse,
-    Run,
+    SingleInsertResult,
     Stepped,
     Tell,
+    Verdict,
 )
 from factorbus.service.core.pending_questions import Reads
 from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
 
 _KEYFRAME = Read(Question("keyframe"))
-# A Run is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
-# insert was already on its way when the last Run ended: then there are likely more behind it, to be folded together.
+# A InsertBatch is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
+# insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be applied together.
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
@@ -75,11 +75,11 @@ class MapCore:
         self._limits, self._created = limits, now
         self._admission = Admission(epoch, limits)
         self._reads = Reads()
-        self._running: Run | None = None
+        self._running: InsertBatch | None = None
         self._unjudged = self._unjudged_bytes = 0  # given to the solver, and not answered
         self._must_reload = False
         self._started = self._ended = 0.0
-        self._slowest_s = math.inf  # of late: forgotten by a tenth with every Run
+        self._slowest_s = math.inf  # of late: forgotten by a tenth with every InsertBatch
         self._closing: Problem | None = None
         self._drained = False
         self._since_keyframe = [0, 0]  # steps, bytes of deltas
@@ -115,7 +115,7 @@ class MapCore:
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
-        if isinstance(arrived.content, Located) and (run := self._try_alone(arrived, arrived.content.settle)):
+        if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content.settle)):
             self._account.received(arrived.size)
             return [run]
         effects = self._admission.expire(arrived.now)
@@ -152,7 +152,7 @@ class MapCore:
         self._reads.append(read)
         return self._go_on([], now)
 
-    def judged(self, judged: Judged) -> list[Effect]:
+    def judged(self, judged: Verdict) -> list[Effect]:
         """The solver's word on some of what it has."""
         effects: list[Effect] = []
         self._unjudged -= len(judged.outcomes)
@@ -165,8 +165,8 @@ class MapCore:
                 self._account.refused(outcome.answer)
         return effects
 
-    def alone(self, alone: Alone, answered: Asker) -> list[Effect]:
-        """One insert was folded in by itself; `answered` has its answer, and the delta is published."""
+    def alone(self, alone: SingleInsertResult, answered: Asker) -> list[Effect]:
+        """One insert was applied in by itself; `answered` has its answer, and the delta is published."""
         insert, size = alone.insert, len(alone.delta)
         others = self._admission.answer(insert, alone.answer, answered)
         self._unjudged -= 1
@@ -179,11 +179,11 @@ class MapCore:
         self._free(alone, 1)
         return self._go_on(others, alone.now)
 
-    def kept(self, events: Sequence[Judged | Stepped], now: float) -> list[Effect]:
-        """What came of a Run is written down."""
+    def kept(self, events: Sequence[Verdict | Stepped], now: float) -> list[Effect]:
+        """What came of a InsertBatch is written down."""
         effects: list[Effect] = []
         for event in events:
-            effects += self.judged(event) if isinstance(event, Judged) else self.stepped(event)
+            effects += self.judged(event) if isinstance(event, Verdict) else self.stepped(event)
         return self._go_on(effects, now)
 
     def block(self, problem: Problem, now: float) -> list[Effect]:
@@ -237,24 +237,24 @@ class MapCore:
             self._since_keyframe = [0, 0]
             self._reads.append(_KEYFRAME)
 
-    def folded(self, folded: Folded) -> list[Effect]:
+    def applied(self, applied: Applied) -> list[Effect]:
         """The solver is free again."""
         taken = self._running.inserts if self._running else ()
         for insert in taken:
-            self._account.took(folded.now - insert.now)
-        if folded.refused:
+            self._account.took(applied.now - insert.now)
+        if applied.refused:
             self._converging.refused()
-        self._free(folded, len(taken))
-        return self._go_on([], folded.now)
+        self._free(applied, len(taken))
+        return self._go_on([], applied.now)
 
-    def _free(self, folded: Folded | Alone, taken: int) -> None:
+    def _free(self, applied: Applied | SingleInsertResult, taken: int) -> None:
         self._running = None
-        self._ended = folded.now
-        self._converging.ended(folded.solver_cpu_s - self._solver_cpu_s, folded.now)
+        self._ended = applied.now
+        self._converging.ended(applied.solver_cpu_s - self._solver_cpu_s, applied.now)
         seconds = self._ended - self._started
         self._admission.took(taken, seconds)
         self._slowest_s = max(seconds, 0.9 * self._slowest_s if self._slowest_s < math.inf else 0.0)
-        self.variables, self.factors, self._solver_cpu_s = folded.variables, folded.factors, folded.solver_cpu_s
+        self.variables, self.factors, self._solver_cpu_s = applied.variables, applied.factors, applied.solver_cpu_s
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
         """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
@@ -329,9 +329,9 @@ class MapCore:
         room = self._has_room()
         further = self._may_go_on(now)
         if self._reads or self._must_reload or (self._admission.ready and room) or further:
-            reads, inserts = self._reads.take(), self._admission.take(limits.fold) if room else ()
+            reads, inserts = self._reads.take(), self._admission.take(limits.record) if room else ()
             short = self._is_short(reads, inserts, now)
-            self._running = Run(reads, inserts, short, self._must_reload, further)
+            self._running = InsertBatch(reads, inserts, short, self._must_reload, further)
             if inserts or further:
                 self._converging.began(further)
             self._must_reload = False
@@ -354,8 +354,8 @@ class MapCore:
         """May the solver have more, or has the journal to write first?"""
         return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
 
-    def _try_alone(self, arrived: Arrived, settle: bool) -> Run | None:
-        """The short Run of this insert and nothing else, if that is what `_go_on` would come to."""
+    def _try_alone(self, arrived: Arrived, settle: bool) -> InsertBatch | None:
+        """The short InsertBatch of this insert and nothing else, if that is what `_go_on` would come to."""
         if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
             return None
         if self._must_reload or not self._has_room():
@@ -366,14 +366,14 @@ class MapCore:
         self._converging.began(False)
         self._unjudged += 1
         self._unjudged_bytes += arrived.size
-        self._running = run = Run((), (arrived,), True)
+        self._running = run = InsertBatch((), (arrived,), True)
         return run
 
     def _is_short(self, reads: tuple[Read, ...], inserts: tuple[Arrived, ...], now: float) -> bool:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        if inserts[0].is_change or (isinstance(content, Insert) and content.points_below):
+        if inserts[0].is_change or (isinstance(content, Insert) and content.convert_below):
             return False
         return isinstance(content, Problem) or not content.settle
 

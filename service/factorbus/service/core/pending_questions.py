@@ -2,7 +2,7 @@
 
 A question is answered between two steps in one of two ways.  Most take a copy there, and are answered from it on
 another thread; one copy serves all of them, so they go together however many there are.  Those about a few variables
-are answered on the spot, from R where it lies, and inserts wait for each.  So in one Run they come to so many
+are answered on the spot, from R where it lies, and inserts wait for each.  So in one InsertBatch they come to so many
 variables together, and the others stay for the next one, which takes the inserts that came in meanwhile.
 """
 
@@ -34,7 +34,7 @@ class Reads:
         self._waiting.clear()
 
     def take(self) -> tuple[Read, ...]:
-        """What the next Run answers: all that take copies, and of the others the oldest, up to `NEAR` variables."""
+        """What the next InsertBatch answers: all that take copies, and of the others the oldest, up to `NEAR` variables."""
         taken: list[Read] = []
         stay: deque[Read] = deque()
         variables, is_full = 0, False

@@ -2,7 +2,7 @@
 
 threads   Zenoh's      a question comes in: handed over
           features     reads it, decides, does small ones itself, puts answers together
-          desk         gives shards to workers and takes what comes of them
+          control         gives shards to workers and takes what comes of them
 """
 
 import logging
@@ -22,8 +22,8 @@ from factorbus.service.jobs.dispatch import IN_PLACE, Ended
 from factorbus.service.jobs.rates import measured
 from factorbus.service.jobs.running import Jobs, do_here
 from factorbus.service.jobs.sharding import Rates, Work, cuts, seconds, shards_for, work_of
-from factorbus.service.jobs.worker_latency import Trips
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.jobs.worker_latency import WorkerLatency
+from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.questions.question_memory import COPIES, Room
 
 log = logging.getLogger(__name__)
@@ -61,9 +61,9 @@ class FeatureQuestions:
 
     def __init__(
         self,
-        desk: Lane,
+        control: SerialExecutor,
         jobs: Jobs,
-        trips: Trips,
+        latencies: WorkerLatency,
         reply: Callable[[Asker, bytes], None],
         refuse: Callable[[Asker, Any], None],
         limits: Limits,
@@ -71,13 +71,13 @@ class FeatureQuestions:
         deadline_s: float,
         room: Room = _UNBOUNDED,
     ) -> None:
-        self._desk, self._jobs, self._trips = desk, jobs, trips
+        self._control, self._jobs, self._latencies = control, jobs, latencies
         self._reply, self._refuse = reply, refuse
         self._limits, self._most, self._deadline_s, self._room = limits, most, deadline_s, room
         self._rates: Rates | None = None
-        self._open = 0  # on the desk
+        self._open = 0  # on the control
         self._stopping = False
-        self._lane = Lane("features")
+        self._executor = SerialExecutor("features")
 
     def measure(self) -> Rates:
         """Find out what computing takes here, before anybody asks."""
@@ -86,23 +86,23 @@ class FeatureQuestions:
 
     def ask(self, asker: Asker, payload: bytes) -> None:
         """A question came in."""
-        if (waiting := self._lane.waiting) >= self._most:
+        if (waiting := self._executor.waiting) >= self._most:
             self._refuse(asker, Busy(waiting, 0.05))
         else:
-            self._lane.hand(self._take, asker, payload)
+            self._executor.hand(self._take, asker, payload)
 
     def stop(self) -> None:
-        """Refuse from now on; returns when all that was asked before is answered or handed to the desk."""
+        """Refuse from now on; returns when all that was asked before is answered or handed to the control."""
         self._stopping = True
         reached = threading.Event()
-        self._lane.hand(reached.set)
+        self._executor.hand(reached.set)
         reached.wait()
 
     def close(self) -> None:
-        """Return when the answers that are ready are sent; after `stop`, and after the desk is closed."""
-        self._lane.close()
+        """Return when the answers that are ready are sent; after `stop`, and after the control is closed."""
+        self._executor.close()
 
-    # ---- on the features lane ---------------------------------------------------------------------------------------
+    # ---- on the features executor ---------------------------------------------------------------------------------------
 
     def _take(self, asker: Asker, payload: bytes) -> None:
         try:
@@ -111,7 +111,7 @@ class FeatureQuestions:
             ask = decode_ask(payload, self._limits)
             self._check(ask)
             work, rates = work_of(ask), self._rates or self.measure()
-            count = shards_for(work, rates, self._trips.known, self._jobs.slots("idp"))
+            count = shards_for(work, rates, self._latencies.known, self._jobs.slots("idp"))
             if count == 0:
                 self._here(asker, payload, ask.sighting.count)
                 return
@@ -122,7 +122,7 @@ class FeatureQuestions:
             log.exception("fault %s: features", reference)
             self._refuse(asker, Internal(reference))
         else:
-            self._desk.hand(self._submit, asker, _Cutting(payload, ask, count, work, rates))
+            self._control.hand(self._submit, asker, _Cutting(payload, ask, count, work, rates))
 
     def _check(self, ask: Ask) -> None:
         """Is there room for the answer?  Raises TooLarge, OutOfMemory."""
@@ -140,7 +140,7 @@ class FeatureQuestions:
     def _answer(self, question: _Question) -> None:
         self._reply(question.asker, encode_answer([part for part in question.parts if part], question.clean))
 
-    # ---- on the desk ------------------------------------------------------------------------------------------------
+    # ---- on the control ------------------------------------------------------------------------------------------------
 
     def _submit(self, asker: Asker, cutting: _Cutting) -> None:
         if self._open >= self._most:
@@ -171,7 +171,7 @@ class FeatureQuestions:
             question.parts[place] = (result.payload, job.worker, result.seconds)
             if None in question.parts:
                 return
-            self._lane.hand(self._answer, question)
+            self._executor.hand(self._answer, question)
         else:
             self._refuse(question.asker, result)
         question.over = True

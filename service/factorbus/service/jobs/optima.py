@@ -1,4 +1,4 @@
-"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.  For the desk."""
+"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.  For the control."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Jobs on their way: to a worker, to the next one when that fails, in place when there is none, and back.
 
-Everything here runs on one lane (the desk); workers and the in-place threads only hand their results to it.  No answer
-of a worker is passed on unchecked; what takes long to check is checked on a lane of its own.
+Everything here runs on one executor (the control); workers and the in-place threads only hand their results to it.  No answer
+of a worker is passed on unchecked; what takes long to check is checked on a executor of its own.
 """
 
 import logging
@@ -16,7 +16,7 @@ from factorbus.proto.messages import Job, JobDone, Optimum
 from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable, UnknownKind
 from factorbus.service.jobs.dispatch import Dispatch, Distrusted, Effect, Ended, InPlace, Send
 from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, is_quick, judged
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.questions.answers import as_variables
 from factorbus.solver.errors import SolverError
 
@@ -38,14 +38,14 @@ class _Open:
 
 
 class Jobs:
-    """The jobs of one service.  For the desk lane, which `desk` must be."""
+    """The jobs of one service.  For the control executor, which `control` must be."""
 
-    def __init__(self, desk: Lane, send: SendJob) -> None:
-        self._desk, self._send = desk, send
+    def __init__(self, control: SerialExecutor, send: SendJob) -> None:
+        self._control, self._send = control, send
         self._dispatch = Dispatch()
         self._open: dict[str, _Open] = {}
-        self._in_place: dict[str, Lane] = {}  # by kind, started when first needed
-        self._checks: Lane | None = None  # for answers that take long to check, started when first needed
+        self._in_place: dict[str, SerialExecutor] = {}  # by kind, started when first needed
+        self._checks: SerialExecutor | None = None  # for answers that take long to check, started when first needed
         self._until: dict[str, float] = {}  # by worker that is distrusted
 
     def slots(self, kind: str) -> int:
@@ -108,7 +108,7 @@ class Jobs:
         timeout_s: float,
         ahead: int = 0,
     ) -> None:
-        """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the desk.
+        """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the control.
 
         deadline_s: for one worker.  timeout_s: until it is given up, with Unavailable.  ahead: of short jobs, how many
         may wait at a worker.
@@ -145,9 +145,9 @@ class Jobs:
                     deadline_s = self._open[job.job].deadline_s
                     self._send(worker, job, deadline_s, lambda r, t=tag, j=job: self._answered(t, j, r))
                 case InPlace(tag, job):
-                    lane = self._in_place.get(job.kind) or Lane(f"in-place {job.kind}")
-                    self._in_place[job.kind] = lane
-                    lane.hand(self._do_in_place, tag, job)
+                    executor = self._in_place.get(job.kind) or SerialExecutor(f"in-place {job.kind}")
+                    self._in_place[job.kind] = executor
+                    executor.hand(self._do_in_place, tag, job)
                 case Ended():
                     self._open.pop(effect.job).ended(effect)
                 case Distrusted():
@@ -165,15 +165,15 @@ class Jobs:
     def _answered(self, tag: int, job: Job, result: JobDone | Any) -> None:
         """On any thread."""
         if not isinstance(result, JobDone):
-            self._desk.hand(self._came, tag, result)
+            self._control.hand(self._came, tag, result)
         elif is_quick(result):
-            self._desk.hand(self._judge, tag, job, result)
+            self._control.hand(self._judge, tag, job, result)
         else:
-            self._desk.hand(self._hand_to_checks, tag, job, result)
+            self._control.hand(self._hand_to_checks, tag, job, result)
 
     def _hand_to_checks(self, tag: int, job: Job, result: JobDone) -> None:
-        self._checks = self._checks or Lane("checks")
-        self._checks.hand(lambda: self._desk.hand(self._came, tag, judged(job, result)))
+        self._checks = self._checks or SerialExecutor("checks")
+        self._checks.hand(lambda: self._control.hand(self._came, tag, judged(job, result)))
 
     def _judge(self, tag: int, job: Job, result: JobDone) -> None:
         self._came(tag, judged(job, result))
@@ -190,8 +190,8 @@ class Jobs:
         self._perform(effects)
 
     def _do_in_place(self, tag: int, job: Job) -> None:
-        """On an in-place lane."""
-        self._desk.hand(self._came, tag, do_here(job))
+        """On an in-place executor."""
+        self._control.hand(self._came, tag, do_here(job))
 
 
 def do_here(job: Job) -> JobDone | Any:

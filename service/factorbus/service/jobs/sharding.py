@@ -21,7 +21,7 @@ class Rates:
 
 
 @dataclass(frozen=True, slots=True)
-class Trip:
+class RoundTrip:
     """What the way to a worker and back takes: every time, per byte that comes back."""
 
     fixed_s: float
@@ -51,15 +51,15 @@ def seconds(work: Work, rates: Rates, shards: int = 1) -> float:
     return rates.fixed_s + rates.feature_s * work.features + number_s * work.numbers / shards
 
 
-def shards_for(work: Work, rates: Rates, trips: Sequence[Trip], slots: int) -> int:
+def shards_for(work: Work, rates: Rates, latencies: Sequence[RoundTrip], slots: int) -> int:
     """How many shards the work goes to workers in; 0: in place, because the way takes longer than the work.
 
     A shard costs every worker a look at all features, so more of them are not always sooner.
-    trips: of the workers there are.  slots: jobs that they take at a time.
+    latencies: of the workers there are.  slots: jobs that they take at a time.
     """
-    if not trips or slots < 1 or work.features < 1:
+    if not latencies or slots < 1 or work.features < 1:
         return 0
-    way = max(trip.fixed_s for trip in trips) + max(trip.byte_s for trip in trips) * work.bytes_back
+    way = max(trip.fixed_s for trip in latencies) + max(trip.byte_s for trip in latencies) * work.bytes_back
     if way >= seconds(work, rates):
         return 0
     # Those that share a core's time or memory gain nothing, but lose nothing either; the first of equals is taken.

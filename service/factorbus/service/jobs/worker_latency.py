@@ -1,4 +1,4 @@
-"""What the way to each worker takes: measured when it joins, with jobs too small to matter.  For the desk.
+"""What the way to each worker takes: measured when it joins, with jobs too small to matter.  For the control.
 
 One that does not answer is asked again and again until it does.  One that does no jobs of kind `idp` says so once, and
 has no way to measure; one that answers wrongly is distrusted, as with any job.
@@ -16,8 +16,8 @@ from factorbus.proto.problems import UnknownKind
 from factorbus.service.jobs.job_check import WrongAnswer, judged
 from factorbus.service.jobs.rates import example
 from factorbus.service.jobs.running import Jobs, SendJob
-from factorbus.service.jobs.sharding import Trip
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.jobs.sharding import RoundTrip
+from factorbus.service.maps.serial_executor import SerialExecutor
 
 log = logging.getLogger(__name__)
 
@@ -26,26 +26,26 @@ _ALL = (_SMALL,) * 5 + (_LARGE,) * 5
 _DEADLINE_S = 2.0
 
 
-class Trips:
+class WorkerLatency:
     """The ways to the workers of one service."""
 
-    def __init__(self, desk: Lane, send: SendJob, jobs: Jobs) -> None:
-        self._desk, self._send, self._jobs = desk, send, jobs
+    def __init__(self, control: SerialExecutor, send: SendJob, jobs: Jobs) -> None:
+        self._control, self._send, self._jobs = control, send, jobs
         self._here: set[str] = set()
         self._other: set[str] = set()  # of these, those that do other kinds of jobs
         self._asked: set[str] = set()  # of these, those that have not answered yet
-        self._known: dict[str, Trip] = {}
+        self._known: dict[str, RoundTrip] = {}
         self._payloads = {n: _payload(n) for n in (_SMALL, _LARGE)}
 
     @property
-    def known(self) -> list[Trip]:
+    def known(self) -> list[RoundTrip]:
         """Of the workers that are here and have been measured."""
         return list(self._known.values())
 
     def row(self, worker: str) -> dict[str, float]:
-        """What is known of the way to `worker`: `trip_ms`, and `byte_ns` for a byte that comes back."""
+        """What is known of the way to `worker`: `latency_ms`, and `byte_ns` for a byte that comes back."""
         found = self._known.get(worker)
-        return {} if found is None else {"trip_ms": found.fixed_s * 1e3, "byte_ns": found.byte_s * 1e9}
+        return {} if found is None else {"latency_ms": found.fixed_s * 1e3, "byte_ns": found.byte_s * 1e9}
 
     def joined(self, worker: str) -> None:
         """Measure the way to a worker that is new here."""
@@ -76,7 +76,7 @@ class Trips:
         def done(result: Any) -> None:
             there_s = result.seconds if isinstance(result, JobDone) else 0.0
             way = max(0.0, time.perf_counter() - sent - there_s)
-            self._desk.hand(self._came, worker, sizes, took, job, result, way)
+            self._control.hand(self._came, worker, sizes, took, job, result, way)
 
         job = Job(f"probe-{secrets.token_hex(4)}", "idp", self._payloads[sizes[0]])
         self._send(worker, job, _DEADLINE_S, done)
@@ -106,7 +106,7 @@ class Trips:
             self._ask(worker, sizes[1:], took)
         elif _LARGE in took:
             byte_s = max(0.0, took[_LARGE] - took[_SMALL]) / answer_size(example("half", _LARGE))
-            self._known[worker] = Trip(took[_SMALL], byte_s)
+            self._known[worker] = RoundTrip(took[_SMALL], byte_s)
             log.info("the way to worker %s takes %.2f ms and %.2f ns a byte", worker, took[_SMALL] * 1e3, byte_s * 1e9)
 
 

@@ -1,7 +1,7 @@
-"""A map's journal at work: a thread that writes down what was folded, and says when it is safe.
+"""A map's journal at work: a thread that writes down what was applied, and says when it is safe.
 
-    commit   what came of a Run is told when the disk has it: answers, deltas and estimates alike, so nobody ever sees
-             what a crash could take back.  While the disk is busy the next inserts are folded; all that waits then goes
+    commit   what came of a InsertBatch is told when the disk has it: answers, deltas and estimates alike, so nobody ever sees
+             what a crash could take back.  While the disk is busy the next inserts are applied; all that waits then goes
              into one transaction (group commit)
     group    told at once, written and safe no later than `group_s` afterwards
     none     told at once, written now and then, safe when the operating system pleases
@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
-from factorbus.journal.records import Fold
+from factorbus.journal.records import JournalRecord
 from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import Last, Saved, Store, open_store
-from factorbus.service.core.events import Arrived, Judged, Stepped
+from factorbus.service.core.events import Arrived, Stepped, Verdict
 from factorbus.service.journal.writing import written
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
 from factorbus.solver.state import FORMAT
 
@@ -36,14 +36,14 @@ _PAUSES_S = (0.2, 5.0)  # between tries to write again
 _KEPT_SNAPSHOTS = 2
 _SHARE = 0.05  # of the time that steps take, for copies of the solver's state
 
-Events: TypeAlias = Sequence[Judged | Stepped]
+Events: TypeAlias = Sequence[Verdict | Stepped]
 
 
 class Listener(Protocol):
     """Who is told what becomes of the writing; called on the journal's thread."""
 
     def kept(self, events: Events) -> None:
-        """What came of a Run is safe."""
+        """What came of a InsertBatch is safe."""
         ...
 
     def unkept(self, problem: JournalFailed) -> None:
@@ -60,7 +60,7 @@ class Listener(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class _Folded:
+class _Applied:
     number: int
     inserts: Sequence[Arrived]
     events: Events
@@ -93,7 +93,7 @@ class SnapshotPlan:
     def __init__(self, every_s: float, steps_s: float = 0.0, differs: str = "") -> None:
         self.every_s, self.differs, self.steps_s, self.copying_s = every_s, differs, steps_s, 0.0
         self.thread: threading.Thread | None = None
-        self.fold = 0
+        self.record = 0
 
     def due(self) -> bool:
         """Steps have taken long enough, copying takes a small share of it, and none is being written."""
@@ -108,7 +108,7 @@ class Keeping(Protocol):
         """The keeper, not started yet."""
         ...
 
-    def reload(self, folder: Folder) -> Last:
+    def reload(self, folder: MapSolver) -> Last:
         """Bring `folder` back to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
         ...
 
@@ -124,7 +124,7 @@ class Keeper:
         self._folder, self._durability = store.path.parent, durability
         self._pause_s = {"commit": 0.0, "group": group_s, "none": _NONE_S}[durability]
         self._begin, self._begun = begin, False
-        self._last, self._number = last, last.fold
+        self._last, self._number = last, last.record
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._problem: JournalFailed | None = None
@@ -135,7 +135,7 @@ class Keeper:
 
     @property
     def waits(self) -> bool:
-        """Whether what is folded is told only when `Listener.kept` is called."""
+        """Whether what is applied is told only when `Listener.kept` is called."""
         return self._durability == "commit"
 
     def start(self) -> JournalFailed | None:
@@ -147,12 +147,12 @@ class Keeper:
         return problem
 
     def hand(self, inserts: Sequence[Arrived], events: Events, further: bool = False) -> None:
-        """Write down that `inserts` were folded, and what came of it; of none, a `further` step, which may have been
+        """Write down that `inserts` were applied, and what came of it; of none, a `further` step, which may have been
         refused."""
         if inserts or events or further:
             self._number += 1
             self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
-            self._items.put(_Folded(self._number, inserts, events, further))
+            self._items.put(_Applied(self._number, inserts, events, further))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
         """Do `call` when all that was handed in so far is told; `dropped` if it never will be."""
@@ -166,13 +166,13 @@ class Keeper:
         self._items.put(_After(call, dropped))
 
     @property
-    def folds(self) -> int:
+    def records(self) -> int:
         """How many were handed in, with those that the journal began with."""
         return self._number
 
     def reloaded(self, last: Last) -> None:
         """The solver is where the journal ends."""
-        self._number = last.fold
+        self._number = last.record
         self._life += 1
         self._items.put(_Reloaded())
 
@@ -182,9 +182,9 @@ class Keeper:
 
     def snapshot(self, state: dict[str, Any], copying_s: float) -> None:
         """Write `state`, which is that after all that was handed in so far; on a thread of its own."""
-        plan, fold = self._snapshot, self._number
+        plan, record = self._snapshot, self._number
         plan.steps_s, plan.copying_s = 0.0, copying_s
-        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, fold, self._life), name="snapshot")
+        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, record, self._life), name="snapshot")
         plan.thread.daemon = True
         plan.thread.start()
 
@@ -197,13 +197,13 @@ class Keeper:
         """What ask/stats says of the journal."""
         return {
             "durability": self._durability,
-            "folds": self._last.fold,
+            "records": self._last.record,
             "revision": self._last.revision,
             "commits": self._commits,
             "inserts": self._inserts,
             "commit_ms": 1e3 * self._commit_s,
             "longest_commit_ms": 1e3 * self._longest_s,
-            "snapshot_fold": self._snapshot.fold,
+            "snapshot_record": self._snapshot.record,
             "blocked": int(self._problem is not None),
             "problem": self._problem.message if self._problem else "",
         }
@@ -262,15 +262,15 @@ class Keeper:
 
     def _write(self, batch: list[Any]) -> JournalFailed | None:
         """Write `batch` in one transaction and tell; with a problem nothing of it is written or told."""
-        folds, last = [], self._last
+        records, last = [], self._last
         for item in batch:
-            if isinstance(item, _Folded):
-                fold = written(item.number, item.inserts, item.events, last, item.further)
-                folds.append(fold)
-                last = Last(fold.number, fold.revision, fold.chain)
+            if isinstance(item, _Applied):
+                record = written(item.number, item.inserts, item.events, last, item.further)
+                records.append(record)
+                last = Last(record.number, record.revision, record.chain)
         try:
-            if folds:
-                self._append(folds)
+            if records:
+                self._append(records)
         except JournalFailed as problem:
             self._problem = problem
             log.error("%s", problem)
@@ -279,20 +279,20 @@ class Keeper:
         for item in batch:
             if isinstance(item, _After):
                 item.call()
-            elif isinstance(item, _Folded) and self.waits:
+            elif isinstance(item, _Applied) and self.waits:
                 self._listener.kept(item.events)
             elif isinstance(item, _Noted):
                 self._note(item)
         return None
 
-    def _append(self, folds: list[Fold]) -> None:
+    def _append(self, records: list[JournalRecord]) -> None:
         started = time.perf_counter()
-        self._store.append(folds)
+        self._store.append(records)
         took = time.perf_counter() - started
         self._commits += 1
         self._commit_s += took
         self._longest_s = max(self._longest_s, took)
-        self._inserts += sum(len(fold.entries) for fold in folds)
+        self._inserts += sum(len(record.entries) for record in records)
 
     def _drop_until_reloaded(self, batch: list[Any], problem: JournalFailed) -> None:
         """Nothing of what comes before the solver is back where the journal is counts any more."""
@@ -329,7 +329,7 @@ class Keeper:
         pause_s, longest_s = _PAUSES_S
         while self._write(batch) is not None:
             if self._ending.wait(pause_s):
-                lost = sum(len(item.inserts) for item in batch if isinstance(item, _Folded))
+                lost = sum(len(item.inserts) for item in batch if isinstance(item, _Applied))
                 log.error("%s: %d inserts and more that were answered are not written", self._store.path, lost)
                 return False
             pause_s = min(2 * pause_s, longest_s)
@@ -372,33 +372,33 @@ class Keeper:
 
     # ---- snapshots --------------------------------------------------------------------------------------------------
 
-    def _write_snapshot(self, state: dict[str, Any], fold: int, life: int) -> None:
-        """On a thread of its own; the journal's thread notes it behind the fold that it was made after."""
+    def _write_snapshot(self, state: dict[str, Any], record: int, life: int) -> None:
+        """On a thread of its own; the journal's thread notes it behind the record that it was made after."""
         started = time.perf_counter()
-        path = file_of(self._folder, fold)
+        path = file_of(self._folder, record)
         try:
             size = write_snapshot(path, state)
         except OSError as error:
             log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
             return
         log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
-        self._items.put(_Noted(Saved(fold, FORMAT, present_build(), self._snapshot.differs, size), life))
+        self._items.put(_Noted(Saved(record, FORMAT, present_build(), self._snapshot.differs, size), life))
 
     def _note(self, noted: _Noted) -> None:
-        """A snapshot counts once it is noted; one of folds that did not happen must not."""
+        """A snapshot counts once it is noted; one of records that did not happen must not."""
         saved = noted.saved
         if noted.life != self._life:
-            file_of(self._folder, saved.fold).unlink(missing_ok=True)
+            file_of(self._folder, saved.record).unlink(missing_ok=True)
             return
         try:
             old = self._store.add_snapshot(saved, _KEPT_SNAPSHOTS)
         except JournalFailed as problem:
-            log.warning("snapshot %d is not noted: %s", saved.fold, problem)
-            file_of(self._folder, saved.fold).unlink(missing_ok=True)
+            log.warning("snapshot %d is not noted: %s", saved.record, problem)
+            file_of(self._folder, saved.record).unlink(missing_ok=True)
             return
-        self._snapshot.fold = saved.fold
-        for fold in old:
-            file_of(self._folder, fold).unlink(missing_ok=True)
+        self._snapshot.record = saved.record
+        for record in old:
+            file_of(self._folder, record).unlink(missing_ok=True)
 
     def _note_snapshots(self) -> None:
         """Those that were written while the journal's thread ended."""

@@ -23,14 +23,14 @@ from factorbus.service.config import Config, Limits
 from factorbus.service.core.map_state import MapCore, Restored
 from factorbus.service.journal.keeping import Keeper, Listener, SnapshotPlan
 from factorbus.service.journal.recovery import Recovered, answers, recover
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
 from factorbus.solver.state import FORMAT
 
 log = logging.getLogger(__name__)
 
 
-def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> Folder:
+def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> MapSolver:
     """A new folder with a solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
@@ -43,10 +43,10 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
         settings = Options.of(**{**options, "mode": mode, "clock": time.perf_counter})
     except BadOption as bad:
         raise JournalOption(str(bad.detail["where"]), bad.message) from None
-    return Folder(lambda: Solver(settings), epoch, limits, settings.as_dict())
+    return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
-def restored(folder: Folder, differs: str | None = None) -> Restored:
+def restored(folder: MapSolver, differs: str | None = None) -> Restored:
     """How the map in `folder` is.  differs: as `Restored` has it."""
     chi2 = folder.chi2() if folder.revision else 0.0
     return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished, differs)
@@ -58,9 +58,9 @@ def log_owner(owner: str) -> None:
 
 
 class CopiedAt(NamedTuple):
-    """The state of a map after a fold.  differs: why its journal may give other bits when it is run again."""
+    """The state of a map after a record.  differs: why its journal may give other bits when it is run again."""
 
-    fold: int
+    record: int
     state: Mapping[str, Any]
     differs: str
 
@@ -119,16 +119,18 @@ class Library:
 
     def fork(self, source: str, target: str, copied: CopiedAt, limits: Limits) -> "Kept":
         """A new map `target` with a journal, which is as `source` was when it was copied.  Raises Problem."""
-        fold, state = copied.fold, copied.state
-        where, config, because = self._owned.folder, self._config, f"forked from {source} after fold {fold}"
-        epoch = Epoch(secrets.randbits(62) | 1, fold + 1, because)
-        fork_journal(where / source, where / target, epoch, state, Saved(fold, FORMAT, present_build(), copied.differs))
+        record, state = copied.record, copied.state
+        where, config, because = self._owned.folder, self._config, f"forked from {source} after record {record}"
+        epoch = Epoch(secrets.randbits(62) | 1, record + 1, because)
+        fork_journal(
+            where / source, where / target, epoch, state, Saved(record, FORMAT, present_build(), copied.differs)
+        )
         store = open_store(where / target, config.durability)
         try:
             header = store.header()
             folder = make_folder(header.mode, header.options, header.epoch, limits)
             folder.load(state)
-            return Kept(store, header, folder, Recovered(store.last(), fold, differs=copied.differs), config)
+            return Kept(store, header, folder, Recovered(store.last(), record, differs=copied.differs), config)
         except BaseException:
             store.close()
             self.remove(target)
@@ -158,7 +160,7 @@ class Kept:
     """A map with its journal, open: what a host and its core are to begin with."""
 
     def __init__(
-        self, store: Store, header: Header, folder: Folder, recovered: Recovered, config: Config,
+        self, store: Store, header: Header, folder: MapSolver, recovered: Recovered, config: Config,
         epoch: Epoch | None = None,
     ) -> None:  # fmt: skip
         """epoch: a new one, which is not in the journal yet."""
@@ -170,7 +172,7 @@ class Kept:
     def restore(self, core: MapCore) -> None:
         """Tell `core` how the map is."""
         limits, epoch = self._config.limits, self.header.epochs[-1]
-        senders = self.store.senders(epoch.fold, limits.clients, limits.remembered)
+        senders = self.store.senders(epoch.record, limits.clients, limits.remembered)
         core.restore(
             [(sender.client, sender.next, answers(sender)) for sender in senders],
             restored(self.folder, self.recovered.differs),
@@ -188,11 +190,11 @@ class Kept:
         )  # fmt: skip
 
     def _new_maker(self, store: Store) -> Maker | None:
-        """Who makes the next fold, if it is not who made the last one."""
-        here, makers = Maker(self.recovered.last.fold + 1, present_build()), store.makers()
+        """Who makes the next record, if it is not who made the last one."""
+        here, makers = Maker(self.recovered.last.record + 1, present_build()), store.makers()
         return None if makers and makers[-1].build == here.build else here
 
-    def reload(self, folder: Folder) -> Last:
+    def reload(self, folder: MapSolver) -> Last:
         """As `keeping.Keeping`."""
         store = open_store(self.store.path.parent, read_only=True)
         try:
@@ -221,14 +223,14 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
     folder = make_folder(header.mode, header.options, header.epoch, limits)
     recovered = recover(store, folder)
     if store.writable:
-        remove_strangers(store.path.parent, {saved.fold for saved in store.snapshots()})
+        remove_strangers(store.path.parent, {saved.record for saved in store.snapshots()})
     epoch = None
     if because := _reason_for_an_epoch(header, recovered):
-        epoch = Epoch(secrets.randbits(62) | 1, recovered.last.fold + 1, because)
+        epoch = Epoch(secrets.randbits(62) | 1, recovered.last.record + 1, because)
         log.warning("%s: a new epoch, because %s", store.path, because)
     log.info(
-        "map %s is back at revision %d in %.2f s: snapshot %d and %d folds after it", header.map,
-        recovered.last.revision, time.perf_counter() - started, recovered.from_fold, recovered.folds,
+        "map %s is back at revision %d in %.2f s: snapshot %d and %d records after it", header.map,
+        recovered.last.revision, time.perf_counter() - started, recovered.from_record, recovered.records,
     )  # fmt: skip
     if recovered.other_build:
         log.warning("map %s was made by another build of the solver: %s", header.map, recovered.other_build)

@@ -1,34 +1,34 @@
-"""What is written down of a Run: its inserts in their order, what became of each, and a digest of what changed."""
+"""What is written down of a InsertBatch: its inserts in their order, what became of each, and a digest of what changed."""
 
 from collections.abc import Sequence
 
 from factorbus.journal import chain
 from factorbus.journal.digest import sealed
-from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, Fold
+from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, JournalRecord
 from factorbus.journal.store import Last
 from factorbus.proto import codec
-from factorbus.service.core.events import Arrived, Judged, Outcome, Stepped
+from factorbus.service.core.events import Arrived, Outcome, Stepped, Verdict
 from factorbus.solver.errors import SolverError
 
 
 def written(
-    number: int, inserts: Sequence[Arrived], events: Sequence[Judged | Stepped], last: Last, further: bool = False
-) -> Fold:
-    """What is written down of a Run.  further: it was for a further step, which may have been refused."""
+    number: int, inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped], last: Last, further: bool = False
+) -> JournalRecord:
+    """What is written down of a InsertBatch.  further: it was for a further step, which may have been refused."""
     present, revision, rebuilt = last.chain, last.revision, False
-    outcomes: dict[int, tuple[Outcome, Judged]] = {}
+    outcomes: dict[int, tuple[Outcome, Verdict]] = {}
     for event in events:
-        if isinstance(event, Judged):
+        if isinstance(event, Verdict):
             outcomes |= {id(outcome.insert): (outcome, event) for outcome in event.outcomes}
             revision = max(revision, event.revision)
         else:
             present, revision = chain.follow(present, event.delta), event.revision
             rebuilt = rebuilt or event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
-    return Fold(number, revision, rebuilt, present, entries, further and not rebuilt)
+    return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt)
 
 
-def _entry(insert: Arrived, outcome: Outcome, judged: Judged) -> Entry:
+def _entry(insert: Arrived, outcome: Outcome, judged: Verdict) -> Entry:
     if isinstance(outcome.answer, bytes):
         answer = ACCEPTED, judged.revision, outcome.first_factor, judged.together, outcome.answer
     else:

@@ -44,7 +44,7 @@ def write_messages(
     here = write_integer(out, write_piece(out, here, w.P_EPOCH, words, letters), epoch)
     here = write_integer(out, write_piece(out, here, w.P_REVISION, words, letters), revision)
     here = write_integer(out, write_piece(out, here, w.P_FIRST_FACTOR, words, letters), first_factor)
-    here = write_piece(out, here, w.P_FOLDED, words, letters)
+    here = write_piece(out, here, w.P_APPLIED, words, letters)
     answer = write_bytes(out, write_piece(out, here, w.P_REPORT, words, letters), report, 0, len(report))
     here = write_integer(out, write_piece(out, answer, w.P_DELTA, words, letters), epoch)
     here = write_integer(out, write_piece(out, here, w.P_REVISION, words, letters), revision)

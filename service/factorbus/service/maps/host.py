@@ -3,10 +3,10 @@
 Whoever brings an event takes the lock for the microseconds that the core needs; what the core wants done is done
 after the lock is free again.
 
-There is one Run at a time, and whoever has it has the solver.  It goes to the map's own thread, unless it is short:
+There is one InsertBatch at a time, and whoever has it has the solver.  It goes to the map's own thread, unless it is short:
 then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small exchange).
-That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the seat):
-however wrong the guess was, only the client that sent the insert is not heard meanwhile.  A Run ends (Folded) when its
+That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the inline_run):
+however wrong the guess was, only the client that sent the insert is not heard meanwhile.  A InsertBatch ends (Applied) when its
 messages are sent or in the outbox, so deltas leave in order.
 """
 
@@ -22,25 +22,25 @@ from typing import Any, TypeAlias
 from factorbus.journal.problems import JournalFailed
 from factorbus.proto.problems import Internal, Problem
 from factorbus.service.core.events import (
-    Alone,
     Answer,
+    Applied,
     Arrived,
     Asked,
     Asker,
     Effect,
-    Folded,
-    Judged,
+    InsertBatch,
     Publish,
     Read,
     Refuse,
-    Run,
+    SingleInsertResult,
     Stepped,
+    Verdict,
 )
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.journal.keeping import Events, Keeper, Keeping
 from factorbus.service.process.health import Pulse
 from factorbus.service.questions.answers import QuestionCopies
-from factorbus.service.solving.apply import Folder
+from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
@@ -52,30 +52,30 @@ AnswerReads: TypeAlias = Callable[[Sequence[Read], QuestionCopies], None]
 
 
 class Host:
-    """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short Run.
+    """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short InsertBatch.
 
     perform: has done what the core wants done, in order, elsewhere; send: the same, at once if the order allows.
-    seat: shared by all maps; who has it may do short Runs.  send_both: `send` for an answer and a delta.
+    inline_run: shared by all maps; who has it may do short Runs.  send_both: `send` for an answer and a delta.
     """
 
     def __init__(
         self,
         core: MapCore,
-        folder: Folder,
+        folder: MapSolver,
         perform: Perform,
         send: Perform,
         answer: AnswerReads,
-        seat: threading.Lock,
+        inline_run: threading.Lock,
         send_both: SendBoth,
         keeping: Keeping | None = None,
     ) -> None:
         self.core = core
         self._keeper = keeping.keeper(self) if keeping else None
         self._keeping = keeping
-        self._folder, self._do, self._send, self._answer, self._seat = folder, perform, send, answer, seat
+        self._folder, self._do, self._send, self._answer, self._inline_run = folder, perform, send, answer, inline_run
         self._send_both = send_both
         self._lock = threading.Lock()
-        self._runs: queue.SimpleQueue[Run | Callable[[], None] | None] = queue.SimpleQueue()
+        self._runs: queue.SimpleQueue[InsertBatch | Callable[[], None] | None] = queue.SimpleQueue()
         self._pulse = Pulse(self._runs.put)
         self._thread = threading.Thread(target=self._solve_all, name=f"solver {core.name}", daemon=True)
         self._thread.start()
@@ -90,13 +90,18 @@ class Host:
         """An insert came in."""
         with self._lock:
             effects = self.core.insert(arrived)
-        if effects and isinstance(run := effects[-1], Run) and run.short and self._seat.acquire(blocking=False):
+        if (
+            effects
+            and isinstance(run := effects[-1], InsertBatch)
+            and run.short
+            and self._inline_run.acquire(blocking=False)
+        ):
             try:
                 if len(effects) > 1:
                     self._perform(effects[:-1])
                 self._solve(run, self._send)
             finally:
-                self._seat.release()
+                self._inline_run.release()
         else:
             self._perform(effects)
 
@@ -175,7 +180,7 @@ class Host:
     # ---- what becomes of the writing: on the journal's thread -------------------------------------------------------
 
     def kept(self, events: Events) -> None:
-        """What came of a Run is safe."""
+        """What came of a InsertBatch is safe."""
         with self._lock:
             effects = self.core.kept(events, time.monotonic())
         self._perform(effects)
@@ -199,7 +204,7 @@ class Host:
         self._perform(effects)
 
     def _perform(self, effects: list[Effect]) -> None:
-        if effects and isinstance(run := effects[-1], Run):
+        if effects and isinstance(run := effects[-1], InsertBatch):
             self._runs.put(run)
             effects = effects[:-1]
         if effects:
@@ -207,20 +212,20 @@ class Host:
 
     def _solve_all(self) -> None:
         while (run := self._runs.get()) is not None:
-            if isinstance(run, Run):
+            if isinstance(run, InsertBatch):
                 self._solve(run, self._do)
             else:
                 run()
 
-    def _solve(self, run: Run, tell: Perform) -> None:
+    def _solve(self, run: InsertBatch, tell: Perform) -> None:
         try:
             if self._keeper is not None:
                 self._run_kept(run, self._keeper, tell)
                 return
             if run.reads:
                 self._read(run.reads)
-            events = self._folder.fold_run(run.inserts, run.further)
-            if not isinstance(events, Alone):
+            events = self._folder.apply_batch(run.inserts, run.further)
+            if not isinstance(events, SingleInsertResult):
                 self._tell(events, tell)
                 return
             answered = events.insert.askers[0]
@@ -239,17 +244,17 @@ class Host:
                 effects = self.core.failed(Internal(reference), time.monotonic())
             self._perform(effects)
 
-    def _tell(self, events: Iterable[Judged | Stepped | Folded], tell: Perform) -> None:
-        """What comes of a Run, step by step."""
+    def _tell(self, events: Iterable[Verdict | Stepped | Applied], tell: Perform) -> None:
+        """What comes of a InsertBatch, step by step."""
         effects: list[Effect] = []
         for event in events:
-            if isinstance(event, Folded):
+            if isinstance(event, Applied):
                 with self._lock:
-                    effects += self.core.folded(event)
+                    effects += self.core.applied(event)
                 self._perform(effects)
                 return
             with self._lock:
-                if isinstance(event, Judged):
+                if isinstance(event, Verdict):
                     # Kept until the delta is made.  Sending wakes other threads, which on a busy machine run first;
                     # measured: an answer sent before its delta is encoded makes the delta 0.2 ms later.
                     effects += self.core.judged(event)
@@ -258,13 +263,13 @@ class Host:
             tell(effects)
             effects = []
 
-    def _run_kept(self, run: Run, keeper: Keeper, tell: Perform) -> None:
+    def _run_kept(self, run: InsertBatch, keeper: Keeper, tell: Perform) -> None:
         """The same with a journal: what comes of it is told when that is safe, or at once if it need not be."""
         if run.reload and self._keeping is not None:
             keeper.reloaded(self._keeping.reload(self._folder))
         if run.reads:
             self._read(run.reads)
-        events, folded = self._folder.fold_whole(run.inserts, run.further)
+        events, applied = self._folder.apply_whole(run.inserts, run.further)
         keeper.hand(run.inserts, events, run.further)
         if not keeper.waits:
             with self._lock:
@@ -275,7 +280,7 @@ class Host:
             started = time.perf_counter()
             keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
         with self._lock:
-            effects = self.core.folded(folded)
+            effects = self.core.applied(applied)
         self._perform(effects)
 
     def _read(self, reads: Sequence[Read]) -> None:
@@ -296,7 +301,7 @@ class Host:
         if keeper is None:
             self._answer(reads, taken)
             return
-        noted = replace(taken, fold=keeper.folds)
+        noted = replace(taken, record=keeper.records)
         wait = keeper.after if taken.copied is None else keeper.when_written
         wait(lambda: self._answer(reads, noted), lambda problem: self._refuse(reads, problem))
 

@@ -10,7 +10,7 @@ from typing import Any
 log = logging.getLogger(__name__)
 
 
-class Lane:
+class SerialExecutor:
     """Calls run on one thread of their own, in the order they were handed in."""
 
     def __init__(self, name: str) -> None:
@@ -54,36 +54,36 @@ class Lane:
         try:
             call(*arguments)
         except Exception:
-            # One answer that cannot be given must not silence the lane for all others.
+            # One answer that cannot be given must not silence the executor for all others.
             self._log(call)
 
     def _log(self, call: Callable[..., None]) -> None:
         log.exception("%s: %s failed", self._thread.name, getattr(call, "__qualname__", call))
 
 
-class Lanes:
-    """Several lanes for calls in no order: one that takes long delays few of the others."""
+class SerialExecutors:
+    """Several executors for calls in no order: one that takes long delays few of the others."""
 
     def __init__(self, name: str, count: int) -> None:
-        self._lanes = [Lane(f"{name} {n}") for n in range(count)]
+        self._executors = [SerialExecutor(f"{name} {n}") for n in range(count)]
 
     @property
     def waiting(self) -> int:
         """Calls that are not done."""
-        return sum(lane.waiting for lane in self._lanes)
+        return sum(executor.waiting for executor in self._executors)
 
     def hand(self, call: Callable[..., None], *arguments: Any) -> None:
-        """Have `call(*arguments)` run on the lane that has least to do.  Never blocks."""
-        min(self._lanes, key=lambda lane: lane.waiting).hand(call, *arguments)
+        """Have `call(*arguments)` run on the executor that has least to do.  Never blocks."""
+        min(self._executors, key=lambda executor: executor.waiting).hand(call, *arguments)
 
     def settle(self) -> None:
         """Return when all that was handed in before is done."""
-        for lane in self._lanes:
+        for executor in self._executors:
             reached = threading.Event()
-            lane.hand(reached.set)
+            executor.hand(reached.set)
             reached.wait()
 
     def close(self) -> None:
         """Return when all that was handed in is done."""
-        for lane in self._lanes:
-            lane.close()
+        for executor in self._executors:
+            executor.close()

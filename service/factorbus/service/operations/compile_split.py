@@ -12,7 +12,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 
-class Shares:
+class CompileSplit:
     """What is taken and what is left.  claims: a folder where whoever comes first makes a file with a kernel's name.
 
     functions: of every kernel those that it calls, directly or not, and itself, with how large they are.

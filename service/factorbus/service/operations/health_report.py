@@ -8,7 +8,7 @@ from typing import Any
 from factorbus.proto.version import __version__
 from factorbus.service.config import Config
 from factorbus.service.maps.host import Host
-from factorbus.service.maps.serial_executor import Lane
+from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.health import Health, Pulse, Signs
 from factorbus.service.process.memory import MemoryLimit
 
@@ -16,18 +16,22 @@ from factorbus.service.process.memory import MemoryLimit
 Chapters = dict[str, Callable[[], Any]]
 
 
-class Vitals:
+class HealthReport:
     """Of one service.  `look` is for the thread that ticks; the rest may be called from any."""
 
     def __init__(
-        self, config: Config, service: str, lanes: Mapping[str, Lane], hosts: Callable[[], Mapping[str, Host]]
+        self,
+        config: Config,
+        service: str,
+        executors: Mapping[str, SerialExecutor],
+        hosts: Callable[[], Mapping[str, Host]],
     ) -> None:
         """hosts: the maps there are at the moment."""
         self.health = Health(config.stuck_s)
         self.memory = MemoryLimit(config.limits.memory_bytes)
         self.chapters: Chapters = {}
         self._service, self._started = service, time.monotonic()
-        self._pulses = {name: Pulse(lane.hand) for name, lane in lanes.items()}
+        self._pulses = {name: Pulse(executor.hand) for name, executor in executors.items()}
         self._hosts = hosts
 
     def look(self) -> set[str]:
@@ -35,10 +39,12 @@ class Vitals:
         hosts = self._hosts()
         self.memory.look()
         now = time.monotonic()
-        lanes = {name: pulse.silent_s(now) for name, pulse in self._pulses.items()}
+        executors = {name: pulse.silent_s(now) for name, pulse in self._pulses.items()}
         solvers = {name: host.silent_s() for name, host in hosts.items()}
         closed = {name: why for name, host in hosts.items() if (why := host.unwritable)}
-        self.health.seen(Signs(now, lanes | {f"solver {name}": seconds for name, seconds in solvers.items()}, closed))
+        self.health.seen(
+            Signs(now, executors | {f"solver {name}": seconds for name, seconds in solvers.items()}, closed)
+        )
         return {name for name, seconds in solvers.items() if seconds > self.health.stuck_s}
 
     def account(self) -> dict[str, Any]:
@@ -53,7 +59,7 @@ class Vitals:
             "alive": self.health.alive(),
             "ready": self.health.ready(),
             "stuck": self.health.stuck(),
-            "lacking": self.health.lacking(),
+            "missing": self.health.missing(),
             "silent_s": self.health.silent_s(),
             "memory": {"resident_bytes": self.memory.resident, "limit_bytes": self.memory.limit},
             "kernels_compiled_s": compiled_seconds(),

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from factorbus.proto.ports import listening_problem
 from factorbus.service.config import BadConfig
-from factorbus.service.operations.health_report import Vitals
+from factorbus.service.operations.health_report import HealthReport
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,8 @@ class Metrics:
             self._server.server_close()
 
 
-def open_metrics(where: str, vitals: Vitals) -> Metrics:
-    """Serve what `vitals` know at `where` (HOST:PORT); nowhere if that is empty.
+def open_metrics(where: str, health_report: HealthReport) -> Metrics:
+    """Serve what `health_report` know at `where` (HOST:PORT); nowhere if that is empty.
 
     Raises BadConfig, PortTaken, CannotListen.
     """
@@ -55,7 +55,7 @@ def open_metrics(where: str, vitals: Vitals) -> Metrics:
         raise BadConfig("metrics need prometheus-client, of the extra `service`: factorbus doctor") from None
     host, _, port = where.rpartition(":")
     try:
-        server = _Server((host.strip("[]"), int(port)), _handler(vitals))
+        server = _Server((host.strip("[]"), int(port)), _handler(health_report))
     except OSError as error:
         raise listening_problem(f"{where}, for metrics,", error) from None
     except OverflowError:
@@ -103,7 +103,7 @@ def _of_workers(rows: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
     for name, what in (
         ("slots", "Jobs it takes at a time"),
         ("in_flight", "Jobs it has"),
-        ("trip_ms", "The way there, ms"),
+        ("latency_ms", "The way there, ms"),
     ):
         samples = {row["name"]: row[name] for row in rows if name in row}
         yield _by(f"worker_{name}", "gauge", what, "worker", samples)
@@ -174,14 +174,14 @@ def _by(name: str, kind: str, what: str, label: str, values: Mapping[str, Any]) 
 class _Collector:
     """What Prometheus's library asks at every scrape."""
 
-    def __init__(self, vitals: Vitals) -> None:
-        self._vitals = vitals
+    def __init__(self, health_report: HealthReport) -> None:
+        self._health_report = health_report
 
     def collect(self) -> Iterator[Any]:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 
         kinds = {"gauge": GaugeMetricFamily, "counter": CounterMetricFamily, "histogram": HistogramMetricFamily}
-        for family in families(self._vitals.account()):
+        for family in families(self._health_report.account()):
             made = kinds[family.kind](f"factorbus_{family.name}", family.help, labels=family.labels)
             for labels, value in family.samples:
                 if family.kind == "histogram":
@@ -222,12 +222,12 @@ class _Server(ThreadingHTTPServer):
             self._room.release()
 
 
-def _handler(vitals: Vitals) -> type[BaseHTTPRequestHandler]:
+def _handler(health_report: HealthReport) -> type[BaseHTTPRequestHandler]:
     from prometheus_client import CollectorRegistry
     from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Collector(vitals))  # type: ignore[arg-type]
+    registry.register(_Collector(health_report))  # type: ignore[arg-type]
 
     class Handler(BaseHTTPRequestHandler):
         timeout = 5.0
@@ -237,9 +237,9 @@ def _handler(vitals: Vitals) -> type[BaseHTTPRequestHandler]:
                 case "/metrics":
                     self._say(200, CONTENT_TYPE_LATEST, generate_latest(registry))
                 case "/live":
-                    self._say(*_word([f"stuck: {', '.join(names)}"] if (names := vitals.health.stuck()) else []))
+                    self._say(*_word([f"stuck: {', '.join(names)}"] if (names := health_report.health.stuck()) else []))
                 case "/ready":
-                    self._say(*_word(vitals.health.lacking()))
+                    self._say(*_word(health_report.health.missing()))
                 case _:
                     self._say(404, _TEXT, b"there are /metrics, /live and /ready\n")
 
@@ -256,5 +256,5 @@ def _handler(vitals: Vitals) -> type[BaseHTTPRequestHandler]:
     return Handler
 
 
-def _word(lacking: list[str]) -> tuple[int, str, bytes]:
-    return (503, _TEXT, f"{'; '.join(lacking)}\n".encode()) if lacking else (200, _TEXT, b"ok\n")
+def _word(missing: list[str]) -> tuple[int, str, bytes]:
+    return (503, _TEXT, f"{'; '.join(missing)}\n".encode()) if missing else (200, _TEXT, b"ok\n")

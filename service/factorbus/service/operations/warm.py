@@ -22,7 +22,7 @@ from factorbus import solver
 from factorbus.idp import kernels as idp_kernels
 from factorbus.idp import warm as warm_idp
 from factorbus.service import kernels
-from factorbus.service.operations.compile_split import Shares, functions_of
+from factorbus.service.operations.compile_split import CompileSplit, functions_of
 from factorbus.service.process.memory import available
 from factorbus.service.process.worker_threads import core_count
 from factorbus.solver.warm import iter_compile, list_missing
@@ -78,7 +78,7 @@ def _take_turns(claims: Path, progress: Callable[[str], None]) -> None:
     """Compile one kernel after the other that nobody has claimed."""
     _look_less()
     kernels = {f"{kernel.__module__}.{kernel.__name__}": kernel for kernel in _list_missing()}
-    for name in Shares(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
+    for name in CompileSplit(claims, {name: functions_of(kernel) for name, kernel in kernels.items()}):
         progress(kernels[name].__name__)
         for _ in iter_compile(kernels[name]):
             pass

@@ -71,7 +71,7 @@ class Health:
         """Nobody is stuck."""
         return not self.stuck()
 
-    def lacking(self) -> list[str]:
+    def missing(self) -> list[str]:
         """What keeps it from being ready."""
         closed = [f"map {name} takes nothing: {why}" for name, why in self._signs.closed.items()]
         stuck = [f"stuck: {', '.join(names)}"] if (names := self.stuck()) else []
@@ -79,4 +79,4 @@ class Health:
 
     def ready(self) -> bool:
         """Alive and open, for every map."""
-        return not self.lacking()
+        return not self.missing()

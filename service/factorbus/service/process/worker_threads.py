@@ -5,7 +5,7 @@ import threading
 from typing import Any
 
 from factorbus.service.process.control_groups import limit_files
-from factorbus.solver.sparse.lending import Lender, can_lend, count_free
+from factorbus.solver.sparse.lending import WorkerThread, can_work, count_free
 
 
 def core_count() -> int:
@@ -25,7 +25,7 @@ def core_count() -> int:
     return max(int(min(shares)), 1)
 
 
-class LentCores:
+class WorkerThreads:
     """Until it is closed, an elimination may be at work on `cores` of those that there are at once.
 
     From when the kernel that eliminates is at hand: threads that asked for it before would compile it, for nobody yet,
@@ -34,15 +34,15 @@ class LentCores:
 
     def __init__(self, cores: int) -> None:
         self._more = min(cores, core_count()) - 1
-        self._lenders: list[Lender] = []
+        self._lenders: list[WorkerThread] = []
         self._threads: list[threading.Thread] = []
         self.tick()
 
     def tick(self) -> None:
         """Time went by: somebody may have compiled or loaded the kernel."""
-        if self._threads or not can_lend():
+        if self._threads or not can_work():
             return
-        self._lenders = [Lender() for _ in range(min(self._more, count_free()))]
+        self._lenders = [WorkerThread() for _ in range(min(self._more, count_free()))]
         self._threads = [
             threading.Thread(target=lender.lend, name=f"core {n}", daemon=True)
             for n, lender in enumerate(self._lenders, 1)

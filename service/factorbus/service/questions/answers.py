@@ -28,7 +28,7 @@ from factorbus.solver.errors import SolverError
 _FORMATS = ("g2o", "tum", "kitti")
 _IDS = ("auto", "ids", "keys", "counted")
 _WAIT_S = (0.001, 86_400.0)
-# How many times the bytes of the solver it takes to repair a map, and to factorise one in a mode that keeps no R.
+# How many times the bytes of the solver it takes to repair a map, and to factorize one in a mode that keeps no R.
 _REPAIR, _FRESH = 4, 3
 _UNBOUNDED = Room()
 
@@ -65,7 +65,7 @@ class QuestionCopies:
     """Copies of what some questions need, all of one revision.
 
     uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
-    solver's copy of everything.  copied: the folder's, and after which fold of the journal that was.  room: for what
+    solver's copy of everything.  copied: the folder's, and after which record of the journal that was.  room: for what
     is made of it.
     """
 
@@ -78,7 +78,7 @@ class QuestionCopies:
     ready: Mapping[int, bytes | Exception] = field(default_factory=dict)
     content: Any = None
     copied: Copied | None = None
-    fold: int = 0
+    record: int = 0
     room: Room = _UNBOUNDED
 
     @property

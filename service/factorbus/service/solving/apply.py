@@ -1,4 +1,4 @@
-"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's Run.
+"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's InsertBatch.
 
     1  stage every insert; the solver refuses a bad one whole, the others go on
     2  one step for all of them
@@ -30,7 +30,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Accepted, Batch, Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Alone, Arrived, Folded, Judged, Located, Outcome, Stepped
+from factorbus.service.core.events import Applied, Arrived, Outcome, ParsedInsert, SingleInsertResult, Stepped, Verdict
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
 from factorbus.service.solving.holding import Broken, Holding
@@ -49,67 +49,69 @@ class _Staged(NamedTuple):
     insert: Arrived
     first_factor: int
     settle: bool
-    points_below: float = 0.0
+    convert_below: float = 0.0
 
 
 class _TakenBack(Exception):
     """A step with several inserts failed: the solver is as it was before them."""
 
 
-class Folder(Holding):
+class MapSolver(Holding):
     """The solver of one map, and how it takes in what comes.  For one thread at a time."""
 
     def __init__(
         self, make_solver: Callable[[], Any], epoch: int, limits: Limits, options: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(make_solver, epoch, limits, options)
-        self._cpu_s = 0.0  # of every thread that folded
+        self._cpu_s = 0.0  # of every thread that applied
         self._out = np.empty(_ALONE_BYTES, np.uint8)
         self._out_bytes = self._out.data
         self._pack = codec.report_encoder()
         self._doubt: Exception | None = None  # a fault of the solver that is still to be dealt with
 
-    def fold_again(
+    def apply_again(
         self, inserts: Sequence[Arrived], rebuilt: bool = False, further: bool = False
-    ) -> Iterator[Judged | Stepped]:
-        """Fold in what was folded in together before: no limit that has been set since refuses it.
+    ) -> Iterator[Verdict | Stepped]:
+        """JournalRecord in what was applied in together before: no limit that has been set since refuses it.
 
         rebuilt: the solver was replaced meanwhile.  further: there was nothing, it was a further step.
         """
         limits, self._limits = self._limits, replace(self._limits, variables=1 << 62, factors=1 << 62)
         try:
-            yield from self.fold_whole(inserts, further)[0] if inserts or further else ()
+            yield from self.apply_whole(inserts, further)[0] if inserts or further else ()
             if rebuilt:
                 yield from self._replace_solver("replayed")
         finally:
             self._limits = limits
 
-    def fold_whole(self, inserts: Sequence[Arrived], further: bool = False) -> tuple[list[Judged | Stepped], Folded]:
-        """All that comes of a fold, at its end.  Of the same inserts in the same groups always the same, to the bit."""
-        came = self.fold_run(inserts, further)
-        if isinstance(came, Alone):
-            judged = Judged((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
+    def apply_whole(self, inserts: Sequence[Arrived], further: bool = False) -> tuple[list[Verdict | Stepped], Applied]:
+        """All that comes of a record, at its end.  Of the same inserts in the same groups always the same, to the bit."""
+        came = self.apply_batch(inserts, further)
+        if isinstance(came, SingleInsertResult):
+            judged = Verdict((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
             told = came.strategy, came.chi2, came.solver_ms
             left = {"converged": came.converged, "unfinished": came.unfinished}
             stepped = Stepped(came.revision, came.delta, *told, **left)
-            return [judged, stepped], Folded(came.variables, came.factors, came.solver_cpu_s, came.now)
-        events: list[Judged | Stepped] = []
-        folded = self._folded(time.thread_time())
+            return [judged, stepped], Applied(came.variables, came.factors, came.solver_cpu_s, came.now)
+        events: list[Verdict | Stepped] = []
+        applied = self._applied(time.thread_time())
         for event in came:
-            if isinstance(event, Folded):
-                folded = event
+            if isinstance(event, Applied):
+                applied = event
             else:
                 events.append(event)
-        return events, folded
+        return events, applied
 
-    def fold_run(self, inserts: Sequence[Arrived], further: bool) -> Alone | Iterator[Judged | Stepped | Folded]:
-        """All that a Run asks for: `inserts`, or a `further` step where there are none."""
+    def apply_batch(
+        self, inserts: Sequence[Arrived], further: bool
+    ) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
+        """All that a InsertBatch asks for: `inserts`, or a `further` step where there are none."""
         if further:
             return self.go_on()
-        return self.fold_alone(inserts[0]) if len(inserts) == 1 else self.fold(inserts)
+        return self.apply_single(inserts[0]) if len(inserts) == 1 else self.record(inserts)
 
-    def go_on(self) -> Iterator[Stepped | Folded]:
-        """One step without an insert: Stepped, unless the solver refuses it and is as it was; Folded."""
+    def go_on(self) -> Iterator[Stepped | Applied]:
+        """One step without an insert: Stepped, unless the solver refuses it and is as it was; Applied."""
         cpu_s, revision, refused = time.thread_time(), self._revision, True
         stepped: list[Stepped] = []
         try:
@@ -120,7 +122,7 @@ class Folder(Holding):
             stepped = list(self._replace_solver(self._fault()))
             refused = not stepped
         yield from (each._replace(further=True) for each in stepped)
-        yield self._folded(cpu_s)._replace(refused=refused)
+        yield self._applied(cpu_s)._replace(refused=refused)
 
     def _further_step(self) -> tuple[list[Stepped], bool]:
         """What comes of it, and whether it is refused.  As those of inserts, it is tried on a copy where numbers are of
@@ -146,10 +148,10 @@ class Folder(Holding):
         self._next(account)
         return [self._told(account)._replace(changed=report.changed, damping=report.damping)], False
 
-    def fold(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped | Folded]:
-        """Fold `inserts` in; every one of them is accepted or refused whole.
+    def record(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped | Applied]:
+        """JournalRecord `inserts` in; every one of them is accepted or refused whole.
 
-        Yields, for every step, Judged (the answers, which stand whatever becomes of the delta) and Stepped; Folded at
+        Yields, for every step, Verdict (the answers, which stand whatever becomes of the delta) and Stepped; Applied at
         the end.
         """
         cpu_s = time.thread_time()
@@ -159,9 +161,9 @@ class Folder(Holding):
                     yield from self._change(insert)
             else:
                 yield from self._add(list(group))
-        yield self._folded(cpu_s)
+        yield self._applied(cpu_s)
 
-    def _add(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
+    def _add(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped]:
         """Inserts that only add: in one step, or one at a time where that fails."""
         try:
             yield from self._together(inserts)
@@ -169,7 +171,7 @@ class Folder(Holding):
             for insert in inserts:
                 yield from self._together([insert])
 
-    def _change(self, insert: Arrived) -> Iterator[Judged | Stepped]:
+    def _change(self, insert: Arrived) -> Iterator[Verdict | Stepped]:
         """One that changes what the map has: in place, or in a new solver; the map is as it was where that fails."""
         content, started = cast(Insert, insert.content), time.perf_counter()
         try:
@@ -179,11 +181,11 @@ class Folder(Holding):
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
             came = None if self._wary else self._solver.try_change(content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:
-            yield Judged((Outcome(insert, problem),))
+            yield Verdict((Outcome(insert, problem),))
             return
         except Exception:
             reference = self._fault()
-            yield Judged((Outcome(insert, Internal(reference)),))
+            yield Verdict((Outcome(insert, Internal(reference)),))
             yield from self._replace_solver(reference)
             return
         if came is None:
@@ -193,7 +195,7 @@ class Folder(Holding):
         self._wary = not is_usual(self._solver)
         yield from self._changed(insert, first_factor, report, started, counted, None)
 
-    def _change_anew(self, insert: Arrived, started: float) -> Iterator[Judged | Stepped]:
+    def _change_anew(self, insert: Arrived, started: float) -> Iterator[Verdict | Stepped]:
         """The same in a new solver."""
         content = cast(Insert, insert.content)
         try:
@@ -202,12 +204,12 @@ class Folder(Holding):
             )
             check_step(solver, report)
         except (Problem, SolverError) as problem:
-            yield Judged((Outcome(insert, problem),))
+            yield Verdict((Outcome(insert, problem),))
             return
         except Exception:
             reference = secrets.token_hex(4)
             log.exception("fault %s: the solver failed in a change; the map goes on without it", reference)
-            yield Judged((Outcome(insert, Internal(reference)),))
+            yield Verdict((Outcome(insert, Internal(reference)),))
             return
         self._solver, self._wary = solver, not is_usual(solver)
         yield from self._changed(insert, first_factor, report, started, counted, 0)
@@ -215,38 +217,38 @@ class Folder(Holding):
     def _changed(
         self, insert: Arrived, first_factor: int, report: Any, started: float, counted: Mapping[str, int],
         previous: int | None,
-    ) -> Iterator[Judged | Stepped]:  # fmt: skip
+    ) -> Iterator[Verdict | Stepped]:  # fmt: skip
         """The step went well; previous: 0 where its delta is to have everything."""
         content = cast(Insert, insert.content)
-        staged = _Staged(insert, first_factor, content.settle, content.points_below)
+        staged = _Staged(insert, first_factor, content.settle, content.convert_below)
         yield from self._stepped([staged], [], report, started, counted, previous)
-        if content.points_below:
-            yield from self._ripen(content.points_below)
+        if content.convert_below:
+            yield from self._convert_to_points(content.convert_below)
 
-    def fold_alone(self, insert: Arrived) -> Alone | Iterator[Judged | Stepped | Folded]:
-        """What `fold` comes to for one insert: in one piece where all goes as usual, in a third of the time.
+    def apply_single(self, insert: Arrived) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
+        """What `record` comes to for one insert: in one piece where all goes as usual, in a third of the time.
 
         That time is mostly one of code that is not in the caches: so it is written in few calls.
         """
         content, solver, limits, most = insert.content, self._solver, self._limits, insert.size // 8
         variables, factors = self._held
         has_room = variables + most <= limits.variables and factors + most <= limits.factors
-        if not isinstance(content, Located) or self._broken or not has_room:
-            return self.fold((insert,))
+        if not isinstance(content, ParsedInsert) or self._broken or not has_room:
+            return self.record((insert,))
         started = time.perf_counter()
         try:
             first_factor = solver.try_stage(content.message, content.groups)
             if first_factor is None:
-                return self.fold((insert,))
+                return self.record((insert,))
             if self._wary or not is_usual(solver, variables, factors):
                 unstage(solver)
-                return self.fold((insert,))
+                return self.record((insert,))
             report = solver.step(content.settle)
         except SolverError:
-            return self.fold((insert,))  # it was taken back, and is now refused in the usual way
+            return self.record((insert,))  # it was taken back, and is now refused in the usual way
         except Exception as fault:
             self._doubt = fault
-            return self.fold((insert,))
+            return self.record((insert,))
         try:
             changed, graph = solver.pick_changed()
             if not is_sound(changed, graph, report):
@@ -268,19 +270,19 @@ class Folder(Holding):
         # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
         self._cpu_s += 1e-3 * solver_ms
         out = self._out_bytes
-        return Alone(
+        return SingleInsertResult(
             insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
             report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(), self._converged,
             self._unfinished,
         )  # fmt: skip
 
-    def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Judged | Stepped | Folded]:
+    def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Verdict | Stepped | Applied]:
         """The step of one insert left what cannot be kept: it is refused."""
         cpu_s = time.thread_time()
         problem = self._find_diverged(report)
-        yield Judged((Outcome(insert, problem or Internal("a step that was sound")),))
+        yield Verdict((Outcome(insert, problem or Internal("a step that was sound")),))
         yield from self._go_back(report)
-        yield self._folded(cpu_s)
+        yield self._applied(cpu_s)
 
     def _find_diverged(self, report: Any) -> Diverged | None:
         """What the last step left beyond its bounds."""
@@ -290,19 +292,19 @@ class Folder(Holding):
             return diverged
         return None
 
-    def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Judged | Stepped | Folded]:
-        """The rest of `fold`, after the step."""
+    def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Verdict | Stepped | Applied]:
+        """The rest of `record`, after the step."""
         cpu_s = time.thread_time()
         self._cpu_s += time.perf_counter() - started
         yield from self._stepped([staged], [], report, started)
-        yield self._folded(cpu_s)
+        yield self._applied(cpu_s)
 
-    def _folded(self, cpu_s: float) -> Folded:
+    def _applied(self, cpu_s: float) -> Applied:
         solver = self._solver
         self._cpu_s += time.thread_time() - cpu_s
-        return Folded(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
+        return Applied(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
 
-    def _together(self, inserts: Sequence[Arrived]) -> Iterator[Judged | Stepped]:
+    def _together(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped]:
         """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
         started = time.perf_counter()
         staged: list[_Staged] = []
@@ -337,10 +339,10 @@ class Folder(Holding):
             outcomes = [Outcome(inserts[0], Internal(reference))]
         diverged = None if report is None else self._find_diverged(report)
         if report is None:
-            yield Judged(tuple(outcomes))
+            yield Verdict(tuple(outcomes))
         elif diverged is not None:
             if len(staged) == 1:
-                yield Judged((*outcomes, Outcome(staged[0].insert, diverged)))
+                yield Verdict((*outcomes, Outcome(staged[0].insert, diverged)))
             if kept is not None:
                 self._solver = kept
             else:
@@ -350,8 +352,8 @@ class Folder(Holding):
         else:
             self._wary = self._wary or kept is not None
             yield from self._stepped(staged, outcomes, report, started)
-            if below := max((s.points_below for s in staged), default=0.0):
-                yield from self._ripen(below)
+            if below := max((s.convert_below for s in staged), default=0.0):
+                yield from self._convert_to_points(below)
 
     def _stage(self, insert: Arrived) -> _Staged:
         """Hand one insert to the solver.  Raises Problem, SolverError: then nothing changed."""
@@ -360,14 +362,14 @@ class Folder(Holding):
             raise Broken(self._broken)
         if isinstance(content, Problem):
             raise content
-        if isinstance(content, Located):
+        if isinstance(content, ParsedInsert):
             if self._has_room(insert.size):
                 first_factor = self._solver.try_stage(content.message, content.groups)
                 if first_factor is not None:
                     return _Staged(insert, first_factor, content.settle)
             content = codec.decode_insert(content.message)
         self._check_room(insert.size, content.batch)
-        return _Staged(insert, self._solver.stage(content.batch), content.settle, content.points_below)
+        return _Staged(insert, self._solver.stage(content.batch), content.settle, content.convert_below)
 
     def _has_room(self, size: int) -> bool:
         """Whether a message of `size` bytes surely keeps the map within its limits."""
@@ -394,7 +396,7 @@ class Folder(Holding):
         started: float,
         changed: Mapping[str, int] | None = None,
         previous: int | None = None,
-    ) -> Iterator[Judged | Stepped]:
+    ) -> Iterator[Verdict | Stepped]:
         """The step went well: the answers, then the delta; previous: 0 where that has everything."""
         account = report.as_dict() | (changed or {})
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
@@ -410,7 +412,7 @@ class Folder(Holding):
             for s in staged
         ]
         self._held = self._solver.variable_count, self._solver.factor_count
-        yield Judged((*accepted, *refused), self._revision, len(staged))
+        yield Verdict((*accepted, *refused), self._revision, len(staged))
         try:
             told = self._told(account, previous)
         except Exception:
@@ -419,7 +421,7 @@ class Folder(Holding):
         else:
             yield told
 
-    def _ripen(self, below: float) -> Iterator[Stepped]:
+    def _convert_to_points(self, below: float) -> Iterator[Stepped]:
         """Features whose linearity index is below this become points, in a step of its own whose delta has everything.
 
         Where that step fails they stay what they are.

@@ -7,7 +7,7 @@ from factorbus.proto.limits import ANSWER_LIMITS, Limits
 from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
-from factorbus.service.core.events import Arrived, Asker, Located, Refuse
+from factorbus.service.core.events import Arrived, Asker, ParsedInsert, Refuse
 from factorbus.service.kernels.digest import digest
 from factorbus.service.kernels.read import read_insert as read_usual
 from factorbus.service.kernels.words import LETTERS, WORDS
@@ -39,7 +39,7 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
     return Arrived([asker], client, insert.sequence, insert.epoch, size, message_digest(payload), insert, now, payload)
 
 
-def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:
+def read_again(payload: bytes) -> tuple[int, Insert | ParsedInsert | Problem]:
     """(digest, content) of an insert that was read before, as `read_insert` has them."""
     if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, ANSWER_LIMITS)):
         return located[2:]
@@ -49,7 +49,7 @@ def read_again(payload: bytes) -> tuple[int, Insert | Located | Problem]:
         return message_digest(payload), problem
 
 
-def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] | None:
+def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, ParsedInsert] | None:
     """(sequence, epoch, digest, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
     size = len(payload)
     # A key is eight bytes: without counting, no more than this can be in it.
@@ -59,7 +59,7 @@ def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, Located] 
     sequence, epoch, settle, digest = read_usual(payload, WORDS, LETTERS, groups)
     if not sequence:
         return None
-    return int(sequence), int(epoch), int(digest), Located(payload, groups, bool(settle))
+    return int(sequence), int(epoch), int(digest), ParsedInsert(payload, groups, bool(settle))
 
 
 def message_digest(message: bytes) -> int:

@@ -109,7 +109,7 @@ class Holding:
         self._epoch = epoch
 
     def dump(self) -> dict[str, Any]:
-        """All that later folds depend on, a copy.  Raises Broken."""
+        """All that later records depend on, a copy.  Raises Broken."""
         if self._broken:
             raise Broken(self._broken)
         state = {"revision": self._revision, "held": list(self._held), "converged": self._converged}

@@ -19,11 +19,11 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.kernels.model.retract import differing
-from factorbus.solver.optimize.gauss_newton import Course, minimise
+from factorbus.solver.optimize.gauss_newton import Course, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
-from factorbus.solver.report import Shares, StepReport, Stopwatch
+from factorbus.solver.report import CompileSplit, StepReport, Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
 from factorbus.solver.sparse.elimination import Elimination
 from factorbus.wording import counted
@@ -228,7 +228,7 @@ class TreeSteps:
         rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
         if settle:
             rule = settling_rule(options)
-        course = minimise(system, chi2, 0.0, rule)
+        course = minimize(system, chi2, 0.0, rule)
         if course.iterations or not settle:
             self._tree.move_all()
             self._tree.step()
@@ -250,7 +250,7 @@ class TreeSteps:
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
-        nonzeros, asleep, changed, eliminated, relinearised, _, moved, flops, rounds = told[:_COUNTS]
+        nonzeros, asleep, changed, eliminated, relinearized, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
@@ -266,22 +266,22 @@ class TreeSteps:
         # the rest.
         return _new(StepReport, (
             "bayes-tree",
-            "batch" if course else ("tree" if moved or relinearised else "extend"),
-            because or (_relinearized(relinearised, rounds) if relinearised else _NOTHING_TO_RELINEARIZE),
+            "batch" if course else ("tree" if moved or relinearized else "extend"),
+            because or (_relinearized(relinearized, rounds) if relinearized else _NOTHING_TO_RELINEARIZE),
             course.iterations if course else rounds,
             chi2,
             max(chi2_before, 0.0),
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - before[at.FACTORS],
             self._moved.size if course else changed,
-            relinearised,
+            relinearized,
             eliminated,
             asleep,
             nonzeros,
             float(flops),
             0.0,  # damping
             converged,
-            Shares(tl.PHASES, told[_COUNTS:], compiled_ms),
+            CompileSplit(tl.PHASES, told[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip

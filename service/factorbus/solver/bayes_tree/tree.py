@@ -22,13 +22,13 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
 from factorbus.solver.options import Options
-from factorbus.solver.sparse.lending import BOARD
+from factorbus.solver.sparse.lending import TASK_QUEUE
 
 _FEW = 8  # new variables for which good first values are looked for
 
 
 class CliqueTree(Arenas):
-    """R, d, δ and linearisation points of a graph, kept by cliques.  The arrays are public: tests look at them."""
+    """R, d, δ and linearization points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = records.Tree._fields
     NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
@@ -67,7 +67,7 @@ class CliqueTree(Arenas):
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
         self.account: F64 = np.zeros(tl.A_SIZE)
-        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARISED_AT] = -1, -self._rest
+        self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARIZED_AT] = -1, -self._rest
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
     def step(self, sure: bool = False) -> int:
@@ -79,7 +79,7 @@ class CliqueTree(Arenas):
         """
         if sure:
             self.state[tl.S_CHECKED] = 1
-        while (status := tree_step(self._graph.places, self.places, BOARD, NOBODY)) == tl.NO_ROOM:
+        while (status := tree_step(self._graph.places, self.places, TASK_QUEUE, NOBODY)) == tl.NO_ROOM:
             self._make_room()
         return status
 
@@ -99,7 +99,7 @@ class CliqueTree(Arenas):
         return int(self.state[tl.S_FAILED])
 
     def move_all(self) -> None:
-        """The next step moves the linearisation points of all variables to the estimate."""
+        """The next step moves the linearization points of all variables to the estimate."""
         var = self._graph.var[: self.state[tl.S_VARIABLES]]
         free = np.flatnonzero(var[:, at.V_COLUMN] >= 0)
         self.node[free, tl.N_FLAGS] = 1

@@ -26,7 +26,7 @@ _PIXEL_BLOCK = np.array([15, 16, 18])
 _GUESS, _SURER = 14 + 20, 10.0
 
 
-def find_ripe(graph: Graph, below: float) -> I64:
+def find_convertible(graph: Graph, below: float) -> I64:
     """The variables, ascending, that are features whose linearity index (3.19) is below this.
 
     One whose first guess of the depth still says something is left: as a point it would lose that, and a map its scale.

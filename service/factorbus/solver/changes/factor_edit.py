@@ -2,7 +2,7 @@
 MATH §11.5.
 
     1  payload    measurements stay where they are; a factor that gets a loss has no room for its scale, and is copied
-    2  tree       what goes is taken off the lists of its variables, what stays is linearised anew (`edit_factors`)
+    2  tree       what goes is taken off the lists of its variables, what stays is linearized anew (`edit_factors`)
     3  rows       what is behind a factor that goes moves up (`remove_rows`); ids stay
 
 Until the step is made all of it can be undone, bit for bit.  What cannot be done so is left to `with_changes`.

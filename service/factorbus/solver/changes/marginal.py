@@ -1,7 +1,7 @@
 """Variables taken out of a graph for good: what their factors say of the others is kept as linear factors.  MATH §11.3.
 
 Variables that hang together go together.  Those that they share a factor with are their border, and what they say of
-it is a linear factor there, linearised at the estimate: of one variable or two, or a prior of one point that it
+it is a linear factor there, linearized at the estimate: of one variable or two, or a prior of one point that it
 determines.  Of more variables it is one in pieces (`joints`).  Refused is a border of more than MOST variables.
 """
 
@@ -95,7 +95,7 @@ def _reduced(graph: Graph, whole: Quadratic, count: int) -> tuple[F64, F64]:
     except np.linalg.LinAlgError:
         key, factors = int(graph.keys[whole.variables[0]]), graph.factors_of(whole.variables[0])
         raise errors.Underconstrained(
-            key, factors, "its own factors leave it free; it cannot be marginalised"
+            key, factors, "its own factors leave it free; it cannot be marginalized"
         ) from None
     across, along = np.linalg.solve(L, cross), np.linalg.solve(L, whole.eta[:cut])
     return whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along

@@ -9,7 +9,7 @@
     place              kind, keys (n,), values, carry   variables of one kind, also fixed ones, go to these values; the
                                                         estimate goes on from there; with `carry` all that no change
                                                         places goes along with what it hangs on (`carrying`)
-    marginalise        keys (n,)                        these variables go; what their factors say of others is kept as
+    marginalize        keys (n,)                        these variables go; what their factors say of others is kept as
                                                         linear factors (`marginal`)
 
 Changes are made one after the other: what the first has removed the second cannot name.  Each names what it is about
@@ -35,7 +35,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_INFORMATION, LEAST_SCALE, MOST_INFORMATION, MOST_NUMBER
 
-CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalise")
+CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalize")
 _NONE = np.empty(0, np.int64)
 # Numbers of a measurement and its information, by the code of the kind.
 _WIDTH = np.array([k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())], np.int64)
@@ -240,11 +240,11 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
     return values
 
 
-def _marginalise(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _marginalize(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     gone = np.unique(_variables(graph, edits, change))
     held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
     if edits.added or edits.placed.any() or edits.touched.any() or held:
-        raise errors.BadOrder("marginalise", "before any loss, weigh, fix, free, place or marginalise")
+        raise errors.BadOrder("marginalize", "before any loss, weigh, fix, free, place or marginalize")
     check_kept(graph, edits.kept, all_or_none=True)
     made, replaced = marginals(graph, gone, edits.kept)
     edits.added += made
@@ -262,7 +262,7 @@ _MAKE = {
     "fix": _fix,
     "free": _free,
     "place": _place,
-    "marginalise": _marginalise,
+    "marginalize": _marginalize,
 }
 
 

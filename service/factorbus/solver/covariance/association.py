@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import admitted, judge_candidates, linearised
+from factorbus.solver.covariance.candidates import admitted, judge_candidates, linearized
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.kernels.compatible import search
 from factorbus.solver.errors import KindMismatch, TooLarge, printed
@@ -92,7 +92,7 @@ def _joint_innovations(blocks: Blocks, pairs: FactorGroup, dim: int) -> tuple[F6
     if not k:
         return np.zeros((0, 0)), np.zeros(0)
     with admitted(graph, [pairs]):
-        linear = linearised(graph, mark[at.FACTORS], mark[at.FACTORS] + k)
+        linear = linearized(graph, mark[at.FACTORS], mark[at.FACTORS] + k)
     variables = np.unique(linear.ends)
     dims = blocks.factored.dims[variables]
     starts = dict(zip(variables.tolist(), (np.cumsum(dims) - dims).tolist(), strict=True))

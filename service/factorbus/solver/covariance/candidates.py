@@ -38,7 +38,7 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class Linear:
-    """Factors linearised at the estimate: r (n, 6), A, B, W (n, 6, 6), sizes (n, 3) of residual and ends."""
+    """Factors linearized at the estimate: r (n, 6), A, B, W (n, 6, 6), sizes (n, 3) of residual and ends."""
 
     ends: I64
     sizes: I64
@@ -118,7 +118,7 @@ def _diagonal(blocks: Blocks, ends: I64, hub: int) -> tuple[F64, I64]:
     return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
 
 
-def linearised(graph: Graph, first: int, last: int) -> Linear:
+def linearized(graph: Graph, first: int, last: int) -> Linear:
     """The factors first .. last−1 at the estimate."""
     r, A, B, W = _room(last - first)
     evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)

@@ -60,10 +60,10 @@ def viewed(graph: Graph, tree: CliqueTree) -> Factored:
 
 
 def factored_anew(graph: Graph) -> Factored:
-    """The same for a graph that is solved in another way: factorised here at its values.  Raises Underconstrained."""
+    """The same for a graph that is solved in another way: factorized here at its values.  Raises Underconstrained."""
     copy = graph.copied()
     values = copy.values.copy()
-    # The graph is solved, so all of it is held; and the linearisation points are the estimate.  They stay there, in one
+    # The graph is solved, so all of it is held; and the linearization points are the estimate.  They stay there, in one
     # round, wherever what is left of the gradient leads.
     tree = CliqueTree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1, converged_share=np.inf))
     if tree.step(sure=True) == tl.FAILED:

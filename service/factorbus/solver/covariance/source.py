@@ -23,7 +23,7 @@ class CovarianceSource:
     def factored(self) -> Factored:
         """A copy of R and of all that it is of, for other threads.
 
-        In the mode "bayes-tree" that is its R, linearised where it is; in the others one made here, at the estimate.
+        In the mode "bayes-tree" that is its R, linearized where it is; in the others one made here, at the estimate.
         """
         return factored(self._graph, self._tree) if self._tree else factored_anew(self._graph)
 

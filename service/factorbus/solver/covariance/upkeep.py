@@ -1,6 +1,6 @@
 """All diagonal blocks kept up from step to step, in the mode "bayes-tree".  MATH §10.6.
 
-A step that moves no linearisation point changes Λ by its new factors.  Of these, one for each new variable only says
+A step that moves no linearization point changes Λ by its new factors.  Of these, one for each new variable only says
 where that is; the others, the loops, take from old blocks what they tell of them, which is of few ranks.  After any
 other step the recursion is gone through for what was eliminated anew, and below that.  Both end where a change becomes
 negligible; so that this and rounding errors do not add up, all blocks are computed anew after some steps.
@@ -63,7 +63,7 @@ class Upkeep:
         step = int(state[tl.S_STEP])
         follows = step == self._step + 1 and self._age < _REFRESH
         self._take_in()
-        adds_only = not state[tl.S_RELINEARISED] and state[tl.S_EDITED_AT] <= self._step
+        adds_only = not state[tl.S_RELINEARIZED] and state[tl.S_EDITED_AT] <= self._step
         loops = self._loops(old, first_factor) if follows and adds_only else None
         self._age = self._age + 1 if follows else 0
         if loops is None or not self._work_in(loops, old, first_factor, step):

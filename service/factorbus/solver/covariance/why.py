@@ -8,7 +8,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import Linear, judge_rows, linearised
+from factorbus.solver.covariance.candidates import Linear, judge_rows, linearized
 from factorbus.solver.graph import observations as sights
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
@@ -19,7 +19,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 
 _NOTHING = 1e-9
-_STEPS = (tl.N_LINEARISED, tl.N_MOVED, tl.N_SEEN)
+_STEPS = (tl.N_LINEARIZED, tl.N_MOVED, tl.N_SEEN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class VariableAccount:
     sigmas (d,): standard deviations in its tangent space; zero where it is fixed   covariance (d, d)
     pivot: the smallest of its pivots of R, 1/σ of it given all that is eliminated later; conditioning: that squared
     over the diagonal of Λ there, 1: no other variable takes anything from it, near 0: almost nothing holds it
-    linearised_step, changed_step, seen_step: the steps that moved its linearisation point last, changed its estimate,
+    linearized_step, changed_step, seen_step: the steps that moved its linearization point last, changed its estimate,
     brought a factor of it; −1: none, or the solver's mode keeps no such record
     stamp: its time stamp; None: it has none
     """
@@ -74,7 +74,7 @@ class VariableAccount:
     covariance: F64
     pivot: float
     conditioning: float
-    linearised_step: int
+    linearized_step: int
     changed_step: int
     seen_step: int
     factors: list[FactorAccount] = field(default_factory=list)
@@ -110,24 +110,24 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
     rows = np.flatnonzero((fac[:, at.F_I] == variable) | (fac[:, at.F_J] == variable)).tolist()
     factors = [_why_row(blocks, each) for each in rows]
     pivot, conditioning = (0.0, 1.0) if fixed else _pivot(blocks, variable, rows)
-    linearised_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
+    linearized_step, changed, seen = (int(node[c]) if keeps_steps else -1 for c in _STEPS)
     value = graph.values[row[at.V_AT] : row[at.V_AT] + kind.size].copy()
     sigmas = np.sqrt(np.diag(covariance))
     stamps = graph.stamps_of(np.array([variable]))
     return VariableAccount(
-        int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearised_step,
+        int(graph.keys[variable]), kind.name, fixed, value, sigmas, covariance, pivot, conditioning, linearized_step,
         changed, seen, factors, None if stamps is None else int(stamps[0]),
     )  # fmt: skip
 
 
 def _why_row(blocks: Blocks, row: int) -> FactorAccount:
-    linear = linearised(blocks.factored.graph, row, row + 1)
+    linear = linearized(blocks.factored.graph, row, row + 1)
     if linear.W[0, 0, 0] < 0.0:
         d = int(blocks.factored.dims[linear.ends[0, 0]])
         H = linear.A[0, :d, :d]  # of one pose, with a residual as large
         return _account(blocks, row, linear, H @ blocks.of(linear.ends[0, :1])[0, :d, :d] @ H.T)
     T = judge_rows(blocks, row, row + 1).predicted[0]
-    return _account(blocks, row, linearised(blocks.factored.graph, row, row + 1), T)
+    return _account(blocks, row, linearized(blocks.factored.graph, row, row + 1), T)
 
 
 def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, float]:
@@ -139,7 +139,7 @@ def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, fl
     pivots = np.array([f.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
     diagonal = np.zeros(d)
     for factor in factors:
-        linear = linearised(f.graph, factor, factor + 1)
+        linear = linearized(f.graph, factor, factor + 1)
         dim = int(linear.sizes[0, 0])
         for end, J in ((0, linear.A), (1, linear.B)):
             if linear.ends[0, end] == variable:
@@ -177,7 +177,7 @@ def _plain(graph: Graph, row: int, dim: int) -> tuple[F64, float]:
     plain = copy.copy(graph)
     plain.fac = graph.fac[: row + 1].copy()
     plain.fac[row, at.F_FLAGS] &= (1 << at.LOSS_SHIFT) - 1
-    return linearised(plain, row, row + 1).r[0, :dim].copy(), _chi2(plain, row)
+    return linearized(plain, row, row + 1).r[0, :dim].copy(), _chi2(plain, row)
 
 
 def _chi2(graph: Graph, row: int) -> float:

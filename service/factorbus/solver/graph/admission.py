@@ -42,7 +42,7 @@ def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
     that is positive semidefinite (`joints`); else it may not.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, OutOfBounds,
-    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialised; `graph` then
+    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` then
     holds a part of the batch and must go back to its mark.
     """
     counts = graph.counts.tolist()
@@ -137,7 +137,7 @@ def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
     if missing >= 0 and place_by_bearings(graph, first, first_factor, reached):
         missing = _find_missing(graph, first, first_factor, reached)
     if missing >= 0:
-        raise errors.Uninitialised(int(graph.keys[missing]))
+        raise errors.Uninitialized(int(graph.keys[missing]))
     outside = find_first_outside(first, int(graph.counts[at.VARIABLES]), graph.var, graph.values)
     if outside >= 0:
         raise value_out_of_bounds(graph, outside)

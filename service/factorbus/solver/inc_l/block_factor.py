@@ -58,7 +58,7 @@ class BlockFactor:
         self._room: F64 = np.empty(0)
 
     def take(self, symbolic: Symbolic, arena: F64, d: F64) -> None:
-        """Copy R from the fronts of a multifrontal factorisation, and d (in the order of `symbolic`)."""
+        """Copy R from the fronts of a multifrontal factorization, and d (in the order of `symbolic`)."""
         n = len(symbolic.order)
         self._reserve(n - int(self.counts[br.POSITIONS]), symbolic.size)
         if self.numbers.size < symbolic.stored:
@@ -93,7 +93,7 @@ class BlockFactor:
         return Reach(rows, int(seen[0]), int(self.counts[br.POSITIONS] - rows[0]) if count else 0)
 
     def omega_update(self, graph: Graph, f0: int, reach: Reach) -> bool:
-        """R₂₂ := chol(R₂₂ᵀR₂₂ + Ω) for the factors from id `f0` on, linearised at the graph's values; d with it.
+        """R₂₂ := chol(R₂₂ᵀR₂₂ + Ω) for the factors from id `f0` on, linearized at the graph's values; d with it.
 
         False: a pivot failed, and R is of no use any more.
         """

@@ -1,6 +1,6 @@
 """R of Λ as it is needed: updated where that is cheap, made anew where it is not.  MATH §8.
 
-R is in the fronts of the last full factorisation, or in block rows once it has been updated, or not there at all
+R is in the fronts of the last full factorization, or in block rows once it has been updated, or not there at all
 (haveR of the 2013 paper).  What solves may be older than Λ (the old factor for a new gradient), or damped.
 """
 
@@ -51,10 +51,10 @@ class Incremental:
         """Bytes of R, in fronts and in block rows."""
         return self.elimination.memory_bytes() + self.rows.memory_bytes()
 
-    def fold(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
+    def record(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
         """R and d follow what came after `since`, which Λ and η hold already; or R is given up."""
         if not self.have_r:
-            return Plan("full", "the linearisation point has moved, or nothing was factorised yet")
+            return Plan("full", "the linearization point has moved, or nothing was factorized yet")
         self._take()
         watch.lap("extract")
         self.rows.append(graph, since[at.VARIABLES])
@@ -123,7 +123,7 @@ class Incremental:
         self._rows_have_d = False
 
     def cost(self) -> tuple[int, float]:
-        """Nonzeros of R, and the flops of its last factorisation."""
+        """Nonzeros of R, and the flops of its last factorization."""
         symbolic = self.elimination.symbolic
         nonzeros = symbolic.nnz_r if symbolic else 0
         return self.rows.nonzeros() if self._have is Where.ROWS else nonzeros, symbolic.flops if symbolic else 0.0

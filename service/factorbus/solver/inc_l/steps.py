@@ -20,7 +20,7 @@ from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import mode_named
-from factorbus.solver.optimize.gauss_newton import Course, glide, minimise
+from factorbus.solver.optimize.gauss_newton import Course, glide, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
@@ -33,7 +33,7 @@ from factorbus.wording import counted
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
 # The old R is tried while it served in more than _LEAST_TRUST + _DEAR · (factors per variable) of the steps that tried
-# lately: a try that fails costs two linearisations, one that does not saves a factorisation.
+# lately: a try that fails costs two linearizations, one that does not saves a factorization.
 _LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 
 
@@ -115,11 +115,11 @@ class IncrementalSteps:
     def _step(self, settle: bool, place_new: bool) -> StepReport:
         watch = Stopwatch(self._options.clock)
         try:
-            # 1. What is new goes to a good place; linearised there it is added to Λ and η.
+            # 1. What is new goes to a good place; linearized there it is added to Λ and η.
             if place_new:
                 self._place_new()
             added = self._system.blocks.extend(self._graph, self._done.graph)
-            watch.lap("linearise")
+            watch.lap("linearize")
             # 2. Is every new variable held by something?
             suspects = self._suspects()
             watch.lap("check")
@@ -199,7 +199,7 @@ class IncrementalSteps:
         if suspects.size:
             self._system.factor.moved()
             return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
-        return self._system.factor.fold(self._graph, self._system.blocks, self._done.graph, watch)
+        return self._system.factor.record(self._graph, self._system.blocks, self._done.graph, watch)
 
     def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> tuple[Course, bool]:
         """Gauss-Newton from the present values, or between forced batches one linear step; and whether that is the
@@ -217,9 +217,9 @@ class IncrementalSteps:
             course = glide(system, chi2, rule)
         if course is None:
             if self._mode.batch_every:
-                system.relinearise()
+                system.relinearize()
             have_factor = self._done.damping == 0.0 and not goes_on and system.factor.serve()
-            course = minimise(system, chi2, self._done.damping, rule, have_factor)
+            course = minimize(system, chi2, self._done.damping, rule, have_factor)
             if not (self._mode.updates and course.converged and self._keeps(have_factor, course)):
                 system.have_lambda()
         if course.failed >= 0 and course.iterations == 0:
@@ -231,7 +231,7 @@ class IncrementalSteps:
         return course, finished
 
     def _keeps(self, had_factor: bool, course: Course) -> bool:
-        """Whether R is to stay in use at the new linearisation point.
+        """Whether R is to stay in use at the new linearization point.
 
         It is where that has led to the new optimum often enough lately; else every `_TRY_AGAIN`-th of the steps that
         move tries, to find out.
@@ -241,7 +241,7 @@ class IncrementalSteps:
         if course.iterations == 0:
             return True
         if had_factor:
-            self._trust += (0.0 if course.factorisations else _LEARN) - _LEARN * self._trust
+            self._trust += (0.0 if course.factorizations else _LEARN) - _LEARN * self._trust
         self._moves += 1
         dear = _LEAST_TRUST + _DEAR * int(self._graph.counts[at.FACTORS]) / int(self._graph.counts[at.VARIABLES])
         return self._trust > dear or self._moves % _TRY_AGAIN == 0
@@ -291,8 +291,8 @@ class IncrementalSteps:
             new_variables=int(self._graph.counts[at.VARIABLES]) - self._done.graph[at.VARIABLES],
             new_factors=int(self._graph.counts[at.FACTORS]) - self._done.graph[at.FACTORS],
             changed=int(self._changed.size),
-            relinearised=course.iterations * columns,
-            eliminated=plan.rows + course.factorisations * columns,
+            relinearized=course.iterations * columns,
+            eliminated=plan.rows + course.factorizations * columns,
             asleep=len(sights.asleep(self._graph)) if self._graph.sights else 0,
             nnz_r=nonzeros,
             flops=flops,

@@ -20,10 +20,10 @@ _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
 
 class Problem(Protocol):
-    """A sum of squares at a linearisation point."""
+    """A sum of squares at a linearization point."""
 
     def factorize(self, damping: float) -> int:
-        """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed."""
+        """Factorize Λ + damping · diag Λ; −1, or the block column whose pivot failed."""
         ...
 
     def decrease(self) -> float:
@@ -34,12 +34,12 @@ class Problem(Protocol):
         """The δ of the last `decrease`."""
         ...
 
-    def linearise_at(self, step: F64) -> float:
-        """χ² at x ⊞ δ, where it is linearised too, aside."""
+    def linearize_at(self, step: F64) -> float:
+        """χ² at x ⊞ δ, where it is linearized too, aside."""
         ...
 
     def accept(self) -> None:
-        """Move to the point linearised last."""
+        """Move to the point linearized last."""
         ...
 
     def keep(self) -> None:
@@ -47,15 +47,15 @@ class Problem(Protocol):
         ...
 
     def go_back(self) -> None:
-        """Move to the point that was kept, and linearise there anew."""
+        """Move to the point that was kept, and linearize there anew."""
         ...
 
 
 class LinearProblem(Problem, Protocol):
-    """A problem that can stay linearised where it was."""
+    """A problem that can stay linearized where it was."""
 
     def accept_linear(self) -> None:
-        """Move to the point linearised last, but keep the linear model: its gradient is zero there."""
+        """Move to the point linearized last, but keep the linear model: its gradient is zero there."""
         ...
 
 
@@ -83,29 +83,29 @@ class Rule:
 
 @dataclass(slots=True)
 class Course:
-    """How a minimisation went.
+    """How a minimization went.
 
-    failed: the block column whose pivot failed in the last factorisation, or −1.  left: what the next undamped step
+    failed: the block column whose pivot failed in the last factorization, or −1.  left: what the next undamped step
     would take off χ², as predicted last; infinite where that is not known.
     """
 
     chi2: float
     damping: float
     iterations: int = 0
-    factorisations: int = 0
+    factorizations: int = 0
     converged: bool = False
     failed: int = -1
     left: float = math.inf
 
 
-def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
+def minimize(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
     """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
 
-    Each try: 1. factorise and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
-    3. linearise at its end; 4. accept it if χ² does not rise there, else factorise with more damping, or go over the
+    Each try: 1. factorize and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
+    3. linearize at its end; 4. accept it if χ² does not rise there, else factorize with more damping, or go over the
     hill where `rule` has non-monotone steps.  5. After an undamped step the old factor with the new gradient gives, for
     the price of one solve, what another step would gain: nothing, and the loop ends; little, and that step is tried as
-    it is; else Λ has changed and is factorised anew.
+    it is; else Λ has changed and is factorized anew.
     With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
     it begins without `damping`, which counts once they have been taken back.
     """
@@ -114,7 +114,7 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
         if not solved:
-            course.factorisations += 1
+            course.factorizations += 1
             course.failed = problem.factorize(course.damping)
             if course.failed >= 0:
                 if _damp_more(course):
@@ -126,7 +126,7 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
         if undamped and rule.is_negligible(decrease, course.chi2):
             course.converged = True
             break
-        reached = problem.linearise_at(problem.step())
+        reached = problem.linearize_at(problem.step())
         solved = False
         if not reached <= course.chi2:
             if not fresh:
@@ -165,12 +165,12 @@ def minimise(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
 
 def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
     """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
-    course = Course(chi2, 0.0, factorisations=1, converged=True)
+    course = Course(chi2, 0.0, factorizations=1, converged=True)
     if problem.factorize(0.0) >= 0:
         return None
     if rule.is_negligible(problem.decrease(), chi2):
         return course
-    reached = problem.linearise_at(problem.step())
+    reached = problem.linearize_at(problem.step())
     if not reached <= chi2:
         return None
     problem.accept_linear()
@@ -193,10 +193,10 @@ def _go_over_hill(problem: Problem, course: Course, reached: float, most: int) -
         if reached < course.chi2:
             course.chi2, course.iterations = reached, course.iterations + made
             return True
-        course.factorisations += 1
+        course.factorizations += 1
         if problem.factorize(0.0) >= 0 or _is_rounding(problem.decrease(), reached):
             break
-        reached = problem.linearise_at(problem.step())
+        reached = problem.linearize_at(problem.step())
     problem.go_back()
     return False
 
@@ -208,7 +208,7 @@ def _polish(problem: Problem, course: Course, most: int) -> None:
         decrease = problem.decrease()
         if decrease <= _EXACT * course.chi2 + _EXACT_FLOOR or not decrease <= 0.9 * last:
             return
-        reached = problem.linearise_at(problem.step())
+        reached = problem.linearize_at(problem.step())
         if not _is_rounding(reached - course.chi2, course.chi2):
             return
         problem.accept()

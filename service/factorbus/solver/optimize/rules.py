@@ -1,4 +1,4 @@
-"""When the minimisation of a step stops, by the solver's options and what the step is for.  MATH §6."""
+"""When the minimization of a step stops, by the solver's options and what the step is for.  MATH §6."""
 
 from factorbus.solver.kernels.bayes_tree.step import FINISHED
 from factorbus.solver.optimize.gauss_newton import Rule

@@ -51,7 +51,7 @@ class System(Generic[R]):
         self._spare_is_here = False
 
     def factorize(self, damping: float) -> int:
-        """Factorise Λ + damping · diag Λ; −1, or the block column whose pivot failed.  Raises Underconstrained."""
+        """Factorize Λ + damping · diag Λ; −1, or the block column whose pivot failed.  Raises Underconstrained."""
         if not self.drifted:
             self.have_lambda()
         failed = self.factor.factorize(self.graph, self.blocks, damping, self._watch)
@@ -72,17 +72,17 @@ class System(Generic[R]):
         """The δ of the last `decrease`."""
         return self.factor.step(self._watch)
 
-    def linearise_at(self, step: F64) -> float:
-        """χ² at x ⊞ δ, linearised there aside."""
+    def linearize_at(self, step: F64) -> float:
+        """χ² at x ⊞ δ, linearized there aside."""
         move(int(self.graph.counts[at.VARIABLES]), self.graph.var, self.graph.values, step, self._trial)
         self._watch.lap("move")
         self._spare_is_here = False
-        chi2 = self.blocks.relinearise(self.graph, self._trial)
-        self._watch.lap("linearise")
+        chi2 = self.blocks.relinearize(self.graph, self._trial)
+        self._watch.lap("linearize")
         return chi2
 
     def accept(self) -> None:
-        """Move to the point linearised last: η is that of the new point, Λ stays until it is asked for."""
+        """Move to the point linearized last: η is that of the new point, Λ stays until it is asked for."""
         self.graph.values, self._trial = self._trial, self.graph.values
         self.blocks.swap_eta()
         self.factor.turned()
@@ -98,13 +98,13 @@ class System(Generic[R]):
         self.anew()
 
     def accept_linear(self) -> None:
-        """Move to the point linearised last; Λ, R and the linear model stay, whose gradient is zero there."""
+        """Move to the point linearized last; Λ, R and the linear model stay, whose gradient is zero there."""
         self.graph.values, self._trial = self._trial, self.graph.values
         self.blocks.eta[: self.graph.counts[at.SCALARS]] = 0.0
         self.factor.rest()
         self._have_lambda, self._spare_is_here, self._moved, self.drifted = False, False, True, True
 
-    def relinearise(self) -> None:
+    def relinearize(self) -> None:
         """Λ and η at the present point, if they are not."""
         if self.drifted:
             self.have_lambda()
@@ -116,8 +116,8 @@ class System(Generic[R]):
         if self._have_lambda:
             return
         if not self._spare_is_here:
-            self.blocks.relinearise(self.graph, self.graph.values)
-            self._watch.lap("linearise")
+            self.blocks.relinearize(self.graph, self.graph.values)
+            self._watch.lap("linearize")
         self.blocks.swap_lambda()
         self.factor.moved()
         self._have_lambda, self._spare_is_here = True, False

@@ -1,4 +1,4 @@
-"""Is every variable held by something?  Checked before a factorisation would fail, or survive by luck.  MATH §7.
+"""Is every variable held by something?  Checked before a factorization would fail, or survive by luck.  MATH §7.
 
 Variables that earlier steps took in are held.  A new one is when it is fixed, has a prior, is joined to a held pose by
 a between factor, seen from a held pose, or fixed by several factors on what is held.  Those that this finds are held;
@@ -52,7 +52,7 @@ def find_loose(graph: Graph, blocks: Blocks, suspects: I64, solve: Callable[[F64
     """The suspect that Λ leaves free to move, or −1.
 
     `solve` gives Λ⁻¹ b.  With D = diag Λ and signs s on the suspects, y = D½ Λ⁻¹ D½ s is of the size of the inverse of
-    the smallest eigenvalue of the normalised matrix, along the direction that is free.
+    the smallest eigenvalue of the normalized matrix, along the direction that is free.
     """
     scalars = int(graph.counts[at.SCALARS])
     rows = graph.var[suspects]

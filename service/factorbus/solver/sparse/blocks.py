@@ -1,7 +1,7 @@
 """Λ and η in blocks, kept incrementally.  MATH §4.
 
 Λ's pattern grows with variables and factors; its numbers are in one arena, each block row-major where the pattern says.
-There are two copies of the numbers: the present ones, and a spare where a trial step is linearised, so that a step that
+There are two copies of the numbers: the present ones, and a spare where a trial step is linearized, so that a step that
 is not accepted costs nothing to undo.
 """
 
@@ -11,11 +11,11 @@ from factorbus.solver.graph.factor_graph import Graph, Mark, grown, table_size
 from factorbus.solver.kernels.graph.block_pattern import connect, enter_blocks, remove_blocks
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.linearize import linearise
+from factorbus.solver.kernels.model.linearize import linearize
 
 
 class Blocks:
-    """The normal equations Λ δ = η of a graph's free variables, linearised at given values."""
+    """The normal equations Λ δ = η of a graph's free variables, linearized at given values."""
 
     NOT_KEPT = ("_spare_data", "_spare_eta")
 
@@ -44,7 +44,7 @@ class Blocks:
         return self.pattern[2, : self.fill[0]]
 
     def extend(self, graph: Graph, since: Mark) -> float:
-        """Add the variables and factors after `since`, linearised at the present values; gives the factors' χ²."""
+        """Add the variables and factors after `since`, linearized at the present values; gives the factors' χ²."""
         v0, v1 = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
         f0, f1 = since[at.FACTORS], int(graph.counts[at.FACTORS])
         self._reserve(v1 - v0 + f1 - f0, int(graph.counts[at.SCALARS]))
@@ -54,9 +54,9 @@ class Blocks:
             self.data = grown(self.data, need)
         self.data[numbers:need] = 0.0
         self.eta[since[at.SCALARS] : int(graph.counts[at.SCALARS])] = 0.0
-        return float(linearise(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
+        return float(linearize(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
 
-    def relinearise(self, graph: Graph, values: F64) -> float:
+    def relinearize(self, graph: Graph, values: F64) -> float:
         """Build all anew at `values` in the spare copy; gives χ² there."""
         if self._spare_data.size != self.data.size or self._spare_eta.size != self.eta.size:
             self._spare_data, self._spare_eta = np.empty_like(self.data), np.empty_like(self.eta)
@@ -64,7 +64,7 @@ class Blocks:
         self._spare_eta[: graph.counts[at.SCALARS]] = 0.0
         factors = int(graph.counts[at.FACTORS])
         return float(
-            linearise(0, factors, graph.var, graph.fac, values, graph.payload, self._spare_data, self._spare_eta)
+            linearize(0, factors, graph.var, graph.fac, values, graph.payload, self._spare_data, self._spare_eta)
         )
 
     def swap_lambda(self) -> None:
@@ -82,7 +82,7 @@ class Blocks:
         """
         remove_blocks(fill[0], int(self.fill[0]), self.table, self.pattern)
         self.fill[:] = fill
-        self.relinearise(graph, graph.values)
+        self.relinearize(graph, graph.values)
         self.swap_lambda()
         self.swap_eta()
 

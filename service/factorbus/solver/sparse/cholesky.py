@@ -1,4 +1,4 @@
-"""The numeric factorisation RᵀR = PΛPᵀ and the solves with it, in arenas that are kept between calls."""
+"""The numeric factorization RᵀR = PΛPᵀ and the solves with it, in arenas that are kept between calls."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from factorbus.solver.kernels.sparse.triangular_solve import (
     solve_lower,
     solve_upper,
 )
-from factorbus.solver.sparse.lending import BOARD
+from factorbus.solver.sparse.lending import TASK_QUEUE
 from factorbus.solver.sparse.ordering import integers
 from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.wording import counted
@@ -35,7 +35,7 @@ class Cholesky:
         return self._arena
 
     def factorize(self, symbolic: Symbolic, data: F64, offsets: I64, damping: float = 0.0) -> int:
-        """Factorise Λ with diagonal Λ·(1 + damping), block b row-major at data[offsets[b]:].
+        """Factorize Λ with diagonal Λ·(1 + damping), block b row-major at data[offsets[b]:].
 
         Gives -1, or the variable whose pivot is not above `PIVOT_TOLERANCE` of its diagonal entry in Λ (or not a
         number): Λ is not positive definite there, or singular as far as doubles can tell.  Then there is no factor
@@ -47,7 +47,7 @@ class Cholesky:
         self._reserve(symbolic)
         failed = factorize(
             symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors,
-            BOARD,
+            TASK_QUEUE,
         )  # fmt: skip
         if failed >= 0:
             return symbolic.variable_at(failed)

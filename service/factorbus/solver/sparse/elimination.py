@@ -1,4 +1,4 @@
-"""Order, analysis and factorisation of Λ.  What depends on its pattern only is kept while that stays.  MATH §5."""
+"""Order, analysis and factorization of Λ.  What depends on its pattern only is kept while that stays.  MATH §5."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Elimination:
         self.symbolic: Symbolic | None = None
 
     def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
-        """Factorise Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
+        """Factorize Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
         symbolic = self._analysis(graph, blocks, watch)
         if self._options.backend == "cholmod":
             failed = self._cholesky.take(

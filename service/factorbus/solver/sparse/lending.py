@@ -1,6 +1,6 @@
 """Where threads of this process lend their cores to the eliminations of this process.  MATH §9.5.
 
-The solver has no thread of its own: whoever has one to spare makes a `Lender`, and calls its `lend` on that thread.
+The solver has no thread of its own: whoever has one to spare makes a `WorkerThread`, and calls its `lend` on that thread.
 There is one board in a process, as there is one set of cores.
 """
 
@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.atomics import CAN_SLEEP
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.sparse import task_queue as at
 
-BOARD: I64 = lines(at.WORDS, np.int64)  # see `kernels/sparse/task_queue.py`
+TASK_QUEUE: I64 = lines(at.WORDS, np.int64)  # see `kernels/sparse/task_queue.py`
 _NOTHING: I64 = np.empty(0, np.int64)
 
 # Words of lenders that nobody has; none where threads cannot sleep in a kernel.
@@ -26,12 +26,12 @@ def count_free() -> int:
     return len(_free)
 
 
-def can_lend() -> bool:
+def can_work() -> bool:
     """Whether the kernel that lenders run is compiled or loaded: called before, `lend` has to do that first."""
     return CAN_SLEEP and bool(tree_step.signatures)
 
 
-class Lender:
+class WorkerThread:
     """One thread that lends its core.  Raises ValueError when there are as many as there may be.
 
     made: chunks of eliminations that it has made.
@@ -41,10 +41,10 @@ class Lender:
         if not _free:
             raise ValueError(f"{at.MOST} threads lend their cores, which is all that can, or none can on this system")
         self._word = _free.pop()
-        self._semaphore = ctypes.c_void_p(BOARD.ctypes.data + 8 * (self._word + at.ASLEEP))
+        self._semaphore = ctypes.c_void_p(TASK_QUEUE.ctypes.data + 8 * (self._word + at.ASLEEP))
         self._libc = ctypes.CDLL(None)
         self._libc.sem_init(self._semaphore, 0, 0)
-        self._line = BOARD[self._word : self._word + 8]
+        self._line = TASK_QUEUE[self._word : self._word + 8]
         self._line[at.MADE], self._line[0] = 0, at.LENDS
 
     @property
@@ -53,7 +53,7 @@ class Lender:
 
     def lend(self) -> None:
         """Returns after `leave`.  Once, on the thread whose core it is."""
-        tree_step(_NOTHING, _NOTHING, BOARD, self._word)
+        tree_step(_NOTHING, _NOTHING, TASK_QUEUE, self._word)
         self._line[0] = at.AWAY
         self._line = self._line.copy()
         _free.append(self._word)

@@ -1,4 +1,4 @@
-"""The analysis of a pattern: all that a factorisation needs to know before it sees a number."""
+"""The analysis of a pattern: all that a factorization needs to know before it sees a number."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class Symbolic:
 
     order (n,): the variable eliminated k-th (fill and constraints as in the given order, fronts in postorder).
     place (n,): first scalar of each variable in elimination order.  starts (n + 1,): in insertion order.
-    nnz_r: structural scalar nonzeros of R.  flops: to factorise, the sum of squared row lengths of R.
+    nnz_r: structural scalar nonzeros of R.  flops: to factorize, the sum of squared row lengths of R.
     areas (nb,): numbers in each block.  widest: scalars of the longest border.
     stored: doubles that hold R, with padding and the zeros of joined fronts.  arena: those and the update matrices.
     """

@@ -1,6 +1,6 @@
 """Normal equations in blocks of one size, with our own Cholesky factor: Σ ‖B x_j − A x_i − v‖² over pairs of unknowns.
 
-Analysed once, factorised as often as the weights change.
+Analysed once, factorized as often as the weights change.
 """
 
 import math

@@ -227,7 +227,7 @@ def _headings(graph: Graph) -> tuple[np.ndarray, ...]:
 
 
 def _linear_pairs(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
-    """Two poses together: as they are to each other where the factor was linearised."""
+    """Two poses together: as they are to each other where the factor was linearized."""
     rows, fac, measured, information = _rows(graph, space.linear_pair)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
     (Ra, ta), (Rb, tb) = poses_apart(measured[:, :size]), poses_apart(measured[:, size : 2 * size])
@@ -242,7 +242,7 @@ def _linear_pairs(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
 
 
 def _linear(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
-    """A pose by itself: where the factor was linearised, if it says something of all of the pose."""
+    """A pose by itself: where the factor was linearized, if it says something of all of the pose."""
     rows, fac, measured, information = _rows(graph, space.linear)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
     R, t = poses_apart(measured[:, :size])

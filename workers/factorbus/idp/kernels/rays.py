@@ -90,7 +90,7 @@ def jacobians(x: F64, turn: F64, slope: F64, A: F64, B: F64) -> None:
 
 @inline_kernel
 def rotation(x: F64) -> tuple:
-    """R(q) of the state's quaternion row by row, not normalised: R(s q) = s² R(q).  MATH (1.1)"""
+    """R(q) of the state's quaternion row by row, not normalized: R(s q) = s² R(q).  MATH (1.1)"""
     a, b, c, d = x[Q], x[Q + 1], x[Q + 2], x[Q + 3]
     return (
         a * a + b * b - c * c - d * d, 2.0 * (b * c - a * d), 2.0 * (d * b + a * c),

@@ -5,7 +5,7 @@ import math
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, make_scratch, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
@@ -19,12 +19,12 @@ from factorbus.solver.kernels.model.sizes import size_of
 def take_in_variables(
     v1: int, var: I64, values: F64, node: I64, lin: F64, scalars: F64, turns: F64, state: I64
 ) -> None:
-    """Variables up to v1 get a row each; they are linearised at their first values."""
+    """Variables up to v1 get a row each; they are linearized at their first values."""
     for v in range(state[tl.S_VARIABLES], v1):
         node[v, tl.N_CLIQUE] = node[v, tl.N_OWN] = node[v, tl.N_ADJ] = -1
         node[v, tl.N_PLACE] = node[v, tl.N_LOCAL] = node[v, tl.N_FLAGS] = node[v, tl.N_LISTED] = 0
         node[v, tl.N_STAMP], node[v, tl.N_SEEN], node[v, tl.N_MOVED] = -1, state[tl.S_STEP], -1
-        node[v, tl.N_LINEARISED] = state[tl.S_STEP]
+        node[v, tl.N_LINEARIZED] = state[tl.S_STEP]
         x = var[v, at.V_AT]
         for a in range(size_of(var[v, at.V_KIND])):
             lin[0, x + a] = values[x + a]
@@ -40,7 +40,7 @@ def take_in_variables(
 
 @inline_kernel
 def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
-    """Which way a plane pose looks where it is linearised."""
+    """Which way a plane pose looks where it is linearized."""
     if var[v, at.V_KIND] == at.SE2:
         angle = lin[0, var[v, at.V_AT] + 2]
         turns[v, tl.U_COS], turns[v, tl.U_SIN] = math.cos(angle), math.sin(angle)
@@ -48,10 +48,10 @@ def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
 
 @part
 def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
-    """Factors up to f1 are linearised, and join the incidences of their variables; gives whether all χ² are numbers.
+    """Factors up to f1 are linearized, and join the incidences of their variables; gives whether all χ² are numbers.
 
     A_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
-    linearised, and the factor is then off its model from the start.
+    linearized, and the factor is then off its model from the start.
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
@@ -70,7 +70,7 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
             state[tl.S_EXACT] += 1
         link[f, tl.L_AT] = state[tl.S_HESSIAN]
         state[tl.S_HESSIAN] += hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
-        linearise_factor(graph, tree, f, scratch)
+        linearize_factor(graph, tree, f, scratch)
         _save(i, saved[2 * (f - f0)], var, node, scalars, turns)
         if j >= 0:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)

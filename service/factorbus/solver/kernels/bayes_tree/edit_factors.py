@@ -1,4 +1,4 @@
-"""Factors taken out of the tree, or linearised anew with another weight or loss, ahead of a step.  MATH §11.5.
+"""Factors taken out of the tree, or linearized anew with another weight or loss, ahead of a step.  MATH §11.5.
 
 The tree keeps its cliques: what is changed is what their variables own.  The step that follows touches the variables of
 these factors, as if the factors were new there, and eliminates their cliques from what is left.
@@ -15,7 +15,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearise_factor, make_scratch, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
@@ -31,7 +31,7 @@ MOST_LINKS = 3  # that a factor is taken out of
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64[::1], int64[:,::1])")
 def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log: I64) -> int:
-    """Take the factors `gone` out of the tree, and linearise those `renewed` as the graph has them now (rows).
+    """Take the factors `gone` out of the tree, and linearize those `renewed` as the graph has them now (rows).
 
     graph, tree: tables of their arenas (`places`)   log (3 per factor gone, 3): links as they were, for `relink`
     Gives how many rows of the log were written; −1 less that where any χ² is not a number.
@@ -157,7 +157,7 @@ def relink(count: int, log: I64, tree_table: I64) -> None:
 
 @part
 def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
-    """Linearise factors with the weight and loss that they have now; gives whether all χ² are numbers."""
+    """Linearize factors with the weight and loss that they have now; gives whether all χ² are numbers."""
     var, fac = graph.var, graph.fac
     values = graph.values
     link, hessian = tree.link, tree.hessian
@@ -172,7 +172,7 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
         was, linear_was = stiff[f, tl.B_CHI2], hessian[last]
         if is_bounded(fac[f, at.F_KIND]):
             note_loss(f, fac, link, state)
-        linearise_factor(graph, tree, f, scratch)
+        linearize_factor(graph, tree, f, scratch)
         weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
         stiff[f, tl.B_CHI2], _, _ = factor_chi2(graph, tree, f, link[f, tl.L_KIND], c, s)

@@ -1,11 +1,11 @@
-"""How far a factor is bent between its linearisation point and the estimate.  MATH §9.6.
+"""How far a factor is bent between its linearization point and the estimate.  MATH §9.6.
 
 What a pose i sees of j at a distance d is u = Rᵢᵀ (tⱼ − tᵢ), and between factors and sightings are linear in it.  With
 a turn of i by φ, and shifts sᵢ and sⱼ in the map's frame, the linear model misses of it, to second order,
 
     bend = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                                     (9.4)
 
-standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearisation point of i alone
+standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearization point of i alone
 makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range bend with the shift as well,
 
     bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
@@ -15,7 +15,7 @@ against the pose, the Jacobian of the pose's turn is off by that share of d, and
 
     slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
 
-r being the residual at the linearisation point.  A pose seen from another one slips as well, with the residual r(x) at
+r being the residual at the linearization point.  A pose seen from another one slips as well, with the residual r(x) at
 the estimate,
 
     slip = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                           (9.13)

@@ -20,7 +20,7 @@ SWITCHED = 30.0  # of a sight that has lost its pixel or found it again: by whic
 def exact_error(
     f: int, var: I64, fac: I64, lin: F64, values: F64, payload: F64, delta: F64
 ) -> tuple[float, float, float]:  # fmt: skip
-    """What the model of factor f, linearised at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
+    """What the model of factor f, linearized at `lin`, misses at `values` = lin ⊞ δ, in standard deviations: of the
     residual, (9.11), and of the force, as its Jacobian is another one there, (9.31); and its χ² there.
     """
     r, now, A, B = np.zeros(at.R_SIZE), np.zeros(at.R_SIZE), np.zeros((6, 6)), np.zeros((6, 6))

@@ -108,7 +108,7 @@ def any_chi2(f: int, var: I64, fac: I64, values: F64, payload: F64) -> float:
 
 @inline_kernel
 def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F64) -> tuple[float, float]:
-    """Cosine and sine of a plane pose at the estimate, from those where it is linearised; 1, 0 of all else."""
+    """Cosine and sine of a plane pose at the estimate, from those where it is linearized; 1, 0 of all else."""
     if not planar:
         return 1.0, 0.0
     d = var[v, at.V_SCALAR]

@@ -1,4 +1,4 @@
-"""The Hessian of a factor at its variables' linearisation points, kept until one of them moves.  MATH §9.2."""
+"""The Hessian of a factor at its variables' linearization points, kept until one of them moves.  MATH §9.2."""
 
 import math
 from typing import NamedTuple
@@ -41,7 +41,7 @@ def hessian_size(di: int, dj: int) -> int:
 
 
 @part
-def linearise_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
+def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """Write the Hessian of factor f at the linearization points, and what its slip depends on there."""
     kind, hessian, stiff, h = graph.fac[f, at.F_KIND], tree.hessian, tree.stiff, tree.link[f, tl.L_AT]
     more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
@@ -178,9 +178,9 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
 
 @part
 def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
-    """Add a factor that was just linearised to what measures δ: the diagonal sums, and how it bends.
+    """Add a factor that was just linearized to what measures δ: the diagonal sums, and how it bends.
 
-    scratch.W holds its information, as `linearise_factor` left it.
+    scratch.W holds its information, as `linearize_factor` left it.
     """
     var, fac, payload = graph.var, graph.fac, graph.payload
     link, hessian, scalars, stiff, turns = tree.link, tree.hessian, tree.scalars, tree.stiff, tree.turns

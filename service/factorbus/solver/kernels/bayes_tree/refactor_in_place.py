@@ -1,7 +1,7 @@
 """Cliques that keep their variables and only get other numbers.  MATH §9.5.
 
-New factors change what has to be eliminated together; those that are only linearised anew do not.  So below the cliques
-that new factors change nothing has to be ordered: there the cliques with a relinearised factor in or below them are
+New factors change what has to be eliminated together; those that are only linearized anew do not.  So below the cliques
+that new factors change nothing has to be ordered: there the cliques with a relinearized factor in or below them are
 eliminated again as they are, and then they are orphans like others.
 """
 

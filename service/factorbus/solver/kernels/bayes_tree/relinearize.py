@@ -1,9 +1,9 @@
-"""Moving linearisation points of single variables to the estimate, and back.  MATH §9.6."""
+"""Moving linearization points of single variables to the estimate, and back.  MATH §9.6."""
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, note_turn
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.hessian import linearise_factor, make_scratch
+from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, make_scratch
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import I64, part
@@ -12,12 +12,12 @@ from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
 WAITS, MOVES = 1, 2
-SPARSE = 16  # where no more than one factor in so many is to be linearised, the others are not looked through
+SPARSE = 16  # where no more than one factor in so many is to be linearized, the others are not looked through
 
 
 @part
-def relinearise(graph: Graph, tree: Tree, pending: I64) -> None:
-    """Move the pending variables to the estimate, and linearise their factors there."""
+def relinearize(graph: Graph, tree: Tree, pending: I64) -> None:
+    """Move the pending variables to the estimate, and linearize their factors there."""
     var, values = graph.var, graph.values
     node, lin, scalars, turns, moved = tree.node, tree.lin, tree.scalars, tree.turns, tree.moved
     state = tree.state
@@ -33,13 +33,13 @@ def relinearise(graph: Graph, tree: Tree, pending: I64) -> None:
         note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = MOVES
         list_moved(MODEL, v, node, moved, state)
-        state[tl.S_RELINEARISED] += 1
-    linearise_around(graph, tree, pending)
+        state[tl.S_RELINEARIZED] += 1
+    linearize_around(graph, tree, pending)
 
 
 @part
 def go_back(graph: Graph, tree: Tree, pending: I64) -> None:
-    """Undo `relinearise`: its variables wait again."""
+    """Undo `relinearize`: its variables wait again."""
     var = graph.var
     node, lin, scalars, turns, state = tree.node, tree.lin, tree.scalars, tree.turns, tree.state
     for k in range(pending.size):
@@ -51,13 +51,13 @@ def go_back(graph: Graph, tree: Tree, pending: I64) -> None:
             scalars[0, d + a] = scalars[2, d + a]
         note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = WAITS
-        state[tl.S_RELINEARISED] -= 1
-    linearise_around(graph, tree, pending)
+        state[tl.S_RELINEARIZED] -= 1
+    linearize_around(graph, tree, pending)
 
 
 @part
-def linearise_around(graph: Graph, tree: Tree, variables: I64) -> None:
-    """Linearise the factors of some variables, each once, in the order of their ids: so they lie in memory.
+def linearize_around(graph: Graph, tree: Tree, variables: I64) -> None:
+    """Linearize the factors of some variables, each once, in the order of their ids: so they lie in memory.
 
     In that of the variables, which is the tree's, it takes twice as long.
     """
@@ -76,7 +76,7 @@ def linearise_around(graph: Graph, tree: Tree, variables: I64) -> None:
     if last - first < SPARSE * count:
         for f in range(first, last + 1):
             if link[f, tl.L_STAMP] == sweep:
-                linearise_factor(graph, tree, f, scratch)
+                linearize_factor(graph, tree, f, scratch)
         return
     for k in range(variables.size):
         slot = node[variables[k], tl.N_ADJ]
@@ -84,5 +84,5 @@ def linearise_around(graph: Graph, tree: Tree, variables: I64) -> None:
             f = slot // 2
             if link[f, tl.L_STAMP] == sweep:
                 link[f, tl.L_STAMP] = -1
-                linearise_factor(graph, tree, f, scratch)
+                linearize_factor(graph, tree, f, scratch)
             slot = next_incidence(slot, link)

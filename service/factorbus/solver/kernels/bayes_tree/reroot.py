@@ -36,12 +36,12 @@ def flops_of_clique(row: I64) -> float:
 
 
 @inline_kernel
-def count_near(marked: I64, relinearises: bool, settings: F64, clique: I64, state: I64) -> int:
+def count_near(marked: I64, relinearizes: bool, settings: F64, clique: I64, state: I64) -> int:
     """How many scalars are to come near the root with the elimination of the marked cliques; 0: it stays as it is."""
     flops = flops_of(marked, clique)
     if flops <= settings[tl.P_REROOT_MIN_FLOPS]:
         return 0
-    if not relinearises and state[tl.S_SPENT] + flops <= settings[tl.P_REROOT_PERIOD] * state[tl.S_MOVING_ROOT]:
+    if not relinearizes and state[tl.S_SPENT] + flops <= settings[tl.P_REROOT_PERIOD] * state[tl.S_MOVING_ROOT]:
         return 0
     side = flops ** (1.0 / 3.0)
     return int(max(settings[tl.P_REROOT_SIZE_LINEAR] * side, settings[tl.P_REROOT_SIZE_AREA] * side * side))

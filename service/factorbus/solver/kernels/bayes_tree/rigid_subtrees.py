@@ -2,7 +2,7 @@
 
 Relative measurements do not change when all that they join moves together, so neither do the rows of R made of them:
 with the motion of the map as a rigid body, ξ = (t, ω), and J the displacement by it in the tangent space of each
-variable at its linearisation point,
+variable at its linearization point,
 
     R_F J_F + R_S J_S = 0                                                                    (9.20)
 

@@ -1,10 +1,10 @@
 """One step of the incremental solver, in one call.  MATH §9.
 
-1  take in        new variables, at good places if they are few, and new factors, linearised
-2  relinearise    variables whose factors have bent since they were linearised
+1  take in        new variables, at good places if they are few, and new factors, linearized
+2  relinearize    variables whose factors have bent since they were linearized
 3  touch, detach  the cliques that new factors change, and where that is much those around the robot;
                   what hangs from them are orphans
-   renew          what is below these and only has relinearised factors is eliminated again as it is
+   renew          what is below these and only has relinearized factors is eliminated again as it is
 4  order          the affected variables, constrained approximate minimum degree
 5  fronts         elimination tree, amalgamation, memory
 6  eliminate      front by front, on several cores where that takes long; orphans bring their update matrices
@@ -49,7 +49,7 @@ from factorbus.solver.kernels.bayes_tree.refactor_in_place import (
     renew,
     still_renewed,
 )
-from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearise
+from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
 from factorbus.solver.kernels.bayes_tree.reroot import account_for, count_near, touch_near
 from factorbus.solver.kernels.bayes_tree.worker_thread import lend
 from factorbus.solver.kernels.jit.bit_sets import MOST
@@ -110,7 +110,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, lender: int) -> int
         await_bound(scaled, var, fac, node, stiff, pending, state, account)
     scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
     scaled[tl.P_MAX_ERROR] *= unit
-    scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARISING] / settings[tl.P_COOLDOWN_FLOPS], 1.0)
+    scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARIZING] / settings[tl.P_COOLDOWN_FLOPS], 1.0)
     share = unit * unit * max(f1, 1) * reluctance(scaled, state)  # of χ²
     scaled[tl.P_SAME_STEP_SHARE] *= share
     scaled[tl.P_NEXT_STEP_SHARE] *= share
@@ -123,8 +123,8 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, lender: int) -> int
     while True:
         moving = pending[: count_due(state)]
         if moving.size > 0:
-            relinearise(graph, tree, moving)
-        lap(began, tl.LINEARISE, state)
+            relinearize(graph, tree, moving)
+        lap(began, tl.LINEARIZE, state)
         before = account[tl.A_CHI2]
         pull, status = eliminate_again(graph, tree, v0, v1, f1, moving, scaled, board)
         if status == tl.NO_ROOM:
@@ -259,15 +259,15 @@ def await_bound(
 
 @inline_kernel
 def reluctance(settings: F64, state: I64) -> float:
-    """How many times as much has to be bent, so soon after the last relinearisation.  (9.19)"""
+    """How many times as much has to be bent, so soon after the last relinearization.  (9.19)"""
     dear = settings[tl.P_COOLDOWN_FLOPS]
-    rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARISED_AT], 1)
+    rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
     return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(dear))
 
 
 @inline_kernel
 def count_due(state: I64) -> int:
-    """How many of the variables that wait are relinearised now: all or none."""
+    """How many of the variables that wait are relinearized now: all or none."""
     due = state[tl.S_WAIT] == 0 and (state[tl.S_DUE] != 0 or state[tl.S_ROUNDS] > 0)
     return state[tl.S_PENDING] if due else 0
 
@@ -383,11 +383,11 @@ def eliminate_again(
         rescale(f1, settings, account)
     for k in range(moving.size):
         v = moving[k]
-        node[v, tl.N_FLAGS], node[v, tl.N_LINEARISED] = FREE, state[tl.S_STEP]
+        node[v, tl.N_FLAGS], node[v, tl.N_LINEARIZED] = FREE, state[tl.S_STEP]
     if moving.size > 0:
         state[tl.S_PENDING] = state[tl.S_DUE] = 0
-        state[tl.S_RELINEARISED_AT] = state[tl.S_STEP]
-        state[tl.S_RELINEARISING] = state[tl.S_FLOPS] - flops
+        state[tl.S_RELINEARIZED_AT] = state[tl.S_STEP]
+        state[tl.S_RELINEARIZING] = state[tl.S_FLOPS] - flops
     lap(now, tl.COMMIT, state)
     return substitute_and_measure(graph, tree, tops, ids, settings, listed)
 

@@ -3,7 +3,7 @@
 `pattern` (3, capacity): rows, columns and starts of the blocks, a block being stored once with row ≤ column (block
 columns count free variables in insertion order).  `table` is a hash table of block index + 1 by (row, column), used as
 in `admit`.  `fill` (2,): blocks and numbers in use.  A factor remembers where its blocks start, so that adding it again
-after the linearisation point moved needs no search.
+after the linearization point moved needs no search.
 """
 
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel

@@ -77,7 +77,7 @@ def take_fronts(
     order: I64, dims: I64, starts: I64, fronts: I64, border: I64, arena: F64, rec: I64, index: I64, numbers: F64,
     place: I64, counts: I64,
 ) -> None:  # fmt: skip
-    """Copy R from the fronts of a factorisation, block by block.
+    """Copy R from the fronts of a factorization, block by block.
 
     The zeros of joined fronts come along: the lists are those of the fronts.
     """

@@ -26,7 +26,7 @@ def dense_omega_update(
     f0: int, f1: int, reached: I64, var: I64, fac: I64, values: F64, payload: F64, rec: I64, index: I64, numbers: F64,
     place: I64, d: F64, counts: I64,
 ) -> int:  # fmt: skip
-    """Fold factors f0 .. f1−1, linearised at `values`, into R and d by (18) and (19) as they stand.
+    """Fold factors f0 .. f1−1, linearized at `values`, into R and d by (18) and (19) as they stand.
 
     reached: the positions that the factors reach, at most MOST_BLOCKS.  Gives −1, or a position whose pivot failed.
     """

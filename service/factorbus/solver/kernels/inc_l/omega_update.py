@@ -32,7 +32,7 @@ def omega_update(
     f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, rec: I64, index: I64, numbers: F64, place: I64,
     d: F64, counts: I64, ld: int, W: F64,
 ) -> int:  # fmt: skip
-    """Fold factors f0 .. f1−1, linearised at `values`, into R and d.
+    """Fold factors f0 .. f1−1, linearized at `values`, into R and d.
 
     ld: the scalars of the rows they reach   W: room for MOST_ROWS · ld
     Gives −1, or a position whose pivot is not a positive number.

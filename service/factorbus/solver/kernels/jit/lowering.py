@@ -101,7 +101,7 @@ class _Lowering(NativeLowering):
 
 
 class _PartLibrary(JITCodeLibrary):
-    """The code of a part as it was written.  It is linked, optimised and made machine code in the kernels that call it.
+    """The code of a part as it was written.  It is linked, optimized and made machine code in the kernels that call it.
 
     Numba's own libraries do all of that at every level of calls, and wrap each function for Python and for C.
     """

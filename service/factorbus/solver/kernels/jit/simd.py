@@ -1,7 +1,7 @@
 """Loads, stores and register tiles on a float64 array, written in LLVM vectors.
 
 Why not plain indexing: `a[i + j]` with signed indices compiles to a compare and a select for negative ones, which
-keeps loops from being vectorised, and no compiler keeps a tile of a product in registers by itself.
+keeps loops from being vectorized, and no compiler keeps a tile of a product in registers by itself.
 
 There are three sets of these functions with one meaning: `simd_llvm` (fast, no checks), `simd_checked` (the same
 behind range checks, NUMBA_BOUNDSCHECK=1) and `simd_plain` (NumPy, NUMBA_DISABLE_JIT=1; read that one first).

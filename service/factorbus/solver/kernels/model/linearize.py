@@ -18,8 +18,8 @@ from factorbus.solver.kernels.model.sizes import end_dims, information_at, resid
 
 
 @kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
-def linearise(first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, data: F64, eta: F64) -> float:
-    """Add the factors first .. last−1, linearised at `values`, to Λ's blocks in `data` and to `eta`; gives their χ²."""
+def linearize(first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, data: F64, eta: F64) -> float:
+    """Add the factors first .. last−1, linearized at `values`, to Λ's blocks in `data` and to `eta`; gives their χ²."""
     r = np.zeros(at.R_SIZE)
     H = np.zeros((4, 6, 6))
     W = np.zeros((6, 6))

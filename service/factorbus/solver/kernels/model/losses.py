@@ -1,6 +1,6 @@
 """Robust losses: a factor that is far off counts for less.  MATH §3.2.
 
-A factor with residual r counts ρ(s), s = rᵀ Ω r, instead of s.  Where it is linearised, r and its Jacobians are
+A factor with residual r counts ρ(s), s = rᵀ Ω r, instead of s.  Where it is linearized, r and its Jacobians are
 multiplied by √w, w = ρ'(s): the normal equations of Σ w s have the gradient of Σ ρ(s), and Gauss-Newton on them is
 iteratively reweighted least squares.  ρ is concave in s, so the model never promises less than it keeps.
 """

@@ -18,7 +18,7 @@ _FIRST = np.array([at.VARIABLE_CODES[kind.connects[0]] for kind in _FACTORS], np
 _SECOND = np.array([at.VARIABLE_CODES[kind.connects[1]] if kind.connects[1:] else -1 for kind in _FACTORS], np.int64)
 _FIRST_DIM = _DIM[_FIRST]
 _SECOND_DIM = np.where(_SECOND >= 0, _DIM[_SECOND], 0)
-_LINEARISED = _SIZE[_FIRST] + np.where(_SECOND >= 0, _SIZE[_SECOND], 0)
+_LINEARIZED = _SIZE[_FIRST] + np.where(_SECOND >= 0, _SIZE[_SECOND], 0)
 
 
 @inline_kernel
@@ -67,4 +67,4 @@ def end_dims(kind: int) -> tuple:
 @inline_kernel
 def values_of_ends(kind: int) -> int:
     """Numbers of the values of the ends of a kind of factor together."""
-    return _LINEARISED[kind]
+    return _LINEARIZED[kind]

@@ -13,7 +13,7 @@ from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE, fa
 def factorize(
     fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, floors: F64, board: I64
 ) -> int:
-    """Factorise Λ with its diagonal multiplied by 1 + damping.  Gives the scalar whose pivot failed, or -1.
+    """Factorize Λ with its diagonal multiplied by 1 + damping.  Gives the scalar whose pivot failed, or -1.
 
     in   values: blocks of Λ, block b row-major at offsets[b]   board: where cores are lent, see `task_queue`
     out  arena: rows of R   floors (n,): least pivot allowed;  scalars count in elimination order

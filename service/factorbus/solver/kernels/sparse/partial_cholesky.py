@@ -31,7 +31,7 @@ RAISED = -2  # what `factor_front` gives where it raised a pivot
 def factor_front(
     a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, floors: F64, k: int, t: int, board: I64
 ) -> int:
-    """Factorise a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1; or RAISED.
+    """Factorize a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1; or RAISED.
 
     in   r, ld: its p rows over p + m columns   u, width: its m x m update matrix
          floors[k + i]: pivot i must exceed it, or, where it is negative, is raised to its size if it does not
