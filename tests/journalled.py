@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from factorbus.client.pending_insert import PendingInsert
 from processes import PATIENCE_S, Process
 
 from factorbus.client import Draft
 from factorbus.client.map import Map
+from factorbus.client.pending_insert import PendingInsert
 from factorbus.journal.store import open_store
 from factorbus.proto.messages import Batch
 from factorbus.proto.stamps import NO_STAMP

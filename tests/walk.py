@@ -34,7 +34,7 @@ def blocks(document: str) -> list[tuple[str, str]]:
 
 
 def walk(document: str, folder: Path) -> str:
-    """InsertBatch all of it in `folder`; gives all that was printed.  Raises AssertionError, with what was said."""
+    """Run all of it in `folder`; gives all that was printed.  Raises AssertionError, with what was said."""
     said, everything = "", []
     with walker(folder) as step:
         for language, text in blocks(document):

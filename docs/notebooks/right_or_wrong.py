@@ -25,7 +25,7 @@ print(len(town.estimate), "poses, χ²", round(town.chi2().chi2, 1))
 
 # %%
 wrong = Draft().between_se2("x20", "x150", (0, 0, 0), sigmas=(0.1, 0.1, 0.05))
-gate = town.doubt.gate(wrong)
+gate = town.uncertainty.gate(wrong)
 print("d²", gate.distance.round(0), "allowed", gate.threshold.round(1), "plausible", gate.plausible)
 
 # %% [markdown]
@@ -44,7 +44,7 @@ print(f"moved by {moved_robust:.3f} m")
 # it measures that is known from it alone.
 
 # %%
-why = town.doubt.why("x150").variable
+why = town.uncertainty.why("x150").variable
 for factor in sorted(why["factors"], key=lambda each: -each["chi2"]):
     print(f"{factor['kind']}  χ² {factor['chi2']:.3g}  leverage {factor['influence'] / factor['dims']:.0%}")
 

@@ -407,7 +407,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    """InsertBatch it; 1 when the goal is missed."""
+    """Run it; 1 when the goal is missed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=32)
     parser.add_argument("--samples", type=int, default=250)

@@ -60,9 +60,9 @@ def main() -> None:
     options = parser.parse_args()
     core = pin()
     names = options.names or [*GENERATED, *(name for name in DATASETS if find(name))]
-    report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "executors": LANES, "problems": []}
+    report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "lanes": LANES, "problems": []}
     if not options.json:
-        print(f"CHOLMOD uses {', '.join(report['cholmod_blas'])}; one thread on core {core}; {LANES} executors")
+        print(f"CHOLMOD uses {', '.join(report['cholmod_blas'])}; one thread on core {core}; {LANES} lanes")
         print(HEAD)
     for name in names:
         system = GENERATED[name]() if name in GENERATED else final_system(file_of(name))

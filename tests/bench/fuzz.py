@@ -93,11 +93,11 @@ class _Map:
 
     def __init__(self) -> None:
         self.core = MapCore("fuzzed", "auto", EPOCH, LIMITS, 0.0)
-        self.folder = _folder()
+        self.map_solver = _folder()
         self.accepted: list[list[Arrived]] = []  # by step
         self.answers: dict[int, list[str]] = {}
         self.next: Counter[str] = Counter()
-        self.bits = _bits(self.folder)
+        self.bits = _bits(self.map_solver)
         self._took = False
 
     def insert(self, asker: int, client: str, data: bytes) -> str:
@@ -124,7 +124,7 @@ class _Map:
                     self._run(effect)
 
     def _run(self, run: InsertBatch) -> None:
-        for event in self.folder.record(run.inserts):
+        for event in self.map_solver.apply(run.inserts):
             if isinstance(event, Verdict):
                 if taken := [each.insert for each in event.outcomes if isinstance(each.answer, bytes)]:
                     self.accepted.append(taken)
@@ -133,7 +133,7 @@ class _Map:
             elif isinstance(event, Stepped):
                 self._perform(self.core.stepped(event))
             elif isinstance(event, Applied):
-                bits = _bits(self.folder)
+                bits = _bits(self.map_solver)
                 if bits != self.bits and not self._took:
                     raise AssertionError("refused, and the map is not what it was")
                 self.bits, self._took = bits, False
@@ -143,7 +143,7 @@ class _Map:
         """Beside a map that got only what was accepted, by step: `same bits`, `same content`, or else `different`."""
         fresh = _folder()
         for inserts in self.accepted:
-            list(fresh.record(inserts))
+            list(fresh.apply(inserts))
         theirs = _bits(fresh)
         return (
             "same bits" if self.bits == theirs else "same content" if _same_content(self.bits, theirs) else "different"
@@ -276,8 +276,8 @@ def _folder() -> MapSolver:
     return MapSolver(lambda: Solver(Options()), EPOCH, LIMITS)
 
 
-def _bits(folder: MapSolver) -> bytes:
-    taken = folder.snapshot([Question("graph")])
+def _bits(map_solver: MapSolver) -> bytes:
+    taken = map_solver.snapshot([Question("graph")])
     return codec.encode_graph(taken.graph)
 
 

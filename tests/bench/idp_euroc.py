@@ -35,7 +35,7 @@ _SETTINGS = VisualSettings(sigma_pixel=2.5, velocity=0.06, turn=0.06, most=45)
 
 
 def main() -> None:
-    """InsertBatch, align, print."""
+    """Run, align, print."""
     options = _options()
     folder = options.data or try_find_tracks()
     if folder is None:

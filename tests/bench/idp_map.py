@@ -67,8 +67,8 @@ class FrontEnd:
                 draft.se3(symbol("x", number), self._ahead(number))
                 self._sights(draft, number, frame)
             self.poses.append(frame.pose)
-            ripen = self._below if number % self._every == 0 else 0.0
-            self._map.insert(draft, convert_below=ripen)
+            below = self._below if number % self._every == 0 else 0.0
+            self._map.insert(draft, convert_below=below)
         self._map.insert(Draft(), settle=True)
 
     def _begin(self, draft: Draft, frame: Frame) -> None:
@@ -130,8 +130,8 @@ class Near:
         """As the service does."""
         self.solver.stage(batch.batch() if isinstance(batch, Draft) else batch)
         self.reports.append(self.solver.step(settle=settle))
-        if convert_below and (ripe := self.solver.ripe(convert_below)).size:
-            self.solver, report = self.solver.with_points(ripe)
+        if convert_below and (keys := self.solver.convertible(convert_below)).size:
+            self.solver, report = self.solver.with_points(keys)
             self.reports.append(report)
         for group in self.solver.changed():
             self._values.update(zip(group.keys.tolist(), group.values, strict=True))
@@ -190,7 +190,7 @@ def report(rows: list[dict[str, Any]]) -> str:
         position, pose, depth = row["nees_position"], row["nees_pose"], row["inverse_depth"]
         lines += [
             f"  {row['map']}: {row['frames']} frames, {row['features']} features ({row['points']} points at the end), "
-            f"{row['sights']} sights, {row['asleep']} asleep, {row['seconds']:.0f} s",
+            f"{row['sights']} sights, {row['inactive']} inactive, {row['seconds']:.0f} s",
             f"    position {row['error_m']['rms'] * 1e3:.1f} mm RMS; NEES {position['mean']:.2f} of 3, "
             f"{position['within']:.1%} within 3σ; of the pose {pose['mean']:.2f} of 6, {pose['within']:.1%}",
             f"    inverse depths: NEES {depth['nees']:.2f} of 1, {depth['within']:.1%} of {row['features_judged']} "
@@ -216,7 +216,7 @@ def judged(front: FrontEnd, graph: Batch) -> dict[str, Any]:
         "points": sum(len(group.keys) for group in graph.variables if group.kind == "point3"),
         "features_judged": len(depths),
         "sights": sum(sights),
-        "asleep": len(solver.asleep()),
+        "inactive": len(solver.inactive()),
         "error_m": {"rms": float(np.sqrt(np.mean(off**2))), "end": float(off[-1])},
         "nees_position": {"mean": float(nees3.mean()), "wanted": 3.0, "within": float((nees3 < _WITHIN[3]).mean())},
         "nees_pose": {"mean": float(nees6.mean()), "wanted": 6.0, "within": float((nees6 < _WITHIN[6]).mean())},

@@ -66,7 +66,7 @@ class Near:
         self.camera = camera
 
     def grow(self, x: np.ndarray, P: np.ndarray, pixels: np.ndarray):
-        from factorbus.client.grown import Grown
+        from factorbus.client.filter_state import Grown
 
         sighting = Sighting(self.camera, x[:13], P[:13], pixels, idp_euroc._RHO, idp_euroc._SIGMA_RHO, 2.5)
         seen = see(sighting)

@@ -110,7 +110,7 @@ def test_times_of_every_call(bus: Bus, kitchen: Map, timeout_s: Any) -> None:
         lambda **t: kitchen.change(Changes(), **t), kitchen.flush, kitchen.wait_converged, kitchen.stats,
         kitchen.chi2, kitchen.graph, kitchen.clients, kitchen.export, kitchen.ask_estimate, kitchen.repair,
         kitchen.estimate.wait_converged, lambda **t: kitchen.estimate.wait_for(1, **t), pending_insert.result,
-        kitchen.doubt.covariance, lambda **t: kitchen.doubt.why("x1", **t), bus.maps, bus.stats,
+        kitchen.uncertainty.covariance, lambda **t: kitchen.uncertainty.why("x1", **t), bus.maps, bus.stats,
         lambda **t: bus.create("attic", **t), lambda **t: bus.drop("attic", **t),
     ]  # fmt: skip
     for call in calls:
@@ -155,7 +155,7 @@ def test_everything_on_a_closed_connection_says_so(bus: Bus, kitchen: Map) -> No
     calls: list[Callable[[], object]] = [
         bus.maps, bus.stats, lambda: bus.create("attic"), lambda: bus.fork(MAP, "attic"), lambda: bus.drop(MAP),
         lambda: bus.map(MAP), lambda: kitchen.insert(POINT), lambda: kitchen.send(POINT), kitchen.settle,
-        kitchen.chi2, kitchen.stats, kitchen.graph, kitchen.clients, kitchen.export, kitchen.doubt.last,
+        kitchen.chi2, kitchen.stats, kitchen.graph, kitchen.clients, kitchen.export, kitchen.uncertainty.last,
         lambda: kitchen.estimate.wait_for(9), kitchen.rejoin,
     ]  # fmt: skip
     for call in calls:

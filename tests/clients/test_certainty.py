@@ -4,7 +4,6 @@ from concurrent.futures import Future
 
 import numpy as np
 import pytest
-from factorbus.viz.rate_limited import RateLimited
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 
@@ -16,6 +15,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import solve_batch
 from factorbus.viz.certainty import chosen
+from factorbus.viz.rate_limit import RateLimited
 from factorbus.viz.tree import parents_of, places_of, reached_from
 
 

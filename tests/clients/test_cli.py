@@ -19,7 +19,7 @@ from factorbus.cli.output.exits import (
     UNAVAILABLE,
     USAGE,
     Stopped,
-    missing,
+    missing_modules,
     report,
     require,
 )
@@ -149,7 +149,7 @@ def test_interrupted_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 def test_a_missing_extra_is_named_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda name: None if name == "numba" else object())
-    assert missing("service") == ["numba"]
+    assert missing_modules("service") == ["numba"]
     require("viz", "a picture")
     with pytest.raises(Stopped, match=r"factorbus serve needs numba.*: \S.* install .*\[service\]"):
         require("service", "factorbus serve")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from faulty.service import MAP, Service, endpoint_in
 
-from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, sender
+from factorbus.client import Draft, NoAnswerYet, Refused, Unavailable, connect, request_sender
 from factorbus.client.mirror import Mirror
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Variables
@@ -94,7 +94,7 @@ def test_an_insert_is_sent_again_with_its_number_and_taken_once(
 def test_an_insert_nobody_answers_in_time_is_sent_again(
     start: Callable[..., Service], endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sender, "TRY_S", 0.1)
+    monkeypatch.setattr(request_sender, "TRY_S", 0.1)
     service = start()
     service.faults.append("hold")
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from factorbus.client.pool import SharedMemoryPool
 from naive.random_sightings import random_sighting
 
 from factorbus import idp
-from factorbus.client.grown import factored, grown
+from factorbus.client.filter_state import factored, grown
+from factorbus.client.shared_memory_pool import SharedMemoryPool
 from factorbus.idp import job, minimal
 from factorbus.proto.features import Answer, Ask, Done, Shard, ShardDone, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
@@ -50,14 +50,14 @@ def test_rows_in_memory_and_rows_that_came_as_bytes_are_put_together(seen) -> No
     sighting, P, after = seen
     pool = SharedMemoryPool()
     m = sighting.width
-    lent = pool.try_allocate(PAGE, after.shape, m)
-    assert lent is not None
-    here = answered(Ask(sighting, "rows", lent.segment), CUTS[:2])
+    allocation = pool.try_allocate(PAGE, after.shape, m)
+    assert allocation is not None
+    here = answered(Ask(sighting, "rows", allocation.segment), CUTS[:2])
     elsewhere = answered(Ask(sighting, "rows"), CUTS[2:])
     assert [done.shard.stored for done in here.shards] == [True, True]
-    found = grown(np.zeros(m), P, sighting, Answer((*here.shards, *elsewhere.shards), True), lent.matrix)
+    found = grown(np.zeros(m), P, sighting, Answer((*here.shards, *elsewhere.shards), True), allocation.matrix)
     assert found.P.tobytes() == after.tobytes()
-    pool.settle(lent, clean=False)
+    pool.settle(allocation, clean=False)
     pool.close()
 
 
@@ -148,10 +148,10 @@ def test_memory_is_used_again_when_nobody_looks_at_it() -> None:
 
 def test_memory_that_somebody_may_still_write_to_is_not_used_again() -> None:
     before, pool = descriptors(), SharedMemoryPool()
-    lent = pool.try_allocate(PAGE, (300, 300), 0)
-    assert lent is not None
-    pool.settle(lent, clean=False)
-    del lent
+    allocation = pool.try_allocate(PAGE, (300, 300), 0)
+    assert allocation is not None
+    pool.settle(allocation, clean=False)
+    del allocation
     gc.collect()
     assert descriptors() == before
     again = pool.try_allocate(PAGE, (300, 300), 0)

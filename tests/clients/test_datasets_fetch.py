@@ -33,12 +33,12 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def dataset_of(source: bytes, name: str = "executor", form: str = "isam") -> Dataset:
+def dataset_of(source: bytes, name: str = "lane", form: str = "isam") -> Dataset:
     """A catalogue entry for a source of our own."""
-    origin = Source(form, ("data/executor one.txt",), (sha256(source),), "someone/maps", "c0ffee")
-    made = convert(form, [("executor", source)])
+    origin = Source(form, ("data/lane one.txt",), (sha256(source),), "someone/maps", "c0ffee")
+    made = convert(form, [("lane", source)])
     edges = source.count(b"\n")
-    return Dataset(name, "a executor", "", "2D", edges + 1, 0, edges, 0, 0, 0.0, sha256(made), origin)
+    return Dataset(name, "a lane", "", "2D", edges + 1, 0, edges, 0, 0, 0.0, sha256(made), origin)
 
 
 @pytest.fixture
@@ -50,9 +50,9 @@ def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
 
 
 def serve(site: Site, answer: Answer) -> str:
-    """Let the site answer so for the executor; returns the path."""
-    site.holds("someone/maps", "c0ffee", "data/executor%20one.txt", answer)
-    return "/someone/maps/c0ffee/data/executor%20one.txt"
+    """Let the site answer so for the lane; returns the path."""
+    site.holds("someone/maps", "c0ffee", "data/lane%20one.txt", answer)
+    return "/someone/maps/c0ffee/data/lane%20one.txt"
 
 
 def left_in(cache: Path) -> list[str]:
@@ -72,11 +72,11 @@ def refused(site: Site, cache: Path, kind: type[DatasetProblem], says: str, time
 def test_a_data_set_is_downloaded_converted_and_put_in_place(site: Site, tmp_path: Path) -> None:
     path = serve(site, Answer(SMALL))
     file = fetch(dataset_of(SMALL), tmp_path / "new" / "cache", base=site.base + "/")
-    assert file == tmp_path / "new" / "cache" / "executor.g2o"
-    assert file.read_bytes() == convert("isam", [("executor", SMALL)])
+    assert file == tmp_path / "new" / "cache" / "lane.g2o"
+    assert file.read_bytes() == convert("isam", [("lane", SMALL)])
     assert file.read_text().startswith("EDGE_SE2 0 1 1 0 0.5 9 0 0 9 0 16\n")
     assert site.asked == [path]
-    assert left_in(tmp_path) == ["new", "new/cache", "new/cache/executor.g2o"]
+    assert left_in(tmp_path) == ["new", "new/cache", "new/cache/lane.g2o"]
     assert file.stat().st_mode & 0o777 == 0o666 & ~current_umask()
 
 
@@ -95,13 +95,13 @@ def test_what_is_there_and_good_is_not_fetched_again(site: Site, tmp_path: Path)
 
 
 def test_what_is_there_and_bad_is_replaced_but_not_before_the_new_one_is_good(site: Site, tmp_path: Path) -> None:
-    (tmp_path / "executor.g2o").write_text("EDGE_SE2 damaged\n")
+    (tmp_path / "lane.g2o").write_text("EDGE_SE2 damaged\n")
     with pytest.raises(HttpStatus):
         fetch(dataset_of(SMALL), tmp_path, base=site.base)
-    assert (tmp_path / "executor.g2o").read_text() == "EDGE_SE2 damaged\n"
+    assert (tmp_path / "lane.g2o").read_text() == "EDGE_SE2 damaged\n"
     serve(site, Answer(SMALL))
     assert sha256(fetch(dataset_of(SMALL), tmp_path, base=site.base).read_bytes()) == dataset_of(SMALL).sha256
-    assert left_in(tmp_path) == ["executor.g2o"]
+    assert left_in(tmp_path) == ["lane.g2o"]
 
 
 def test_progress_comes_while_the_file_still_does(site: Site, tmp_path: Path) -> None:
@@ -119,19 +119,19 @@ def test_progress_comes_while_the_file_still_does(site: Site, tmp_path: Path) ->
     assert 0 < counts[0] < len(LARGE)
     assert counts == sorted(counts)
     assert counts[-1] == len(LARGE)
-    assert {(file, total) for file, _, total in seen} == {("executor one.txt", len(LARGE))}
+    assert {(file, total) for file, _, total in seen} == {("lane one.txt", len(LARGE))}
 
 
 def test_a_redirect_is_followed(site: Site, tmp_path: Path) -> None:
-    serve(site, Answer(status=302, location="/elsewhere/executor.txt"))
-    site.answers["/elsewhere/executor.txt"] = Answer(SMALL)
+    serve(site, Answer(status=302, location="/elsewhere/lane.txt"))
+    site.answers["/elsewhere/lane.txt"] = Answer(SMALL)
     assert fetch(dataset_of(SMALL), tmp_path, base=site.base).is_file()
 
 
 def test_without_a_length_the_checksum_decides(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL, length=None))
     assert fetch(dataset_of(SMALL), tmp_path, base=site.base).is_file()
-    (tmp_path / "executor.g2o").unlink()
+    (tmp_path / "lane.g2o").unlink()
     serve(site, Answer(SMALL[:-20], length=None))
     refused(site, tmp_path, BadChecksum, "not the file of that commit")
 
@@ -197,7 +197,7 @@ def test_an_address_that_cannot_be_is_refused(tmp_path: Path, base: str) -> None
 
 def test_a_conversion_with_another_outcome_is_refused(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
-    with pytest.raises(BadChecksum, match=r"executor\.g2o as converted .* conversion is wrong here"):
+    with pytest.raises(BadChecksum, match=r"lane\.g2o as converted .* conversion is wrong here"):
         fetch(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base)
     assert left_in(tmp_path) == []
 
@@ -217,8 +217,8 @@ def test_the_source_is_kept_when_asked_for(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
     with pytest.raises(BadChecksum):
         fetch(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base, keep_source=True)
-    assert left_in(tmp_path) == ["sources", "sources/executor", "sources/executor/executor one.txt"]
-    assert (tmp_path / "sources/executor/executor one.txt").read_bytes() == SMALL
+    assert left_in(tmp_path) == ["sources", "sources/lane", "sources/lane/lane one.txt"]
+    assert (tmp_path / "sources/lane/lane one.txt").read_bytes() == SMALL
 
 
 def test_two_files_of_one_source(site: Site, tmp_path: Path) -> None:
@@ -243,10 +243,10 @@ def test_a_cache_that_cannot_be_made_is_told(site: Site, tmp_path: Path) -> None
 
 def test_a_folder_in_the_place_of_the_file_is_told(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
-    (tmp_path / "executor.g2o").mkdir()
-    with pytest.raises(CannotWrite, match=r"executor\.g2o cannot be written: Is a directory"):
+    (tmp_path / "lane.g2o").mkdir()
+    with pytest.raises(CannotWrite, match=r"lane\.g2o cannot be written: Is a directory"):
         fetch(dataset_of(SMALL), tmp_path, base=site.base)
-    assert left_in(tmp_path) == ["executor.g2o"]
+    assert left_in(tmp_path) == ["lane.g2o"]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
@@ -263,9 +263,9 @@ from pathlib import Path
 from factorbus.datasets import Dataset, DatasetProblem, Source, fetch
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 cache, base, source, made = sys.argv[1:]
-executor = Dataset("executor", "", "", "2D", 2, 0, 1, 0, 0, 0.0, made, Source("isam", ("l.txt",), (source,), "a/b", "c"))
+lane = Dataset("lane", "", "", "2D", 2, 0, 1, 0, 0, 0.0, made, Source("isam", ("l.txt",), (source,), "a/b", "c"))
 try:
-    fetch(executor, Path(cache), base=base)
+    fetch(lane, Path(cache), base=base)
 except DatasetProblem as problem:
     print(problem.code)
 """
@@ -287,45 +287,45 @@ def test_no_room_while_downloading_leaves_nothing(site: Site, tmp_path: Path) ->
 
 
 def test_what_only_the_wheel_has_needs_the_wheel(tmp_path: Path) -> None:
-    shipped = Source("isam", ("executor.txt",), (sha256(SMALL),))
-    executor = replace(dataset_of(SMALL), download=None, wheel=shipped)
+    shipped = Source("isam", ("lane.txt",), (sha256(SMALL),))
+    lane = replace(dataset_of(SMALL), download=None, wheel=shipped)
     with pytest.raises(NotShipped, match=r"pip install 'gtsam==4\.3\.0'"):
-        fetch(executor, tmp_path / "cache")
+        fetch(lane, tmp_path / "cache")
     wheel = tmp_path / "wheel"
     wheel.mkdir()
-    (wheel / "executor.txt").write_bytes(SMALL)
-    assert sha256(fetch(executor, tmp_path / "cache", wheel=wheel).read_bytes()) == executor.sha256
+    (wheel / "lane.txt").write_bytes(SMALL)
+    assert sha256(fetch(lane, tmp_path / "cache", wheel=wheel).read_bytes()) == lane.sha256
 
 
 def test_the_wheels_file_is_taken_before_the_network_unless_it_is_another(site: Site, tmp_path: Path) -> None:
-    executor = replace(dataset_of(SMALL), wheel=Source("isam", ("executor.txt",), (sha256(SMALL),)))
-    (tmp_path / "executor.txt").write_bytes(SMALL)
-    fetch(executor, tmp_path / "one", wheel=tmp_path, base=site.base)
+    lane = replace(dataset_of(SMALL), wheel=Source("isam", ("lane.txt",), (sha256(SMALL),)))
+    (tmp_path / "lane.txt").write_bytes(SMALL)
+    fetch(lane, tmp_path / "one", wheel=tmp_path, base=site.base)
     assert site.asked == []
-    (tmp_path / "executor.txt").write_bytes(LARGE)
+    (tmp_path / "lane.txt").write_bytes(LARGE)
     path = serve(site, Answer(SMALL))
-    fetch(executor, tmp_path / "two", wheel=tmp_path, base=site.base)
+    fetch(lane, tmp_path / "two", wheel=tmp_path, base=site.base)
     assert site.asked == [path]
 
 
 def test_found_in_the_users_folder_then_the_cache_then_the_wheel(tmp_path: Path) -> None:
-    executor = replace(dataset_of(SMALL), wheel=Source("isam", ("executor.txt",), (sha256(SMALL),)))
+    lane = replace(dataset_of(SMALL), wheel=Source("isam", ("lane.txt",), (sha256(SMALL),)))
     places = Places(tmp_path / "own", tmp_path / "cache", tmp_path / "wheel")
-    assert locate(executor, places) is None
-    assert find("executor", places, [executor]) is None
+    assert locate(lane, places) is None
+    assert find("lane", places, [lane]) is None
 
     (tmp_path / "wheel").mkdir()
-    (tmp_path / "wheel" / "executor.txt").write_bytes(LARGE)
-    assert find("executor", places, [executor]) is None, "another file of that name is not it"
-    (tmp_path / "wheel" / "executor.txt").write_bytes(SMALL)
-    assert str(locate(executor, places)).count("wheel") >= 1
+    (tmp_path / "wheel" / "lane.txt").write_bytes(LARGE)
+    assert find("lane", places, [lane]) is None, "another file of that name is not it"
+    (tmp_path / "wheel" / "lane.txt").write_bytes(SMALL)
+    assert str(locate(lane, places)).count("wheel") >= 1
     assert not (tmp_path / "cache").exists(), "looking changes nothing"
-    assert find("executor", places, [executor]) == tmp_path / "cache" / "executor.g2o"
-    assert sha256((tmp_path / "cache" / "executor.g2o").read_bytes()) == executor.sha256
+    assert find("lane", places, [lane]) == tmp_path / "cache" / "lane.g2o"
+    assert sha256((tmp_path / "cache" / "lane.g2o").read_bytes()) == lane.sha256
 
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "executor.g2o").write_text("the user's")
-    assert find("executor.g2o", places, [executor]) == tmp_path / "own" / "executor.g2o"
+    (tmp_path / "own" / "lane.g2o").write_text("the user's")
+    assert find("lane.g2o", places, [lane]) == tmp_path / "own" / "lane.g2o"
 
 
 def test_the_places_of_this_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factorbus.client.transform_linear import is_relative, says_nothing
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.dense_factors import boxminus, boxplus, pose_matrix, pose_vector, residual
@@ -18,7 +17,8 @@ from naive.random_sights import random_sight
 from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCollision, NoAnchor
 from factorbus.client.frames import compose, difference, inverse, moved_values
 from factorbus.client.merging import fit_into
-from factorbus.client.moved import transform_factors
+from factorbus.client.transform_factors import transform_factors
+from factorbus.client.transform_linear import is_relative, says_nothing
 from factorbus.pieces import cut
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of

@@ -131,14 +131,14 @@ def test_why_of_a_number_is_of_the_factor_and_of_the_variable_without_a_letter(
 
 def test_why_in_python_has_words_and_symbols_and_one_key_will_do(endpoint: str) -> None:
     with connect(endpoint, client="reader") as bus, bus.map("yard", mirror=False, create=False) as yard:
-        why = yard.doubt.why("a2")
+        why = yard.uncertainty.why("a2")
         assert why.symbols == ("a2", "a1", "a3")
         assert str(why) == why.text
         assert why.text.splitlines()[0] == "a2, se2, at revision 3"
         assert "between_se2 (a1, a2): χ²" in why.text
-        assert yard.doubt.why(factor=0).text.startswith("factor 0, between_se2 (a0, a1)")
-        assert yard.doubt.covariance("a2")["a2"].shape == (3, 3)
-        assert yard.doubt.relative(("a1", "a2")).groups[0].covariance.shape == (1, 3, 3)
+        assert yard.uncertainty.why(factor=0).text.startswith("factor 0, between_se2 (a0, a1)")
+        assert yard.uncertainty.covariance("a2")["a2"].shape == (3, 3)
+        assert yard.uncertainty.relative(("a1", "a2")).groups[0].covariance.shape == (1, 3, 3)
         assert [group.keys.size for group in yard.ask_estimate("a2").variables] == [1]
 
 

@@ -7,7 +7,7 @@ import pytest
 from naive.random_sightings import CAMERAS
 
 from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
-from factorbus.client.grown import Grown
+from factorbus.client.filter_state import Grown
 from factorbus.idp import lenses, minimal, see
 from factorbus.proto.camera import Camera
 from factorbus.proto.features import Sighting

@@ -79,7 +79,7 @@ def test_what_http_says_is_what_the_map_has(endpoint: str, gateway: str) -> None
         ]
         assert sum(each["chi2"] for each in explained) == pytest.approx(2 * joined.chi2().chi2, rel=1e-9)
         # What is said of certainty is what the map says when it is asked itself.
-        covariances = joined.doubt.covariance()
+        covariances = joined.uncertainty.covariance()
         for each in explained:
             np.testing.assert_allclose(
                 each["sigmas"], np.sqrt(np.diag(covariances[each["key"]])), rtol=1e-9, atol=1e-15

@@ -24,8 +24,7 @@ from factorbus.simulate import city_trees
 
 pytest.importorskip("foxglove")
 
-from factorbus.viz.follower import Look
-
+from factorbus.viz.map_follower import Look
 from factorbus.viz.mcap import Recording
 
 

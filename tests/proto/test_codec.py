@@ -1,4 +1,4 @@
-"""Messages to bytes and back: golden bytes, round latencies, and decoders that take anything without harm."""
+"""Messages to bytes and back: golden bytes, round trips, and decoders that take anything without harm."""
 
 import json
 import re
@@ -135,7 +135,7 @@ def from_description(content: Any) -> Any:
     return [from_description(item) for item in content] if isinstance(content, list) else content
 
 
-# ---- round latencies --------------------------------------------------------------------------------------------------
+# ---- round trips --------------------------------------------------------------------------------------------------
 
 NUMBERS = st.integers(0, 2**63 - 1)
 DOUBLES = st.floats(allow_nan=True, allow_infinity=True, width=64)

@@ -71,7 +71,7 @@ def test_every_field_is_explained(message: Any) -> None:
         (keys.insert_key("m", "c"), "map/<map>/in/<client>"),
         (keys.ask_key("m", "chi2"), "map/<map>/ask/<question>"),
         (keys.delta_key("m"), "map/<map>/out/delta"),
-        (keys.snapshot_key("m"), "map/<map>/out/keyframe"),
+        (keys.snapshot_key("m"), "map/<map>/out/snapshot"),
         (keys.event_key("m"), "map/<map>/out/event"),
         (keys.service_token("m", "s"), "map/<map>/live/service/<id>"),
         (keys.client_token("m", "c"), "map/<map>/live/client/<client>"),

@@ -1,4 +1,4 @@
-"""Messages of inverse-depth features: golden bytes, round latencies, and decoders that take anything without harm."""
+"""Messages of inverse-depth features: golden bytes, round trips, and decoders that take anything without harm."""
 
 import json
 import runpy

@@ -140,7 +140,7 @@ def test_a_map_that_is_not_empty_waits_for_a_pose(endpoint: str, spawn: Callable
         transform, _ = node.wait_for("/tf")
         # There odometry says (3, 0) towards x, and the map (5, 5) towards y.
         assert ros.plane(transform.transforms[0].transform) == pytest.approx((5.0, 2.0, math.pi / 2), abs=1e-6)
-        assert looked.doubt.covariance(["a0"])["a0"] == pytest.approx(np.diag([0.01] * 3), rel=1e-3)
+        assert looked.uncertainty.covariance(["a0"])["a0"] == pytest.approx(np.diag([0.01] * 3), rel=1e-3)
     joined.signal(signal.SIGINT)
     assert joined.wait() == 0
 

@@ -213,7 +213,7 @@ def test_questions_are_answered_of_the_latest_revision_and_do_not_stop_it(driven
     assert driven.core.ask(Asked("q", "chi2", b""), driven.now) == []
     following = the_run(driven.done(run, converged=False))
     assert [read.asker for read in following.reads] == ["q"]
-    assert following.further, "reads come first in a InsertBatch, and so are of the step before"
+    assert following.further, "reads come first in an InsertBatch, and so are of the step before"
     driven.done(following, converged=False)
     for n in range(20):  # who asks all the time
         effects = driven.core.ask(Asked(f"q{n}", "chi2", b""), driven.now)

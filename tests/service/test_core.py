@@ -28,7 +28,7 @@ from factorbus.service.core.map_state import MapCore
 
 @pytest.fixture
 def core() -> MapCore:
-    return MapCore("m", "auto", 5, Limits(record=2, keyframe_steps=3, questions=2), now=0.0)
+    return MapCore("m", "auto", 5, Limits(step_inserts=2, snapshot_steps=3, questions=2), now=0.0)
 
 
 def insert(client: str, sequence: int) -> Arrived:
@@ -56,7 +56,7 @@ def test_an_insert_goes_to_a_free_solver_at_once_and_the_next_ones_wait(core: Ma
     assert [core.insert(insert("a", s)) for s in (2, 3, 4)] == [[], [], []]
     effects = solved(core, run)
     assert effects[:2] == [Answer("a1", b"ok"), Publish("delta", b"delta")]
-    assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `record` at a time"
+    assert [i.sequence for i in run_of(effects).inserts] == [2, 3], "no more than `step_inserts` at a time"
     assert core.revision == 1
 
 
@@ -166,14 +166,14 @@ def test_questions_are_bounded(core: MapCore) -> None:
     assert effect.problem.code == "busy"
 
 
-@pytest.mark.parametrize("limits", [Limits(keyframe_steps=3), Limits(keyframe_bytes=15)])
-def test_a_keyframe_now_and_then(limits: Limits) -> None:
+@pytest.mark.parametrize("limits", [Limits(snapshot_steps=3), Limits(snapshot_bytes=15)])
+def test_a_snapshot_now_and_then(limits: Limits) -> None:
     core = MapCore("m", "auto", 5, limits, now=0.0)
     due = 3  # the third step, or the third delta of five bytes
     for sequence in range(1, due + 1):
         effects = solved(core, run_of(core.insert(insert("a", sequence))))
-        keyframes = [r.question.name for e in effects if isinstance(e, InsertBatch) for r in e.reads]
-        assert keyframes == (["keyframe"] if sequence == due else [])
+        snapshots = [r.question.name for e in effects if isinstance(e, InsertBatch) for r in e.reads]
+        assert snapshots == (["snapshot"] if sequence == due else [])
 
 
 def test_stopping_answers_everything_accepted_and_takes_nothing_new(core: MapCore) -> None:

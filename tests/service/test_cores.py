@@ -1,4 +1,4 @@
-"""A service has as many threads that lend their cores as it was told to, of the cores that there are."""
+"""A service has as many worker threads as it was told to, of the cores that there are."""
 
 import os
 import threading
@@ -10,11 +10,11 @@ from factorbus.service.process import control_groups
 from factorbus.service.process import worker_threads as cores
 from factorbus.service.process.worker_threads import WorkerThreads
 from factorbus.solver.kernels.bayes_tree.step import tree_step
-from factorbus.solver.sparse.lending import can_work, count_free
+from factorbus.solver.sparse.worker_threads import can_work, count_free
 from factorbus.solver.warm import iter_compile
 
 pytestmark = pytest.mark.skipif(
-    count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"
+    count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be worker_threads"
 )
 
 
@@ -48,7 +48,7 @@ def test_no_more_cores_than_the_process_has_the_time_of(
     assert cores.core_count() == count
 
 
-def lending() -> int:
+def worker_count() -> int:
     return sum(thread.name.startswith("core ") for thread in threading.enumerate())
 
 
@@ -58,27 +58,27 @@ def test_no_more_than_told_and_than_there_are(
 ) -> None:
     monkeypatch.setattr(cores, "core_count", lambda: there)
     assert list(iter_compile(tree_step))
-    free, lent = count_free(), WorkerThreads(told)
-    assert lent.account() == {"used": used, "pieces": 0}
-    assert lending() == used - 1
+    free, worker_threads = count_free(), WorkerThreads(told)
+    assert worker_threads.account() == {"used": used, "pieces": 0}
+    assert worker_count() == used - 1
     assert count_free() == free - (used - 1)
-    lent.close()
-    assert lending() == 0
+    worker_threads.close()
+    assert worker_count() == 0
     assert count_free() == free
 
 
 def test_no_thread_compiles_what_nobody_has_asked_for_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cores, "core_count", lambda: 2)
     monkeypatch.setattr(cores, "can_work", lambda: False)
-    free, lent = count_free(), WorkerThreads(2)
-    lent.tick()
-    assert lent.account() == {"used": 1, "pieces": 0}
-    assert (lending(), count_free()) == (0, free)
+    free, worker_threads = count_free(), WorkerThreads(2)
+    worker_threads.tick()
+    assert worker_threads.account() == {"used": 1, "pieces": 0}
+    assert (worker_count(), count_free()) == (0, free)
     assert list(iter_compile(tree_step))
     monkeypatch.setattr(cores, "can_work", can_work)
     for _ in range(2):
-        lent.tick()
-        assert lent.account() == {"used": 2, "pieces": 0}
-        assert lending() == 1
-    lent.close()
-    assert (lending(), count_free()) == (0, free)
+        worker_threads.tick()
+        assert worker_threads.account() == {"used": 2, "pieces": 0}
+        assert worker_count() == 1
+    worker_threads.close()
+    assert (worker_count(), count_free()) == (0, free)

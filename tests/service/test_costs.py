@@ -106,7 +106,7 @@ def test_what_there_is_no_memory_for_is_refused_with_the_limit(
     assert "memory_bytes" in problem.message
     memory.limit = 1 << 40
     take(solver, name, payload, Room(memory))
-    memory.lend(int(memory.limit - memory.resident - (1 << 20)))  # nothing was kept of what was lent
+    memory.reserve(int(memory.limit - memory.resident - (1 << 20)))  # nothing was kept of what was reserved
 
 
 @pytest.mark.parametrize("count", [3000, 30_000, 1_000_000])
@@ -206,13 +206,13 @@ def test_one_that_is_refused_does_not_refuse_the_others_of_its_revision(solver: 
 
 def test_what_is_lent_counts_for_all_until_it_is_given_back(memory: MemoryLimit) -> None:
     memory.limit = memory.resident + (1 << 30)
-    memory.lend(1 << 29)
+    memory.reserve(1 << 29)
     with pytest.raises(OutOfMemory):
-        memory.lend(3 << 28)
+        memory.reserve(3 << 28)
     memory.give_back(1 << 29)
-    memory.lend(3 << 28)
+    memory.reserve(3 << 28)
     memory.give_back(3 << 28)
     memory.limit = memory.resident  # maps have come up to the limit
-    memory.lend(memory.limit // 5)
+    memory.reserve(memory.limit // 5)
     with pytest.raises(OutOfMemory):
-        memory.lend(memory.limit // 5)
+        memory.reserve(memory.limit // 5)

@@ -144,7 +144,7 @@ def test_a_wrong_answer_costs_trust_and_the_job_goes_to_another() -> None:
 def test_a_doubtful_answer_is_decided_in_place() -> None:
     dispatch = Dispatch()
     dispatch.joined("a", 1)
-    effects = dispatch.doubted(tag_of(dispatch.submit(job("j"))), "answered NaN")
+    effects = dispatch.suspected(tag_of(dispatch.submit(job("j"))), "answered NaN")
     assert places(effects) == [IN_PLACE]
     assert dispatch.distrusted == []
     assert dispatch.done(tag_of(effects), done("j"))[0] == Distrusted("a", "answered NaN", 1)

@@ -56,14 +56,14 @@ def inserts() -> list[Arrived]:
 
 
 class Written:
-    """A folder, and the journal of what it did."""
+    """A map_solver, and the journal of what it did."""
 
     def __init__(self, path: Path, mode: str, **options: Any) -> None:
-        self.folder, self.refused = folder_in(mode, **options), False
-        self.store: Store = create(path, path.name, mode, self.folder.options(), EPOCH, "none")
+        self.map_solver, self.refused = folder_in(mode, **options), False
+        self.store: Store = create(path, path.name, mode, self.map_solver.options(), EPOCH, "none")
 
-    def record(self, *taken: Arrived, further: bool = False) -> list[Stepped]:
-        events, applied = self.folder.apply_whole(taken, further)
+    def apply(self, *taken: Arrived, further: bool = False) -> list[Stepped]:
+        events, applied = self.map_solver.apply_whole(taken, further)
         self.refused = applied.refused
         last = self.store.last()
         self.store.append([written(last.record + 1, taken, events, last, further)])
@@ -71,15 +71,15 @@ class Written:
 
     def converge(self) -> list[Stepped]:
         steps: list[Stepped] = []
-        while self.folder.unfinished:
-            steps += self.record(further=True)
+        while self.map_solver.unfinished:
+            steps += self.apply(further=True)
             assert not self.refused
             assert len(steps) < 2000
         return steps
 
 
-def values(folder: MapSolver) -> dict[int, bytes]:
-    taken = folder.snapshot([Question("estimate")])
+def values(map_solver: MapSolver) -> dict[int, bytes]:
+    taken = map_solver.snapshot([Question("estimate")])
     return {int(key): row.tobytes() for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
 
 
@@ -94,8 +94,8 @@ def told(deltas: list[Delta]) -> dict[int, bytes]:
 @pytest.mark.parametrize("mode", MODES)
 def test_further_steps_lead_to_the_optimum_and_tell_what_they_change(tmp_path: Path, mode: str) -> None:
     map_, came = Written(tmp_path / "m", mode), inserts()
-    deltas = [codec.decode_delta(step.delta) for one in came for step in map_.record(one)]
-    assert not map_.folder.converged
+    deltas = [codec.decode_delta(step.delta) for one in came for step in map_.apply(one)]
+    assert not map_.map_solver.converged
     assert (deltas[-1].report["converged"], deltas[-1].report["converging"]) == (False, True)
     before = len(deltas)
     further = map_.converge()
@@ -111,8 +111,8 @@ def test_further_steps_lead_to_the_optimum_and_tell_what_they_change(tmp_path: P
     converged = [delta.report["converged"] for delta in deltas[before:]]
     assert converged == sorted(converged)
     assert [delta.report["converging"] for delta in deltas[before:]] == [True] * (len(further) - 1) + [False]
-    assert told(deltas) == values(map_.folder)
-    assert map_.folder.chi2() == pytest.approx(optimum(POSES, DEGREES), rel=1e-6)
+    assert told(deltas) == values(map_.map_solver)
+    assert map_.map_solver.chi2() == pytest.approx(optimum(POSES, DEGREES), rel=1e-6)
 
 
 @pytest.mark.parametrize("mode", ALL_MODES)
@@ -121,14 +121,14 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     map_ = Written(tmp_path / "m", mode, max_iterations=10, max_nonmonotone_steps=20)
     world, judge = WORLDS["manhattan"](120, 7), Solver(Options(mode="all-batch"))
     for n, step in enumerate(world):
-        (stepped,) = map_.record(arrived(n + 1, step.batch))
+        (stepped,) = map_.apply(arrived(n + 1, step.batch))
         report = codec.decode_delta(stepped.delta).report
-        assert report["converging"] is stepped.unfinished is map_.folder.unfinished
+        assert report["converging"] is stepped.unfinished is map_.map_solver.unfinished
         judge.stage(step.batch)
         judge.step()
-    assert map_.folder.converged
-    assert map_.folder.unfinished
-    state = map_.folder.dump()
+    assert map_.map_solver.converged
+    assert map_.map_solver.unfinished
+    state = map_.map_solver.dump()
     steps = map_.converge()
     assert 1 <= len(steps) <= 3
     assert all(step.converged and step.further for step in steps)
@@ -139,12 +139,12 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     assert late.unfinished, "a snapshot knows"
     while late.unfinished:
         late.apply_whole((), further=True)
-    assert values(again) == values(map_.folder) == values(late)
+    assert values(again) == values(map_.map_solver) == values(late)
     assert not again.unfinished
     # Nothing is left to do, whoever insists.
-    before = values(map_.folder)
-    map_.record(further=True)
-    assert values(map_.folder) == before
+    before = values(map_.map_solver)
+    map_.apply(further=True)
+    assert values(map_.map_solver) == before
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -152,18 +152,22 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
     """Further steps between inserts, too: how many there were is in the journal."""
     map_, came = Written(tmp_path / "m", mode), inserts()
     for one in came:
-        map_.record(one)
+        map_.apply(one)
     for _ in range(3):
-        map_.record(further=True)
-    map_.record(arrived(len(came) + 1, closing(POSES)))
-    state, at = map_.folder.dump(), map_.store.last()
+        map_.apply(further=True)
+    map_.apply(arrived(len(came) + 1, closing(POSES)))
+    state, at = map_.map_solver.dump(), map_.store.last()
     for _ in range(2):
-        map_.record(further=True)
-    assert not map_.folder.converged
+        map_.apply(further=True)
+    assert not map_.map_solver.converged
     again = folder_in(mode)
     recovered = recover(map_.store, again)
     assert (recovered.same, recovered.last) == (True, map_.store.last())
-    assert (values(again), again.revision, again.converged) == (values(map_.folder), map_.folder.revision, False)
+    assert (values(again), again.revision, again.converged) == (
+        values(map_.map_solver),
+        map_.map_solver.revision,
+        False,
+    )
     assert [record.number for record in map_.store.records() if record.further] == [
         len(came) + n for n in (1, 2, 3, 5, 6)
     ]
@@ -176,8 +180,8 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
         while other.unfinished:
             other.apply_whole((), further=True)
             made += 1
-        assert values(other) == values(map_.folder), "what goes on from there goes the same way"
-        assert other.revision == map_.folder.revision == at.revision + made
+        assert values(other) == values(map_.map_solver), "what goes on from there goes the same way"
+        assert other.revision == map_.map_solver.revision == at.revision + made
     assert all(same for _, same in verify(map_.store, folder_in(mode)))
 
 
@@ -187,8 +191,8 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
 def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Path, damage: str) -> None:
     map_ = Written(tmp_path / "m", "inc-l")
     for one in inserts():
-        map_.record(one)
-    map_.record(further=True)
+        map_.apply(one)
+    map_.apply(further=True)
     map_.store._db.execute(damage)
     map_.store.close()
     store = open_store(tmp_path / "m")
@@ -198,30 +202,30 @@ def test_an_insert_that_is_missing_is_not_taken_for_a_further_step(tmp_path: Pat
 
 
 def unconverged(mode: str = "all-batch") -> MapSolver:
-    folder = folder_in(mode)
+    map_solver = folder_in(mode)
     for one in inserts():
-        folder.apply_whole([one])
-    assert not folder.converged
-    return folder
+        map_solver.apply_whole([one])
+    assert not map_solver.converged
+    return map_solver
 
 
 def test_a_further_step_that_is_refused_leaves_all_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = unconverged()
-    before, revision = values(folder), folder.revision
+    map_solver = unconverged()
+    before, revision = values(map_solver), map_solver.revision
 
     def refuse(solver: Solver, settle: bool = False) -> Any:
         raise NotFinite("χ²")
 
     monkeypatch.setattr(Solver, "step", refuse)
-    events, applied = folder.apply_whole((), further=True)
-    assert (events, applied.refused, folder.revision, values(folder)) == ([], True, revision, before)
+    events, applied = map_solver.apply_whole((), further=True)
+    assert (events, applied.refused, map_solver.revision, values(map_solver)) == ([], True, revision, before)
 
 
 def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It may leave traces in how the next step is made: as that of an insert it is in the journal."""
     map_, true_step = Written(tmp_path / "m", "all-batch"), Solver.step
     for one in inserts():
-        map_.record(one)
+        map_.apply(one)
     tried: list[Solver] = []
 
     def refuse(solver: Solver, settle: bool = False) -> Any:
@@ -231,14 +235,14 @@ def test_one_that_is_refused_is_made_again_too(tmp_path: Path, monkeypatch: pyte
         return true_step(solver, settle)
 
     monkeypatch.setattr(Solver, "step", refuse)
-    assert map_.record(further=True) == []
+    assert map_.apply(further=True) == []
     assert map_.refused
     *_, last = map_.store.records()
-    assert (last.further, last.revision, last.entries) == (True, map_.folder.revision, ())
+    assert (last.further, last.revision, last.entries) == (True, map_.map_solver.revision, ())
     again = folder_in("all-batch")
     assert recover(map_.store, again).same
     assert len(tried) == 2
-    assert (values(again), again.revision) == (values(map_.folder), map_.folder.revision)
+    assert (values(again), again.revision) == (values(map_.map_solver), map_.map_solver.revision)
 
 
 def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,27 +268,27 @@ def test_one_that_diverges_is_refused_and_the_map_stays_where_it_was(
     map_ = Written(tmp_path / "m", "all-batch")
     extra = Draft().se2("r0", (0, 0, 0)).between_se2("x0", "r0", (0, 0, 0), sigmas=(sigma, sigma, sigma)).batch()
     for one in (*inserts(), arrived(POSES + 2, extra)):
-        map_.record(one)
-    before, revision, solver = values(map_.folder), map_.folder.revision, map_.folder.solver
-    chi2 = map_.folder.chi2()
+        map_.apply(one)
+    before, revision, solver = values(map_.map_solver), map_.map_solver.revision, map_.map_solver.solver
+    chi2 = map_.map_solver.chi2()
     with monkeypatch.context() as patched:
         escaping(patched)
-        steps = map_.record(further=True)
+        steps = map_.apply(further=True)
         again = folder_in("all-batch")
         assert recover(map_.store, again).same
     assert map_.refused
     assert [record.levelname for record in caplog.records if "refused" in record.message] == ["WARNING"] * 2
-    assert (values(again), again.revision) == (values(map_.folder), map_.folder.revision)
+    assert (values(again), again.revision) == (values(map_.map_solver), map_.map_solver.revision)
     if sigma < 1e-8:
-        assert (steps, map_.folder.revision, map_.folder.solver) == ([], revision, solver)
-        assert values(map_.folder) == before
+        assert (steps, map_.map_solver.revision, map_.map_solver.solver) == ([], revision, solver)
+        assert values(map_.map_solver) == before
     else:
         (undone,) = steps
-        assert (undone.further, undone.revision, map_.folder.revision) == (True, revision + 1, revision + 1)
-        assert np.isfinite([np.frombuffer(row) for row in values(map_.folder).values()]).all()
-        assert map_.folder.chi2() <= chi2
+        assert (undone.further, undone.revision, map_.map_solver.revision) == (True, revision + 1, revision + 1)
+        assert np.isfinite([np.frombuffer(row) for row in values(map_.map_solver).values()]).all()
+        assert map_.map_solver.chi2() <= chi2
     # An insert later it is tried again, and all is well.
-    map_.record(arrived(POSES + 3, closing(POSES)))
+    map_.apply(arrived(POSES + 3, closing(POSES)))
     map_.converge()
 
 
@@ -297,12 +301,12 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
 ) -> None:
     map_ = Written(tmp_path / "m", "all-batch")
     for one in inserts():
-        map_.record(one)
-    revision, broken = map_.folder.revision, map_.folder.solver
+        map_.apply(one)
+    revision, broken = map_.map_solver.revision, map_.map_solver.solver
     monkeypatch.setattr(broken, "step", failing)
-    (stepped,) = map_.record(further=True)
+    (stepped,) = map_.apply(further=True)
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
-    assert map_.folder.solver is not broken
+    assert map_.map_solver.solver is not broken
     assert len(told([codec.decode_delta(stepped.delta)])) == POSES
     again = folder_in("all-batch")
     assert recover(map_.store, again).same
@@ -311,13 +315,13 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
 
 
 def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = unconverged()
-    revision, broken = folder.revision, folder.solver
+    map_solver = unconverged()
+    revision, broken = map_solver.revision, map_solver.solver
     monkeypatch.setattr(broken, "changed", failing)
-    (stepped,) = [event for event in folder.apply_whole((), further=True)[0] if isinstance(event, Stepped)]
+    (stepped,) = [event for event in map_solver.apply_whole((), further=True)[0] if isinstance(event, Stepped)]
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
-    assert folder.solver is not broken
-    assert told([codec.decode_delta(stepped.delta)]) == values(folder)
+    assert map_solver.solver is not broken
+    assert told([codec.decode_delta(stepped.delta)]) == values(map_solver)
 
 
 # ---- with threads ---------------------------------------------------------------------------------------------------
@@ -371,7 +375,7 @@ class Hosted:
 
     def __init__(self, solver: Solver) -> None:
         self.told = Told()
-        self.core = MapCore("m", "all-batch", EPOCH, Limits(record=1), 0.0)
+        self.core = MapCore("m", "all-batch", EPOCH, Limits(step_inserts=1), 0.0)
         self.host = Host(
             self.core, MapSolver(lambda: solver, EPOCH, Limits()), self.told.take, self.told.take,
             lambda reads, taken: None, threading.Lock(), self.told.take_both,

@@ -1,4 +1,4 @@
-"""A map at work: which thread records an insert, in what order its messages leave, and how it ends."""
+"""A map at work: which thread applies an insert, in what order its messages leave, and how it ends."""
 
 import threading
 import time
@@ -80,10 +80,10 @@ class Setup:
         self.told, self.inline_run, self.solver = Told(), threading.Lock(), Held()
         self.sequence = 0
         core = MapCore("m", "auto", EPOCH, Limits(), 0.0)
-        folder = MapSolver(lambda: self.solver, EPOCH, Limits())
+        map_solver = MapSolver(lambda: self.solver, EPOCH, Limits())
         self.host = Host(
             core,
-            folder,
+            map_solver,
             self.told.take,
             self.told.take,
             lambda reads, taken: None,
@@ -285,9 +285,9 @@ def test_a_fault_in_a_short_run_ends_the_map_and_tells_who_waits(setup: Setup, m
     setup.until_short()
 
     def broken(inserts: Any) -> Any:
-        raise RuntimeError("folding failed")
+        raise RuntimeError("applying failed")
 
-    monkeypatch.setattr(setup.host._folder, "record", broken)
+    monkeypatch.setattr(setup.host._map_solver, "apply", broken)
     setup.host.insert(setup.arrived(pose(1)))
     setup.host.insert(setup.arrived(pose(2)))
     codes = [effect.problem.code for effect, _ in setup.told.effects if isinstance(effect, Refuse)]

@@ -32,13 +32,13 @@ class Map:
     """A map as the service has it, asked after every insert whether everything in it is a number."""
 
     def __init__(self, mode: str) -> None:
-        self.folder = MapSolver(lambda: Solver(Options(mode=mode)), 9, Limits())
+        self.map_solver = MapSolver(lambda: Solver(Options(mode=mode)), 9, Limits())
         self.values: dict[int, np.ndarray] = {}
         self.sequence = 0
 
     def insert(self, batch: Batch, changes: tuple[Change, ...] = (), settle: bool = False) -> str:
         """Code of the answer."""
-        events, _ = self.folder.apply_whole([self.arrived(batch, changes, settle)])
+        events, _ = self.map_solver.apply_whole([self.arrived(batch, changes, settle)])
         (answer,) = [o.answer for e in events if isinstance(e, Verdict) for o in e.outcomes]
         for event in events:
             if isinstance(event, Stepped):
@@ -63,7 +63,7 @@ class Map:
             self.values |= dict(zip(group.keys.tolist(), group.values, strict=True))
 
     def estimate(self) -> dict[int, bytes]:
-        taken = self.folder.snapshot([Question("estimate")])
+        taken = self.map_solver.snapshot([Question("estimate")])
         return {int(k): row.tobytes() for g in taken.variables for k, row in zip(g.keys, g.values, strict=True)}  # type: ignore[arg-type]
 
 
@@ -79,7 +79,7 @@ def fuzz(mode: str, seed: int, inserts: int) -> Counter[str]:
         code = tried.insert(batch, settle=bool(rng.random() < 0.2))
         codes[code] += 1
         assert code in REASONS, f"seed {seed}"
-        assert math.isfinite(tried.folder.chi2()), f"seed {seed}"
+        assert math.isfinite(tried.map_solver.chi2()), f"seed {seed}"
         if code == "accepted":
             world.accept(batch)
         else:
@@ -121,13 +121,13 @@ def near(x: float) -> Batch:
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_that_diverges_from_unusual_numbers_leaves_every_bit(mode: str) -> None:
     tried, other = start(mode), start(mode)
-    before, revision = tried.estimate(), tried.folder.revision
+    before, revision = tried.estimate(), tried.map_solver.revision
     assert tried.insert(far(1e9)) == "diverged"  # beyond 1e8 it is tried on a copy
-    assert (tried.estimate(), tried.folder.revision) == (before, revision)
+    assert (tried.estimate(), tried.map_solver.revision) == (before, revision)
     for x in (1.0, 2.0):
         assert (tried.insert(near(x)), other.insert(near(x))) == ("accepted", "accepted")
         assert tried.estimate() == other.estimate()
-    assert tried.folder.chi2() == other.folder.chi2()
+    assert tried.map_solver.chi2() == other.map_solver.chi2()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -145,10 +145,10 @@ def test_a_step_that_diverges_from_usual_numbers_is_undone(mode: str) -> None:
 def test_of_several_inserts_only_the_guilty_is_refused(mode: str) -> None:
     tried = start(mode)
     arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0))]
-    events, _ = tried.folder.apply_whole(arrived)
+    events, _ = tried.map_solver.apply_whole(arrived)
     answers = [o.answer for e in events if isinstance(e, Verdict) for o in e.outcomes]
     assert [getattr(answer, "code", "accepted") for answer in answers] == ["accepted", "diverged", "accepted"]
-    estimate = tried.folder.snapshot([Question("estimate")]).variables[0].values
+    estimate = tried.map_solver.snapshot([Question("estimate")]).variables[0].values
     np.testing.assert_allclose(estimate, [[2.0, 0.0]], atol=1e-6)
 
 
@@ -184,7 +184,7 @@ def test_the_reported_case_is_refused_by_name() -> None:
         ),
     )
     assert tried.insert(batch) == "out_of_bounds"
-    assert tried.folder.size == (1, 0)
+    assert tried.map_solver.size == (1, 0)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -192,9 +192,9 @@ def test_run_again_from_a_journal_it_comes_to_the_same_bits(mode: str) -> None:
     tried, again = start(mode), start(mode)
     arrived = [tried.arrived(batch) for batch in (near(1.0), far(9e7), near(3.0), far(1e9), near(2.0))]
     for one in arrived:
-        events, _ = tried.folder.apply_whole([one])
+        events, _ = tried.map_solver.apply_whole([one])
         assert not any(event.rebuilt for event in events if isinstance(event, Stepped)), "no fault of the solver"
-        list(again.folder.apply_again([one], rebuilt=False))
-        assert (tried.folder.revision, tried.folder.size) == (again.folder.revision, again.folder.size)
+        list(again.map_solver.apply_again([one], rebuilt=False))
+        assert (tried.map_solver.revision, tried.map_solver.size) == (again.map_solver.revision, again.map_solver.size)
         assert tried.estimate() == again.estimate()
-    assert tried.folder.size == (1, 4)
+    assert tried.map_solver.size == (1, 4)

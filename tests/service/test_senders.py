@@ -24,7 +24,7 @@ class Declared:
 
 
 def settle(control: SerialExecutor) -> None:
-    """Return when the control is done with what it has."""
+    """Return when the control thread is done with what it has."""
     reached = threading.Event()
     control.hand(reached.set)
     assert reached.wait(10)

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.jit.simd import LANES, add_run, six, solve_rows, t
 from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, padded, update_row, update_size
 from factorbus.solver.kernels.sparse.panels import DEPTH
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
-from factorbus.solver.sparse.lending import TASK_QUEUE
+from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
 
 @given(st.integers(1, 40), st.integers(0, 40), st.integers(0, 2**32 - 1))

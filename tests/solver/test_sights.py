@@ -89,7 +89,7 @@ def test_every_step_is_the_dense_optimum(seed: int, mode: str) -> None:
         twin.put(solver.estimate())
         assert report.chi2 == pytest.approx(twin.chi2(), rel=1e-7)
         assert twin.gauss_newton(iterations=2) < 1e-7
-        assert report.asleep == 0
+        assert report.inactive == 0
         for group in solver.estimate():
             for key, value in zip(group.keys.tolist(), group.values, strict=True):
                 assert distance(group.kind, value, twin.values[key]) < 1e-6
@@ -215,13 +215,13 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     """A strong prior pulls a point behind the camera that saw it."""
     solver = Solver(Options(mode=mode))
     solver.stage(point_batch(measurement("point_seen", PINHOLE, CENTRE)))
-    assert solver.step(settle=True).asleep == 0
-    assert solver.asleep() == []
+    assert solver.step(settle=True).inactive == 0
+    assert solver.inactive() == []
     solver.stage(Batch((), (Factors("prior_point3", np.array([[P]]), BEHIND[None], 1e6 * unit(3)),)))
     solver.step()
     report = solver.step(settle=True)
-    assert report.asleep == 1
-    [(factor, text, why)] = solver.asleep()
+    assert report.inactive == 1
+    [(factor, text, why)] = solver.inactive()
     assert (factor, text) == (1, "point_seen (x0, p0)")
     assert "behind" in why
     weak, strong = np.array([0.0, 0, 2]), BEHIND
@@ -364,11 +364,11 @@ def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
     drive_past(solver)
     before = solver.step(settle=True)
     features = next(group for group in solver.estimate() if group.kind == "idp")
-    ripe = solver.ripe(0.1)
-    assert ripe.size > 0
-    assert set(ripe.tolist()) <= set(features.keys.tolist())
-    assert solver.ripe(1e9).size == 12
-    assert solver.ripe(0.0).size == 0
+    found = solver.convertible(0.1)
+    assert found.size > 0
+    assert set(found.tolist()) <= set(features.keys.tolist())
+    assert solver.convertible(1e9).size == 12
+    assert solver.convertible(0.0).size == 0
     made, report = solver.with_points(features.keys)
     settled = made.step(settle=True)
     assert (made.variable_count, made.factor_count) == (solver.variable_count, solver.factor_count)
@@ -405,11 +405,11 @@ def test_a_feature_with_a_linear_factor_stays_one() -> None:
     solver = Solver(Options())
     drive_past(solver)
     before = solver.step(settle=True)
-    assert solver.ripe(1e9).size == 12
+    assert solver.convertible(1e9).size == 12
     after, _, report, _ = solver.with_changes([Change("marginalize", keys=np.array([symbol("x", 0)]))], settle=True)
     assert sum(len(g.keys) for g in after.graph()[1] if g.kind == "linear_idp") == 12
     assert report.chi2 <= before.chi2 * (1 + 1e-9)
-    assert after.ripe(1e9).size == 0
+    assert after.convertible(1e9).size == 0
     with pytest.raises(errors.KindMismatch, match="linear factor"):
         after.with_points(np.array([symbol("f", 3)]))
 
@@ -430,5 +430,5 @@ def test_the_linearity_index_is_the_papers() -> None:
         p, sigma = dense_idp.point(y), np.sqrt(covariance[start + 5, start + 5])
         cosine = (p - last) @ dense_idp.direction(y) / np.linalg.norm(p - last)
         index = 4 * sigma / y[5] ** 2 * abs(cosine) / np.linalg.norm(p - last)
-        assert key in solver.ripe(index * 1.001).tolist()
-        assert key not in solver.ripe(index * 0.999).tolist()
+        assert key in solver.convertible(index * 1.001).tolist()
+        assert key not in solver.convertible(index * 0.999).tolist()

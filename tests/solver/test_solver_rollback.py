@@ -37,14 +37,14 @@ def loose_ends(rng: np.random.Generator) -> Batch:
 
 
 @settings(max_examples=40)
-@given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6), record=st.integers(1, 3))
-def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], record: int) -> None:
+@given(seed=st.integers(0, 2**32 - 1), refuse=st.lists(st.booleans(), min_size=6, max_size=6), fold=st.integers(1, 3))
+def test_refused_steps_leave_no_trace(seed: int, refuse: list[bool], fold: int) -> None:
     rng = np.random.default_rng(seed)
     tried, spared = Solver(BATCH), Solver(BATCH)
     for n, batch in enumerate(random_steps(seed, steps=6)):
         tried.stage(batch)
         spared.stage(batch)
-        if n % record == 0:
+        if n % fold == 0:
             assert tried.step().as_dict() == spared.step().as_dict()
         elif refuse[n]:
             tried.step()

@@ -12,7 +12,7 @@ from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.factors import LENS_AT
 from factorbus.solver.kernels.jit.compile import DISABLED
 from factorbus.solver.lenses.layout import LIMIT
-from factorbus.solver.report import CompileSplit
+from factorbus.solver.report import PhaseShares
 
 TIGHT = {"batch_tolerance": 0.0, "incremental_tolerance": 0.0, "chi2_epsilon": 1e-20, "max_iterations": 100}
 
@@ -224,8 +224,8 @@ def test_many_factors_are_staged_in_compiled_loops() -> None:
 
 
 def test_shares_of_a_total() -> None:
-    shares = CompileSplit(("order", "eliminate"), [1, 3], 8.0)
+    shares = PhaseShares(("order", "eliminate"), [1, 3], 8.0)
     assert shares == {"order": 2.0, "eliminate": 6.0}
-    assert CompileSplit(("order",), [0], 0.0) == {"order": 0.0}
+    assert PhaseShares(("order",), [0], 0.0) == {"order": 0.0}
     with pytest.raises(KeyError):
         shares["commit"]

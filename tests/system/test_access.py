@@ -161,7 +161,7 @@ TRIALS: dict[str, tuple[Callable[[Identity], bool], tuple[str, ...]]] = {
     "read the bus's own records": (lambda me: me.answered("@/**"), ()),
     **{
         f"forge {channel} of kitchen": (lambda me, channel=channel: me.published(f"map/kitchen/out/{channel}"), ())
-        for channel in ("delta", "keyframe", "event")
+        for channel in ("delta", "snapshot", "event")
     },
     "put an insert": (lambda me: me.published("map/kitchen/in/robot1-1"), ()),
     "follow kitchen": (lambda me: me.hears("map/kitchen/out/delta"), ("robot1", "robot2", "wall", "ops")),

@@ -48,7 +48,7 @@ def test_what_no_camera_can_see_is_refused_and_losses_travel(endpoint: str) -> N
         draft.prior_point3("p0", (0, 0, 4), sigmas=(1, 1, 1))
         draft.point_seen("x0", "p0", camera, (380, 260), sigmas=(1, 1), loss=("huber", 1.5))
         accepted = joined.insert(draft)
-        assert accepted.report["asleep"] == 0
+        assert accepted.report["inactive"] == 0
         [group] = [group for group in joined.graph().batch.factors if group.loss]
         assert (group.kind, group.loss, group.scale.tolist()) == ("point_seen", "huber", [1.5])
         behind = Draft().point3("p1", (0, 0, -4)).prior_point3("p1", (0, 0, -4), sigmas=(1, 1, 1))

@@ -88,9 +88,9 @@ def test_ids_in_the_graph_are_what_changes_and_why_call_factors_by(square: Map) 
     assert ids == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10]
     robust = [group for group in groups if group.loss]
     assert [(g.loss, g.ids.tolist(), g.scale.tolist()) for g in robust] == [("huber", [6], [1.5])]
-    assert square.doubt.why(factor=5).factor["factor"] == 5
+    assert square.uncertainty.why(factor=5).factor["factor"] == 5
     with pytest.raises(Refused, match="removed"):
-        square.doubt.why(factor=4)
+        square.uncertainty.why(factor=4)
     batch = square.insert(Draft().between_se2("x0", "x7", (0, 0, 0), sigmas=SIGMAS))
     assert batch.first_factor == 11
 

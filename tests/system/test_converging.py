@@ -17,7 +17,7 @@ from factorbus.client import Bus, Draft, Map, aio, connect
 from factorbus.journal.records import JournalRecord
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
-from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.library import make_map_solver
 from factorbus.service.journal.recovery import verify
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
@@ -150,7 +150,7 @@ def test_while_it_goes_on_it_says_so_and_answers_of_its_latest_revision(
         answers = []
         while joined.estimate.converging:
             known = joined.estimate.revision
-            answers.append((known, joined.chi2(), joined.doubt.last()))
+            answers.append((known, joined.chi2(), joined.uncertainty.last()))
             asked += 1
         assert asked > 3
         joined.wait_converged(PATIENCE_S)
@@ -227,7 +227,7 @@ def again(journal: Path) -> list[tuple[JournalRecord, bool]]:
     store = open_store(journal, read_only=True)
     try:
         header = store.header()
-        return list(verify(store, make_folder(header.mode, header.options, header.epoch, Limits())))
+        return list(verify(store, make_map_solver(header.mode, header.options, header.epoch, Limits())))
     finally:
         store.close()
 

@@ -11,7 +11,7 @@ from processes import PATIENCE_S
 from factorbus.client import connect
 from factorbus.journal.store import open_store
 from factorbus.service.config import Limits
-from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.library import make_map_solver
 from factorbus.service.journal.recovery import verify
 from factorbus.service.process.worker_threads import core_count
 from factorbus.simulate import manhattan
@@ -42,7 +42,7 @@ def test_what_was_made_on_several_cores_is_what_one_core_makes(
     store = open_store(tmp_path / "journal" / "m2", read_only=True)
     try:
         header = store.header()
-        folder = make_folder(header.mode, header.options, header.epoch, Limits())
-        assert all(same for _, same in verify(store, folder)), "here nobody lends a core"
+        folder = make_map_solver(header.mode, header.options, header.epoch, Limits())
+        assert all(same for _, same in verify(store, folder)), "here there is no worker thread"
     finally:
         store.close()

@@ -22,7 +22,7 @@ from factorbus.journal.store import open_store
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import BadName, UnknownMap
 from factorbus.service.config import Limits
-from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.library import make_map_solver
 
 SIGMAS = (0.1, 0.1, 0.02)
 
@@ -193,7 +193,7 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
 
 
 def test_a_fork_for_which_there_is_no_memory_takes_none() -> None:
-    folder = make_folder("bayes-tree", {}, 7, Limits())
+    folder = make_map_solver("bayes-tree", {}, 7, Limits())
     assert folder._copied(0).bytes > 0
     assert folder._copied(0).state is None
     assert folder._copied(1 << 40).state is not None

@@ -70,11 +70,11 @@ def test_it_refuses_before_the_limit_and_takes_again_after_a_drop(tmp_path: Path
         before = resident(account["pid"])
         for count, code in ((1000, "out_of_memory"), (4000, "too_large"), (1_000_000, "too_large")):
             with pytest.raises(Refused) as no_room:
-                first.doubt.joint(np.arange(count) % 3000)  # keys, some of them again and again
+                first.uncertainty.joint(np.arange(count) % 3000)  # keys, some of them again and again
             assert no_room.value.code == code
             assert no_room.value.detail["size"] > no_room.value.detail["limit"]
         assert resident(account["pid"]) < before + (64 << 20), "nothing was allocated for what is refused"
-        assert first.doubt.joint([0, 1]).shape == (6, 6)
+        assert first.uncertainty.joint([0, 1]).shape == (6, 6)
         bus.drop("first")
         with bus.map("second", mirror=False) as second:
             again, _ = fill(second)

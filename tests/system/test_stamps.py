@@ -68,8 +68,8 @@ def test_every_reader_has_the_stamps_that_came_in(
     some = joined.ask_estimate(["x4", "x3", "l1"]).variables
     assert stamps(some) == {"x4": T0 + 4, "l1": -1}
     assert [group.stamps for group in joined.ask_estimate("x3").variables] == [None]
-    assert joined.doubt.why("x4").variable["stamp"] == T0 + 4
-    assert "stamp" not in joined.doubt.why("x3").variable
+    assert joined.uncertainty.why("x4").variable["stamp"] == T0 + 4
+    assert "stamp" not in joined.uncertainty.why("x3").variable
     for key, said in (("x4", True), ("x3", False)):
         assert main(["ask", "why", joined.name, key, "--connect", endpoint]) == 0
         assert (f"{T0 + 4} ns" in capsys.readouterr().out) == said

@@ -89,7 +89,7 @@ def traffic(robot: Map, other: Map, kill: int, wanted: dict[str, int]) -> list[i
         passed.append(accepted.revision - before - 1)
         wanted[name] = stamp
         assert robot.chi2().revision >= accepted.revision
-        robot.doubt.covariance([name])
+        robot.uncertainty.covariance([name])
         if n % 2:
             robot.change(Changes().undo(step, accepted))
             del wanted[name]

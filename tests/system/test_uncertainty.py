@@ -78,38 +78,38 @@ def test_covariances_are_those_of_the_solver(square: tuple[Map, Solver]) -> None
         (v,) = index(twin, name)
         d = 2 if name[0] == "l" else 3
         np.testing.assert_allclose(every[name], blocks.diagonal()[v, :d, :d], rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(joined.doubt.covariance([name])[name], every[name], rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(joined.uncertainty.covariance([name])[name], every[name], rtol=1e-6, atol=1e-12)
     assert not every["x0"].any()
-    assert joined.doubt.last().groups[0].keys.tolist() == [symbol("x", 8)]
+    assert joined.uncertainty.last().groups[0].keys.tolist() == [symbol("x", 8)]
     names = ["l3", "x2", "x0", "x7"]
     joint = blocks.joint(index(twin, *names))
-    np.testing.assert_allclose(joined.doubt.joint(names), joint, rtol=1e-6, atol=1e-10)
-    np.testing.assert_allclose(joined.doubt.cross(names[:2], names[2:]), joint[:5, 5:], rtol=1e-6, atol=1e-10)
-    pair = joined.doubt.relative([("x2", "x7"), ("x7", "l3")])
+    np.testing.assert_allclose(joined.uncertainty.joint(names), joint, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(joined.uncertainty.cross(names[:2], names[2:]), joint[:5, 5:], rtol=1e-6, atol=1e-10)
+    pair = joined.uncertainty.relative([("x2", "x7"), ("x7", "l3")])
     assert {group.kind for group in pair.groups} == {"se2", "point2"}
     assert all(group.values is not None and len(group.values) == 1 for group in pair.groups)
 
 
 def test_candidates_are_gated_and_weighed(square: tuple[Map, Solver]) -> None:
     joined, twin = square
-    right = joined.doubt.relative([("x2", "x6")]).groups[0].values
+    right = joined.uncertainty.relative([("x2", "x6")]).groups[0].values
     assert right is not None
     draft = Draft().between_se2("x2", "x6", tuple(right[0]), sigmas=SIGMAS)
     draft.between_se2("x2", "x6", (right[0][0] + 3.0, *right[0][1:]), sigmas=SIGMAS)
-    found, gain = joined.doubt.gate(draft), joined.doubt.gain(draft)
+    found, gain = joined.uncertainty.gate(draft), joined.uncertainty.gain(draft)
     assert found.plausible.tolist() == [True, False]
     assert found.dims.tolist() == [3, 3]
     wanted = judge_candidates(Blocks(twin.covariances.factored()), draft.batch().factors)
     np.testing.assert_allclose(found.distance, wanted.distance, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(gain.gain, wanted.gain, rtol=1e-6)
     many = Batch(factors=tuple(draft.batch().factors) * 40)  # no longer between two steps
-    np.testing.assert_allclose(joined.doubt.gate(many).distance[:2], found.distance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(joined.uncertainty.gate(many).distance[:2], found.distance, rtol=1e-6, atol=1e-9)
 
 
 def test_sightings_are_associated(square: tuple[Map, Solver]) -> None:
     joined, _ = square
-    seen = [joined.doubt.relative([("x8", name)]).groups[0].values[0] for name in ("l3", "l1")]
-    found = joined.doubt.associate("x8", "landmark_se2", [*seen, [50.0, 50.0]], information=np.diag([25.0, 25.0]))
+    seen = [joined.uncertainty.relative([("x8", name)]).groups[0].values[0] for name in ("l3", "l1")]
+    found = joined.uncertainty.associate("x8", "landmark_se2", [*seen, [50.0, 50.0]], information=np.diag([25.0, 25.0]))
     assert found.matched.tolist() == [True, True, False]
     assert found.landmarks[:2].tolist() == [symbol("l", 3), symbol("l", 1)]
     assert found.complete
@@ -118,11 +118,11 @@ def test_sightings_are_associated(square: tuple[Map, Solver]) -> None:
 
 def test_why(square: tuple[Map, Solver]) -> None:
     joined, _ = square
-    account = joined.doubt.why("l1")
+    account = joined.uncertainty.why("l1")
     assert account.variable["kind"] == "point2"
     assert {factor["kind"] for factor in account.variable["factors"]} == {"landmark_se2"}
     assert account.step["because"]
-    factor = joined.doubt.why(factor=account.variable["factors"][0]["factor"]).factor
+    factor = joined.uncertainty.why(factor=account.variable["factors"][0]["factor"]).factor
     first = account.variable["factors"][0]
     assert factor.keys() == first.keys()
     assert (factor["kind"], factor["keys"], factor["chi2"]) == (first["kind"], first["keys"], first["chi2"])
@@ -133,28 +133,28 @@ def test_why(square: tuple[Map, Solver]) -> None:
 def test_refusals_carry_their_codes(square: tuple[Map, Solver], named: list[str]) -> None:
     joined, _ = square
     with pytest.raises(Refused, match="x77") as refused:
-        joined.doubt.covariance(named)
+        joined.uncertainty.covariance(named)
     assert refused.value.code == "unknown_variable"
     with pytest.raises(Refused) as refused:
-        joined.doubt.relative([("l1", "x1")])
+        joined.uncertainty.relative([("l1", "x1")])
     assert refused.value.code == "kind_mismatch"
     with pytest.raises(Refused) as refused:
-        joined.doubt.why(factor=999)
+        joined.uncertainty.why(factor=999)
     assert refused.value.code == "unknown_factor"
     with pytest.raises(Refused) as refused:
-        joined.doubt.gate(Draft().between_se2("x1", "x99", (1, 0, 0), sigmas=SIGMAS))
+        joined.uncertainty.gate(Draft().between_se2("x1", "x99", (1, 0, 0), sigmas=SIGMAS))
     assert refused.value.code == "unknown_variable"
     with pytest.raises(Refused) as refused:
-        joined.doubt.gate(Draft().between_se2("x1", "x2", (1, 0, 0), sigmas=SIGMAS), probability=1.5)
+        joined.uncertainty.gate(Draft().between_se2("x1", "x2", (1, 0, 0), sigmas=SIGMAS), probability=1.5)
     assert refused.value.code == "bad_option"
 
 
 def test_an_empty_map_has_no_last_pose(endpoint: str) -> None:
     with connect(endpoint, client="asker") as bus, bus.map("empty", "bayes-tree") as empty:
         with pytest.raises(Refused) as refused:
-            empty.doubt.last()
+            empty.uncertainty.last()
         assert refused.value.code == "unknown_variable"
-        assert empty.doubt.covariance().groups == ()
+        assert empty.uncertainty.covariance().groups == ()
 
 
 def test_asyncio_asks_the_same(endpoint: str, square: tuple[Map, Solver]) -> None:
@@ -166,21 +166,21 @@ def test_asyncio_asks_the_same(endpoint: str, square: tuple[Map, Solver]) -> Non
             bus.map(joined.name, joined.mode, mirror=False) as same,
         ):
             every, joint, cross, pair, why = await asyncio.gather(
-                same.doubt.covariance(["x3"]),
-                same.doubt.joint(["x3", "l1"]),
-                same.doubt.cross(["x3"], ["l1"]),
-                same.doubt.relative([("x3", "l1")]),
-                same.doubt.why("x3"),
+                same.uncertainty.covariance(["x3"]),
+                same.uncertainty.joint(["x3", "l1"]),
+                same.uncertainty.cross(["x3"], ["l1"]),
+                same.uncertainty.relative([("x3", "l1")]),
+                same.uncertainty.why("x3"),
             )
             np.testing.assert_allclose(joint[:3, :3], every["x3"], rtol=1e-6, atol=1e-12)
             np.testing.assert_allclose(cross, joint[:3, 3:], rtol=1e-6, atol=1e-12)
             assert pair.groups[0].covariance.shape == (1, 2, 2)
             assert why.variable["kind"] == "se2"
-            assert (await same.doubt.last()).groups[0].kind == "se2"
+            assert (await same.uncertainty.last()).groups[0].kind == "se2"
             draft = Draft().between_se2("x3", "x5", (1, 0, 0), sigmas=SIGMAS)
-            gate, gain = await asyncio.gather(same.doubt.gate(draft), same.doubt.gain(draft))
+            gate, gain = await asyncio.gather(same.uncertainty.gate(draft), same.uncertainty.gain(draft))
             assert gate.distance.size == gain.gain.size == 1
-            found = await same.doubt.associate("x3", "landmark_se2", [[1.0, 1.0]], information=np.eye(2))
+            found = await same.uncertainty.associate("x3", "landmark_se2", [[1.0, 1.0]], information=np.eye(2))
             assert found.matched.size == 1
 
     asyncio.run(asked())

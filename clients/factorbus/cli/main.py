@@ -92,7 +92,7 @@ def cli(debug: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """InsertBatch the command line; returns the exit code, and never shows a traceback unless asked to."""
+    """Run the command line; returns the exit code, and never shows a traceback unless asked to."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments or bool(os.environ.get("FACTORBUS_DEBUG"))
     try:

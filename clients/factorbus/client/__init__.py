@@ -7,16 +7,15 @@
 `factorbus.client.aio` is the same for asyncio.  Light: numpy, msgpack and zenoh, no compiler.
 """
 
-from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
-
 from factorbus.client.bus import Bus, connect
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features, Growing
-from factorbus.client.grown import Factored, Grown
+from factorbus.client.filter_state import Factored, Grown
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
 from factorbus.client.mirror import Mirror, Snapshot
+from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 
@@ -40,10 +39,10 @@ __all__ = [
     "NoAnchor",
     "NoAnswerYet",
     "NotConverged",
+    "PendingInsert",
     "Problem",
     "Refused",
     "Snapshot",
-    "PendingInsert",
     "Unavailable",
     "connect",
 ]

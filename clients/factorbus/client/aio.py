@@ -17,7 +17,6 @@ from contextlib import asynccontextmanager
 from os import PathLike
 from typing import Any
 
-from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
@@ -26,12 +25,13 @@ from factorbus.client.arguments import of_type, seconds
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
-from factorbus.client.grown import Factored, Grown
+from factorbus.client.filter_state import Factored, Grown
 from factorbus.client.key_numbers import Key
 from factorbus.client.map import Map as SyncMap
 from factorbus.client.map import MapRow
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
+from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
 from factorbus.client.questions import logged
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
@@ -130,7 +130,8 @@ class Map:
         self._map = joined
         self._room = asyncio.Semaphore(window)
         self._loop = asyncio.get_running_loop()
-        self.doubt = Uncertainty(joined.doubt.ask)
+        self.uncertainty = Uncertainty(joined.uncertainty.ask)
+        self.marginals = self.uncertainty
 
     @property
     def name(self) -> str:

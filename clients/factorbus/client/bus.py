@@ -6,13 +6,12 @@ from numbers import Integral
 from os import PathLike
 from typing import Any
 
-from factorbus.client.sender import Request, RequestSender
-
 from factorbus.client.arguments import flag, of_type, seconds
 from factorbus.client.features import Features
-from factorbus.client.gathering import gather
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import SUFFIX_LENGTH, Map, MapRow
+from factorbus.client.query_all import query_all
+from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, fields, keys
 from factorbus.proto.camera import Camera
 from factorbus.proto.fields import read_map
@@ -114,7 +113,7 @@ class Bus:
 
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
         """The maps there are: of the service, or at a router of all services.  Raises Refused, Unavailable."""
-        told = gather(self._link, "maps", seconds("timeout_s", timeout_s, self.timeout_s))
+        told = query_all(self._link, "maps", seconds("timeout_s", timeout_s, self.timeout_s))
         return [row for each in told for row in _rows(each)]
 
     def stats(self, timeout_s: float | None = None) -> list[dict[str, Any]]:
@@ -122,7 +121,7 @@ class Bus:
 
         Raises Refused, Unavailable.
         """
-        told = gather(self._link, "stats", seconds("timeout_s", timeout_s, self.timeout_s))
+        told = query_all(self._link, "stats", seconds("timeout_s", timeout_s, self.timeout_s))
         return [codec.decode_map(each) for each in told]
 
     def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from factorbus.client.arguments import flag, of_type
 from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
+from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_pieces
-from factorbus.client.mounted import transform_se2, transform_se3
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -100,7 +100,7 @@ class Draft:
 
         mount: where on the robot the sensor is, x y theta, if it has measured its own way rather than the robot's: one
         off the centre moves sideways when the robot turns.  The certainty is that of the sensor, in its frame, and is
-        carried over to first order in the error (`factorbus.client.mounted`, MATH §3.7).
+        carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
         """
         if mount is not None:
             where = self._between(first, second, "between_se2")

@@ -13,13 +13,13 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 
 import numpy as np
-from factorbus.client.pool import SharedAllocation, SharedMemoryPool
-from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import seconds
-from factorbus.client.grown import Factored, Grown, factored, grown
+from factorbus.client.filter_state import Factored, Grown, factored, grown
 from factorbus.client.link import Link
+from factorbus.client.request_sender import Request, RequestSender
+from factorbus.client.shared_memory_pool import SharedAllocation, SharedMemoryPool
 from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import keys
 from factorbus.proto.arrays import F64
@@ -61,7 +61,7 @@ class Features:
         self._pool = SharedMemoryPool()
         self._shared = True  # until an answer shows that nobody there shares memory with us
         self._stack = ExitStack()
-        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._services: set[str] = set()
         self._stack.enter_context(link.watching(keys.any_features_token(), self._see))
@@ -85,11 +85,11 @@ class Features:
         state, covariance = _matching(x, P)
         sighting = self._sighting(state, covariance, pixels)
         m, n = sighting.width, sighting.count
-        lent = None
+        allocation = None
         if self._shared and rows_size(n, m) >= _SHARED_FROM_BYTES:
-            lent = self._pool.try_allocate(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
-        ask = Ask(sighting, "rows", lent.segment) if lent else Ask(sighting, "half")
-        return Growing(self, state, covariance, ask, lent, self._ask(ask, timeout_s))
+            allocation = self._pool.try_allocate(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
+        ask = Ask(sighting, "rows", allocation.segment) if allocation else Ask(sighting, "half")
+        return Growing(self, state, covariance, ask, allocation, self._ask(ask, timeout_s))
 
     def factor(self, x: ArrayLike, P: ArrayLike, pixels: ArrayLike, timeout_s: float | None = None) -> Factored:
         """The new features as factors: O(m + n) numbers, from which any block of the covariance is formed on demand.
@@ -105,10 +105,10 @@ class Features:
         self._stack.close()
         self._pool.close()
 
-    def settle(self, lent: SharedAllocation, clean: bool, stored: bool) -> None:
+    def settle(self, allocation: SharedAllocation, clean: bool, stored: bool) -> None:
         """For Growing: what became of the memory of an answer."""
         self._shared &= stored
-        self._pool.settle(lent, clean)
+        self._pool.settle(allocation, clean)
 
     def again_without_memory(self, ask: Ask, timeout_s: float | None = None) -> Request:
         """For Growing: the same question, for somebody who shares no memory with us."""
@@ -155,9 +155,9 @@ class Growing:
     """A filter's growth that is on its way."""
 
     def __init__(
-        self, features: Features, x: F64, P: F64, ask: Ask, lent: SharedAllocation | None, request: Request
+        self, features: Features, x: F64, P: F64, ask: Ask, allocation: SharedAllocation | None, request: Request
     ) -> None:
-        self._features, self._x, self._P, self._ask, self._lent = features, x, P, ask, lent
+        self._features, self._x, self._P, self._ask, self._allocation = features, x, P, ask, allocation
         self._request = request
         self._result: Grown | None = None
 
@@ -176,26 +176,26 @@ class Growing:
         try:
             answer = self._request.future.result()
         except Refused as refused:
-            if self._lent is None or refused.code != "too_large":
+            if self._allocation is None or refused.code != "too_large":
                 self._settle(clean=False, stored=True)
                 raise
             # Nobody there could store it, and as rows it is too large to send; as the upper half it may not be.
             self._settle(clean=False, stored=False)
-            self._lent = None
+            self._allocation = None
             answer = self._features.again_without_memory(self._ask).future.result()
         except BaseException:
             self._settle(clean=False, stored=True)
             raise
-        matrix = self._lent.matrix if self._lent else None
+        matrix = self._allocation.matrix if self._allocation else None
         result = grown(self._x, self._P, self._ask.sighting, answer, matrix)
         stored = all(done.shard.stored for done in answer.shards)
         self._settle(clean=answer.clean and self._request.attempt == 1, stored=stored)
         return result
 
     def _settle(self, clean: bool, stored: bool) -> None:
-        lent, self._lent = self._lent, None
-        if lent is not None:
-            self._features.settle(lent, clean, stored)
+        allocation, self._allocation = self._allocation, None
+        if allocation is not None:
+            self._features.settle(allocation, clean, stored)
 
 
 def _matching(x: ArrayLike, P: ArrayLike) -> tuple[F64, F64]:

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any
 
-from factorbus.client.pending_insert import PendingInsert
-from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import flag, of_type, seconds
@@ -22,7 +20,9 @@ from factorbus.client.key_numbers import Key
 from factorbus.client.link import Link
 from factorbus.client.merging import Merged, fit_into
 from factorbus.client.mirror import Mirror
+from factorbus.client.pending_insert import PendingInsert
 from factorbus.client.questions import Questions, logged
+from factorbus.client.request_sender import Request, RequestSender
 from factorbus.client.supported import check_changes, check_stamps
 from factorbus.client.uncertainty import Uncertainty, UncertaintyQuestions
 from factorbus.client.window import Window
@@ -70,7 +70,7 @@ class Map:
     link.  They belong to the epoch that was joined: if the map is created anew (service restarted, map dropped),
     they are refused with wrong_epoch until `rejoin`; the mirror follows the new map by itself.
 
-    doubt: what the map can be asked about its uncertainty.
+    uncertainty, marginals: what the map can be asked about its uncertainty.
     """
 
     def __init__(
@@ -86,13 +86,14 @@ class Map:
         self._size, self._join = window, join
         self._stack, self._presence = ExitStack(), ExitStack()
         self._mirror: Mirror | None = None
-        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._sending = threading.Lock()
         self._closed = False
         self._enter(join())
         self.ask = Questions(sender, self.name, timeout_s)
-        self.doubt = Uncertainty(UncertaintyQuestions(sender, self.name, timeout_s))
+        self.uncertainty = Uncertainty(UncertaintyQuestions(sender, self.name, timeout_s))
+        self.marginals = self.uncertainty
 
     def __enter__(self) -> Map:
         return self

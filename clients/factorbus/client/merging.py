@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from factorbus.client.transform_linear import is_relative, says_nothing
 from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft, batch_of
@@ -24,7 +23,8 @@ from factorbus.client.frames import (
     inverse,
     moved_values,
 )
-from factorbus.client.moved import transform_factors
+from factorbus.client.transform_factors import transform_factors
+from factorbus.client.transform_linear import is_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS

@@ -67,7 +67,7 @@ class Mirror:
     def __init__(self, link: Link, map_name: str, timeout_s: float) -> None:
         self._link, self._map, self._timeout_s = link, map_name, timeout_s
         self._following = Following()
-        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._callbacks: list[Callable[[Delta], None]] = []
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
@@ -197,7 +197,7 @@ class Mirror:
         """Subscribe, then ask; `stack` gets what ends it.  Returns when the estimate is here.  Raises Unavailable."""
         stack.callback(self._stop)
         self._thread.start()
-        for key, word in ((keys.delta_key(self._map), "delta"), (keys.snapshot_key(self._map), "keyframe")):
+        for key, word in ((keys.delta_key(self._map), "delta"), (keys.snapshot_key(self._map), "snapshot")):
             stack.enter_context(self._link.listening(key, lambda data, word=word: self._hear(word, data)))
         self._inbox.put(("ask", None))
         self.wait_for(0)
@@ -281,7 +281,7 @@ class Mirror:
         match word:
             case "delta":
                 self._apply_delta(decode_delta(content))
-            case "keyframe":
+            case "snapshot":
                 self._adopt(content)
             case "estimate":
                 self._take_estimate(content)

@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-from factorbus.client.sender import Request, RequestSender
-
 from factorbus.client.arguments import flag, seconds
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
+from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.messages import Chi2, Estimate, Graph

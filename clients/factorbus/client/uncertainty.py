@@ -1,8 +1,8 @@
 """What a map can be asked about its uncertainty: how sure it is of what, and what it thinks of a measurement.
 
     with connect("tcp/127.0.0.1:7447", client="robot1") as bus, bus.map("hall") as hall:
-        hall.doubt.covariance(["x10"])["x10"]                      # 3 x 3, in the robot's own frame
-        hall.doubt.gate(Draft().between_se2("x3", "x40", (0, 0, 0), sigmas=(0.1, 0.1, 0.02))).plausible
+        hall.uncertainty.covariance(["x10"])["x10"]                      # 3 x 3, in the robot's own frame
+        hall.uncertainty.gate(Draft().between_se2("x3", "x40", (0, 0, 0), sigmas=(0.1, 0.1, 0.02))).plausible
 
 Covariances are in tangent spaces: of local increments, translation first, metres and radians.  No compiler and no scipy
 is needed here.
@@ -15,12 +15,12 @@ from concurrent.futures import Future
 from typing import Any, TypeVar
 
 import numpy as np
-from factorbus.client.sender import Request, RequestSender
 from numpy.typing import ArrayLike
 
 from factorbus.client.arguments import of_type, seconds
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
+from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import asking_codec, keys
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import (

@@ -151,7 +151,7 @@ async def _export(maps: JoinedMaps, request: Request) -> Response:
 async def _variable(maps: JoinedMaps, request: Request) -> Response:
     key = parse_symbol(request.path_params["key"])
     async with maps.using(request.path_params["name"]) as joined:
-        why = await asyncio.wrap_future(joined.map.doubt.ask.why(AskWhy(key), None))
+        why = await asyncio.wrap_future(joined.map.uncertainty.ask.why(AskWhy(key), None))
     return Document(explain(why))
 
 

@@ -58,7 +58,7 @@ class JoinedMaps:
             variables = snapshot.variables()
             if have is None or (have.epoch, have.revision) != (snapshot.epoch, snapshot.revision):
                 keys = chosen(variables, _ELLIPSES).tolist()
-                asked = joined.map.doubt.ask.covariance("diagonal", keys, None, None)
+                asked = joined.map.uncertainty.ask.covariance("diagonal", keys, None, None)
                 joined.covariances = have = await asyncio.wrap_future(asked)
         return have.revision, spread_of(variables, blocks_of(have))
 

@@ -150,9 +150,9 @@ class FrontEnd:
         return None if _is_empty(draft) else draft
 
     def _use_what_waited(self, draft: Draft) -> None:
-        ripe = [each for each in self._waiting if each[0] <= self.stamp_ns]
+        due = [each for each in self._waiting if each[0] <= self.stamp_ns]
         self._waiting = deque((each for each in self._waiting if each[0] > self.stamp_ns), _WAITING)
-        for stamp_ns, topic, message in ripe:
+        for stamp_ns, topic, message in due:
             try:
                 self._use(draft, stamp_ns, topic, message)
             except BadRosMessage as bad:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 
 import numpy as np
-from factorbus.viz.rate_limited import RateLimited
 
 from factorbus.client import Map
 from factorbus.proto.arrays import F64, I64
@@ -15,6 +14,7 @@ from factorbus.proto.asking import Covariances
 from factorbus.proto.messages import Variables
 from factorbus.viz.ellipses import Spread, spread_of
 from factorbus.viz.geometry import POSITION
+from factorbus.viz.rate_limit import RateLimited
 
 _LETTER_BITS = 56
 _NOBODY = Covariances(0, 0, "diagonal", ())
@@ -59,7 +59,7 @@ class MapCertainty:
 
     def _ask(self) -> Future[Covariances]:
         keys = chosen(self._variables, self._most)
-        return self._map.doubt.ask.covariance("diagonal", keys.tolist(), None, None)
+        return self._map.uncertainty.ask.covariance("diagonal", keys.tolist(), None, None)
 
 
 def _placed(group: Variables, prefix: str) -> I64:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from factorbus.viz.follower import Look
 
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta
@@ -20,6 +19,7 @@ from factorbus.viz import style
 from factorbus.viz.closures import closures_of, colours_of
 from factorbus.viz.ellipses import outlines
 from factorbus.viz.geometry import Track, points_of, rays_of, segments_of, track_of, view_of
+from factorbus.viz.map_follower import Look
 from factorbus.viz.viewer_process import Viewer
 
 _LETTER_BITS = 56

@@ -22,7 +22,6 @@ from typing import Any
 
 import foxglove
 import numpy as np
-from factorbus.viz.follower import Look
 from foxglove import messages as fox
 from foxglove.channels import FrameTransformChannel, PosesInFrameChannel, SceneUpdateChannel
 
@@ -30,6 +29,7 @@ from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Delta, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, symbol_parts
+from factorbus.viz.map_follower import Look
 from factorbus.viz.mcap_scene import scene_of
 
 _BEYOND_NS = 2**32 * 10**9  # MCAP's seconds are 32 bits without a sign

@@ -3,13 +3,13 @@
 from typing import Any
 
 import numpy as np
-from factorbus.viz.follower import Look
 from foxglove import messages as fox
 
 from factorbus.proto.arrays import F64
 from factorbus.viz import style
 from factorbus.viz.closures import closures_of, colours_of
 from factorbus.viz.geometry import Track, points_of, track_of
+from factorbus.viz.map_follower import Look
 
 _LETTER_BITS = 56
 _PIXELS = 2.0

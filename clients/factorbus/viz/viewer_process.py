@@ -109,7 +109,7 @@ def _program() -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """InsertBatch Rerun's program with `arguments` until it ends or standard input closes; returns its exit code."""
+    """Run Rerun's program with `arguments` until it ends or standard input closes; returns its exit code."""
     program = subprocess.Popen(
         [_program(), *arguments], stdin=subprocess.DEVNULL, env=os.environ | {"RERUN_APP_ONLY": "true"}
     )

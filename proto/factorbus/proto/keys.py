@@ -2,7 +2,7 @@
 
     factorbus/v1/map/<map>/in/<client>                  query        an insert
     factorbus/v1/map/<map>/ask/<question>               query        estimate, chi2, graph, ...: QUESTIONS
-    factorbus/v1/map/<map>/out/{delta,keyframe,event}   publication
+    factorbus/v1/map/<map>/out/{delta,snapshot,event}   publication
     factorbus/v1/map/<map>/live/{service,client}/<id>   liveliness token
     factorbus/v1/worker/<id>/job                        query
     factorbus/v1/worker/<id>/live/<slots>               liveliness token
@@ -70,7 +70,7 @@ def delta_key(map_name: str) -> str:
 
 def snapshot_key(map_name: str) -> str:
     """Where the whole estimate is published now and then."""
-    return f"{map_root(map_name)}/out/keyframe"
+    return f"{map_root(map_name)}/out/snapshot"
 
 
 def event_key(map_name: str) -> str:

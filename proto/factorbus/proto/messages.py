@@ -131,7 +131,7 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Values of variables at `revision`: all of them (answer to ask/estimate, keyframe) or those asked for."""
+    """Values of variables at `revision`: all of them (answer to ask/estimate, snapshot) or those asked for."""
 
     epoch: int
     revision: int

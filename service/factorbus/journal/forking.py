@@ -18,8 +18,8 @@ log = logging.getLogger(__name__)
 def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, Any], saved: Saved) -> None:
     """The journal in `source`, which may be at work, up to a record into `target`, which must not be there yet.
 
-    state: of the solver after that record, so that a restart is quick; saved: which record that is, and what the state is
-    of.  The inserts are there too.  All of it or nothing.
+    state: of the solver after that record, so that a restart is quick; saved: which record that is, and what the state
+    is of.  The inserts are there too.  All of it or nothing.
     Raises NoJournal, JournalDamaged, JournalVersion, JournalUnreadable, JournalFailed.
     """
     beside = target.with_name(f"{UNFINISHED}{target.name}")

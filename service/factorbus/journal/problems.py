@@ -82,7 +82,7 @@ class JournalVersion(Problem):
 
 
 class JournalDiffers(Problem):
-    """InsertBatch again, the journal gives something else than it says."""
+    """Run again, the journal gives something else than it says."""
 
     code = "journal_differs"
 

@@ -1,7 +1,7 @@
 """A journal's database: what is in its tables, and how it is written.
 
-Written by one process, and read by others at the same time (WAL).  One transaction takes in all records that wait for it
-(group commit); it is there after a crash wholly or not at all.
+Written by one process, and read by others at the same time (WAL).  One transaction takes in all records that wait for
+it (group commit); it is there after a crash wholly or not at all.
 """
 
 import json
@@ -141,7 +141,7 @@ class Store:
             return [self._sender(name, first_record, entries) for name, _ in reversed(names)]
 
     def counts(self) -> dict[str, int]:
-        """Folds, inserts, clients and bytes of all messages."""
+        """Records, inserts, clients and bytes of all messages."""
         with self._reading():
             (records,) = self._db.execute("SELECT COUNT(*) FROM record").fetchone()
             row = self._db.execute(
@@ -156,7 +156,7 @@ class Store:
             return [Saved(record, form, json.loads(build), *more) for record, form, build, *more in rows]
 
     def append(self, records: Sequence[JournalRecord]) -> None:
-        """Write `records` down: when this returns they are as safe as the durability promises.  Raises JournalFailed."""
+        """Write `records` down: when this returns they are as safe as the durability says.  Raises JournalFailed."""
         with self._writing():
             self._db.executemany(
                 "INSERT INTO record VALUES (?, ?, ?, ?)", [(f.number, f.revision, _kind(f), f.chain) for f in records]

@@ -1,16 +1,16 @@
 """The service at work: what comes over the bus goes to the maps, what they want done is done.
 
 threads   Zenoh's own      run the callbacks: read, judge (microseconds), hand over; one of them at a time may
-                           record an insert in instead, and send what comes of it, when that is soon done
+                           apply an insert instead, and send what comes of it, when that is soon done
           solver <map>     records and steps, and encodes what comes of it
           outbox           answers to inserts, and publications, in order
           refusals         of inserts and questions
-          control             maps that come and go, jobs for workers
+          control          maps that come and go, jobs for workers
           answers 0..3     answers to questions, which can be large
           computed 0, 1    answers to questions that take long to compute: covariances of many, repair, files
           in-place <kind>  jobs when there is no worker
           features         questions of filters: small ones done, large ones cut up and put together
-          core 1..         what lends its core to eliminations that take long
+          core 1..         worker threads of eliminations that take long
 """
 
 import logging
@@ -270,7 +270,7 @@ class Shell:
         else:
             ignore(query)
 
-    # ---- on the control, which sends nothing itself to whoever might not take it ---------------------------------------
+    # ---- on the control thread, which sends nothing itself to whoever might not take it -----------------------------
 
     def _administer(self, query: Asker) -> None:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)

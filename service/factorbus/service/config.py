@@ -40,7 +40,7 @@ class Limits:
     changes: int = 64  # inserts with changes of one client, admitted or parked, that have no answer yet
     questions: int = 256  # waiting for the solver to come to a revision
     remembered: int = 1024  # answers per client that a repeated sequence number gets again
-    record: int = 64  # inserts that one step takes in ...
+    step_inserts: int = 64  # inserts that one step takes in ...
     step_bytes: int = 4 << 20  # ... as long as they have no more bytes than so together
     unwritten: int = 1024  # inserts that the journal has yet to write before the solver gets more
     parked_s: float = 5.0  # how long an insert waits for the one before it
@@ -50,8 +50,8 @@ class Limits:
     insert_factors: int = 1_000_000
     variables: int = 20_000_000
     factors: int = 100_000_000
-    keyframe_steps: int = 1000  # a keyframe after so many steps ...
-    keyframe_bytes: int = 64 << 20  # ... or so many bytes of deltas
+    snapshot_steps: int = 1000  # a snapshot after so many steps ...
+    snapshot_bytes: int = 64 << 20  # ... or so many bytes of deltas
     jobs: int = 64  # batch optima being computed or waiting, in this service
     sessions: int = 1000  # connections to this service
     memory_bytes: int = 0  # of this process, before what would make maps grow is refused; 0: 4/5 of what there is

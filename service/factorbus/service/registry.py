@@ -1,6 +1,6 @@
 """The maps of a service: found on disk, made, dropped, each with its host and its place on the bus.
 
-Made and dropped on the control only, or before it has work; looked up from any thread.
+Made and dropped on the control thread only, or before it has work; looked up from any thread.
 """
 
 import logging
@@ -20,7 +20,7 @@ from factorbus.service.bus.zenoh_session import MapPlace, ServiceBus
 from factorbus.service.config import Config
 from factorbus.service.core.events import Asker, Read
 from factorbus.service.core.map_state import MapCore
-from factorbus.service.journal.library import CopiedAt, Kept, Library, make_folder, restored
+from factorbus.service.journal.library import CopiedAt, Kept, Library, make_map_solver, restored
 from factorbus.service.maps.host import Host
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.process.heap import give_back
@@ -67,8 +67,8 @@ class Maps:
     """All maps of one service.  named: of the service, in tokens."""
 
     def __init__(
-        self, bus: ServiceBus, config: Config, named: str, library: Library | None, delivery: Delivery, control: SerialExecutor,
-        memory: MemoryLimit,
+        self, bus: ServiceBus, config: Config, named: str, library: Library | None, delivery: Delivery,
+        control: SerialExecutor, memory: MemoryLimit,
     ) -> None:  # fmt: skip
         self._bus, self._config, self._service, self._library = bus, config, named, library
         self._delivery, self._control, self._memory = delivery, control, memory
@@ -232,16 +232,16 @@ class Maps:
         """mode: None for that of the map which is there.  Raises Problem."""
         return self._at_work(*self._begin(name, mode))
 
-    def _at_work(self, core: MapCore, folder: MapSolver, kept: Kept | None) -> OpenMap:
+    def _at_work(self, core: MapCore, map_solver: MapSolver, kept: Kept | None) -> OpenMap:
         name = core.name
-        folder.bound(Room(self._memory, self._config.limits.answer_bytes))
-        place, options = self._bus.place(name, self._service), folder.options()
+        map_solver.bound(Room(self._memory, self._config.limits.answer_bytes))
+        place, options = self._bus.place(name, self._service), map_solver.options()
 
         def more() -> dict[str, Any]:
             return {"options": options, **made.host.journal()}
 
         by = self._delivery.of_map(place, more, lambda: made.on_drained())
-        host = Host(core, folder, by.perform, by.send, by.answer_reads, self._inline_run, by.send_both, kept)
+        host = Host(core, map_solver, by.perform, by.send, by.answer_reads, self._inline_run, by.send_both, kept)
         made = OpenMap(host, place, options)
         return made
 
@@ -258,10 +258,10 @@ class Maps:
             kept = library.make(name, mode or settled_mode("auto"), limits)
         else:
             epoch, mode = secrets.randbits(62) | 1, mode or settled_mode("auto")
-            return MapCore(name, mode, epoch, limits, now), make_folder(mode, {}, epoch, limits), None
+            return MapCore(name, mode, epoch, limits, now), make_map_solver(mode, {}, epoch, limits), None
         core = MapCore(name, kept.header.mode, kept.header.epoch, limits, now)
         kept.restore(core)
-        return core, kept.folder, kept
+        return core, kept.map_solver, kept
 
     def _open(self, name: str, made: OpenMap) -> dict[str, Any]:
         """A map is made: let others see it.  Its row."""
@@ -315,14 +315,14 @@ class Maps:
         if self._library is not None:
             copy = CopiedAt(taken.record, copied.state, was.differs or "")
             kept = self._library.fork(fork.source, fork.target, copy, limits)
-            epoch, folder = kept.header.epoch, kept.folder
+            epoch, map_solver = kept.header.epoch, kept.map_solver
         else:
             epoch = secrets.randbits(62) | 1
-            folder = make_folder(was.mode, found.options, epoch, limits)
-            folder.load(copied.state)
+            map_solver = make_map_solver(was.mode, found.options, epoch, limits)
+            map_solver.load(copied.state)
         core = MapCore(fork.target, was.mode, epoch, limits, now)
-        core.restore((), restored(folder, was.differs))
-        return self._at_work(core, folder, kept)
+        core.restore((), restored(map_solver, was.differs))
+        return self._at_work(core, map_solver, kept)
 
     def _dropped(self, asker: Asker, found: OpenMap) -> None:
         name = found.host.core.name

@@ -22,8 +22,8 @@ class StepReport(NamedTuple):
     changed      variables whose values differ from before, the new ones included
     relinearized linearization points that were moved, counted once per iteration
     eliminated   variables eliminated, counted once per factorization
-    asleep       sights without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
-                 linearized); `Solver.asleep` tells which and why
+    inactive       sights without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
+                 linearized); `Solver.inactive` tells which and why
     nnz_r, flops of one factorization; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
     converged    a full Gauss-Newton step from the estimate would not lower χ² by more than `Options.converged_share` of
                  it, in the mode "bayes-tree" by a bound; in the others the last iteration did not by more than the
@@ -43,7 +43,7 @@ class StepReport(NamedTuple):
     changed: int = 0
     relinearized: int = 0
     eliminated: int = 0
-    asleep: int = 0
+    inactive: int = 0
     nnz_r: int = 0
     flops: float = 0.0
     damping: float = 0.0
@@ -61,7 +61,7 @@ class StepReport(NamedTuple):
         return told
 
 
-class CompileSplit(Mapping[str, float]):
+class PhaseShares(Mapping[str, float]):
     """A total by name, in proportion to counts; worked out when somebody asks, since every step has one and few do."""
 
     __slots__ = ("_counts", "_names", "_total")

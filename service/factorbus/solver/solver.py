@@ -110,7 +110,7 @@ class Solver:
         """
         return self._stepper.unfinished
 
-    def ripe(self, below: float) -> I64:
+    def convertible(self, below: float) -> I64:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
         return self._graph.keys[find_convertible(self._graph, below)]
 
@@ -168,9 +168,9 @@ class Solver:
         self._graph.take(edited(other._graph, edits))
         return self._stepper.resume(False)
 
-    def asleep(self) -> list[tuple[int, str, str]]:
+    def inactive(self) -> list[tuple[int, str, str]]:
         """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
-        return observations.asleep(self._graph)
+        return observations.inactive(self._graph)
 
     def memory_bytes(self) -> int:
         """Bytes in use for the graph and for what solves it."""

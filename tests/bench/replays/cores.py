@@ -16,7 +16,7 @@ import numpy as np
 
 from factorbus.proto.messages import Batch
 from factorbus.solver import Options, Solver, warm
-from factorbus.solver.sparse.lending import WorkerThread
+from factorbus.solver.sparse.worker_threads import WorkerThread
 
 from .clock import percentiles
 from .feed import fed
@@ -38,9 +38,9 @@ def cores(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]]
     try:
         with fed(problem) as steps:
             for k, stretch in enumerate(iter(lambda: tuple(islice(steps, _STRETCH)), ())):
-                for lent in (k % 2, 1 - k % 2):
-                    with lent_core() if lent else nullcontext():
-                        seconds[lent].extend(_drive(solvers[lent], stretch))
+                for with_worker in (k % 2, 1 - k % 2):
+                    with worker_core() if with_worker else nullcontext():
+                        seconds[with_worker].extend(_drive(solvers[with_worker], stretch))
                 tell({"done": len(seconds[0])})
     finally:
         gc.enable()
@@ -59,15 +59,15 @@ def cores(job: dict[str, Any], problem: Problem, tell: Callable[[dict[str, Any]]
 
 
 @contextmanager
-def lent_core() -> Iterator[None]:
-    """Another thread lends its core meanwhile."""
-    lender = WorkerThread()
-    thread = threading.Thread(target=lender.lend)
+def worker_core() -> Iterator[None]:
+    """A worker thread runs meanwhile."""
+    worker = WorkerThread()
+    thread = threading.Thread(target=worker.run)
     thread.start()
     try:
         yield
     finally:
-        lender.leave()
+        worker.leave()
         thread.join()
 
 

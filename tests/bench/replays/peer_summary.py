@@ -10,11 +10,11 @@ from . import summary
 from .contestants import ISAM2_ALONE, PEER, STAND_IN, Entry
 from .problems import Problem
 
-InsertBatch = dict[str, Any]
+Run = dict[str, Any]
 
 
 def rows_of(
-    problem: Problem, entries: Sequence[Entry], runs: dict[str, list[InsertBatch]], batch: dict[int, float]
+    problem: Problem, entries: Sequence[Entry], runs: dict[str, list[Run]], batch: dict[int, float]
 ) -> list[dict[str, Any]]:
     """One for each contestant.
 
@@ -39,20 +39,20 @@ def rows_of(
     return rows
 
 
-def _peer_of(runs: dict[str, list[InsertBatch]]) -> str:
+def _peer_of(runs: dict[str, list[Run]]) -> str:
     """Whose time counts: the stand-in's, if it came further."""
     reached = {name: max((run.get("done", 0) for run in runs.get(name, ())), default=0) for name in (PEER, STAND_IN)}
     return STAND_IN if reached[STAND_IN] > reached[PEER] else PEER
 
 
-def time_until(run: InsertBatch, steps: int) -> float:
+def time_until(run: Run, steps: int) -> float:
     """CPU seconds of the first so many steps; between the points of the curve it is taken as straight."""
     if steps >= run["done"]:
         return float(run["cpu_s"])
     return float(np.interp(steps - 1, *run["cumulative"]))
 
 
-def _against(mine: Sequence[InsertBatch], peers: Sequence[InsertBatch]) -> dict[str, Any]:
+def _against(mine: Sequence[Run], peers: Sequence[Run]) -> dict[str, Any]:
     mine, peers = ([run for run in runs if run.get("done")] for runs in (mine, peers))
     if not mine or not peers:
         return {"ratio_to_isam2": None, "ratio_steps": 0, "ratio_spread": None}

@@ -72,7 +72,7 @@ def growth_table(found: dict[str, Any]) -> str:
 
 
 def cores_table(found: dict[str, Any]) -> str:
-    """Steps by the clock, on one core and with another one lent."""
+    """Steps by the clock, on one core and with a worker thread."""
     if found["status"] == "failed":
         return found["reason"]
     names = ("p50", "p95", "p99", "max")

@@ -88,7 +88,7 @@ def covariance_command(
             f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
         )
     with _map(name, connect, zenoh, timeout_s) as asked:
-        found = asked.doubt.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
+        found = asked.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
     if found.covariance is not None:
         names = [format_symbol(int(key)) for key in found.keys]
         if as_json:
@@ -129,7 +129,7 @@ def gate_command(
     read = _read(candidates)
     factors = read.batch.factors
     with _map(name, connect, zenoh, timeout_s) as asked:
-        found = asked.doubt.ask.gate(factors, probability, timeout_s).result()
+        found = asked.uncertainty.ask.gate(factors, probability, timeout_s).result()
     columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
     rows = [
         {"factor": told, "distance": distance, "threshold": allowed, "plausible": plausible}
@@ -160,7 +160,7 @@ def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_
     read = _read(candidates)
     factors = read.batch.factors
     with _map(name, connect, zenoh, timeout_s) as asked:
-        found = asked.doubt.ask.gain(factors, timeout_s).result()
+        found = asked.uncertainty.ask.gain(factors, timeout_s).result()
     rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
     if as_json:
         content = [{"factor": told, "gain": gain} for told, gain in rows]
@@ -215,13 +215,13 @@ def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
     from factorbus.client import Refused
 
     if not what.isdecimal() or only == "variable":
-        return [asked.doubt.why(what)]
+        return [asked.uncertainty.why(what)]
     if only == "factor":
-        return [asked.doubt.why(factor=int(what))]
+        return [asked.uncertainty.why(factor=int(what))]
     told, refused = [], None
     for how in ({"key": what}, {"factor": int(what)}):
         try:
-            told.append(asked.doubt.why(**how))
+            told.append(asked.uncertainty.why(**how))
         except Refused as problem:
             if problem.code not in ("unknown_variable", "unknown_factor"):
                 raise
@@ -348,8 +348,8 @@ def _variable_rows(account: Any) -> list[tuple[str, str]]:
 def _factor_line(account: Any, step: Any) -> str:
     from factorbus.proto.why_text import fall_without
 
-    if account.get("asleep"):
-        return f"inactive: {account['asleep']}"
+    if account.get("inactive"):
+        return f"inactive: {account['inactive']}"
     without, loss = account["without"], account.get("loss")
     fall = "no redundancy: nothing else measures it"
     if without is not None:

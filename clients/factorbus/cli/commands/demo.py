@@ -83,7 +83,7 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
 
 
 def demo(request: DemoRequest) -> dict[str, Any]:
-    """InsertBatch it, with progress on standard error; returns the document."""
+    """Run it, with progress on standard error; returns the document."""
     from factorbus.cli.demo.ground_truth import World
     from factorbus.cli.driving.picture import course_of, draw
     from factorbus.cli.driving.remote import RemoteMap

@@ -62,7 +62,7 @@ def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
 def demo(
     plot: Path, frames: int, points: int, features: int, noise: float, outliers: float, seed: int, workers: int
 ) -> dict[str, Any]:
-    """InsertBatch it, with progress on standard error; returns the document."""
+    """Run it, with progress on standard error; returns the document."""
     from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
     from factorbus.cli.output.console import note, progress
     from factorbus.cli.process.children import STARTING, service, worker

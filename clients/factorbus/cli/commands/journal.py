@@ -93,20 +93,20 @@ def _wrong_with(folder: Path) -> Iterator[str]:
 @_MAP
 @_FOLDER
 def verify(names: tuple[str, ...], folder: Path) -> int:
-    """JournalRecord everything in again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
+    """Apply everything again, from the first insert on: is every revision the same, to the bit? Exit code 1: no.
 
     Another processor, or another version of factorbus, may well round otherwise: then the first revision is named at
     which the values differ.
     """
     require("service", "factorbus journal verify")
     from factorbus.service.config import Limits
-    from factorbus.service.journal.library import make_folder
+    from factorbus.service.journal.library import make_map_solver
     from factorbus.service.journal.recovery import verify as run_again
 
     alike = True
     for name, store in _stores(folder, names):
         header, total = store.header(), store.last().record
-        again = make_folder(header.mode, header.options, header.epoch, Limits())
+        again = make_map_solver(header.mode, header.options, header.epoch, Limits())
         revision, differs = 0, 0
         with screen.progress(name, total) as show_progress:
             for record, same in run_again(store, again):

@@ -64,9 +64,8 @@ def command(
 
 
 def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event") -> None:
-    from factorbus.viz.follower import MapFollower
-
     from factorbus.cli.output.console import note
+    from factorbus.viz.map_follower import MapFollower
     from factorbus.viz.mcap import Recording
 
     with MapFollower(joined) as follower, Recording(path) as recording:

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import REFUSED, Stopped, missing, require
+from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, require
 from factorbus.cli.output.starts import optimum_from, ratio_to
 from factorbus.cli.process.options import (
     SECONDS,
@@ -63,7 +63,7 @@ class ReplayRequest:
 
 @click.command()
 @file_argument("file")
-@click.option("--in-process", is_flag=True, help="InsertBatch the solver in this process, without a bus.")
+@click.option("--in-process", is_flag=True, help="Run the solver in this process, without a bus.")
 @click.option("--connect", metavar="ENDPOINT", help="Use the service at ENDPOINT instead of starting one.")
 @zenoh_option
 @click.option(
@@ -321,7 +321,7 @@ def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
 
 def _chi2_initial(steps: Any) -> float | None:
     """χ² before any step, by the solver; None in a light client, which has none."""
-    if missing("service"):
+    if missing_modules("service"):
         return None
     from factorbus.cli.driving.local import chi2_unsolved
 

@@ -94,7 +94,7 @@ def _view(seen: dict[str, Any], endpoint: str, console: Any) -> "RenderableType"
 # Columns of each table, the first of which stays; where not all have room the last of these goes first.
 _MATTER = (
     "variables", "revision", "χ²", "step ms", "waiting", "steps/s", "factors", "inserts", "map", "inserts/s", "refused",
-    "mode", "slots", "in flight", "trip ms",
+    "mode", "slots", "in flight", "latency ms",
 )  # fmt: skip
 _ANY_WIDTH = 10_000
 _LEFT = ("map", "mode")
@@ -152,10 +152,10 @@ def _inserts(rows: list[dict[str, Any]]) -> int:
 def _workers(seen: dict[str, Any]) -> _Table:
     rows = []
     for row in seen["workers"]:
-        trip = "" if row.get("latency_ms") is None else f"{row['latency_ms']:.2f}"
-        trip = "distrusted" if row.get("distrusted") else trip
-        rows.append((row["name"], str(row["slots"]), str(row["in_flight"]), trip))
-    return ("worker", "slots", "in flight", "trip ms"), rows
+        latency = "" if row.get("latency_ms") is None else f"{row['latency_ms']:.2f}"
+        latency = "distrusted" if row.get("distrusted") else latency
+        rows.append((row["name"], str(row["slots"]), str(row["in_flight"]), latency))
+    return ("worker", "slots", "in flight", "latency ms"), rows
 
 
 def _table(console: Any, content: _Table) -> Any:
@@ -179,10 +179,10 @@ def _drawn(names: list[str], rows: list[list[str]], longest: int | None) -> Any:
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     # A long name goes on in the next line; numbers do not.
-    table.add_column(names[0], style="bold", overflow="record", max_width=longest)
+    table.add_column(names[0], style="bold", overflow="fold", max_width=longest)
     for name in names[1:]:
         if name in _LEFT:
-            table.add_column(name, overflow="record", max_width=longest)
+            table.add_column(name, overflow="fold", max_width=longest)
         else:
             table.add_column(name, justify="right", no_wrap=True)
     for row in rows:

@@ -54,12 +54,11 @@ def command(
     if save and serving:
         raise click.UsageError("--save and --serve exclude each other")
     require("watch", "factorbus watch")
-    from factorbus.viz.follower import MapFollower
-
     from factorbus.cli.output.console import note
     from factorbus.cli.process.bus import joined_when_there, open_bus
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.viz.live import LiveView
+    from factorbus.viz.map_follower import MapFollower
 
     with (
         stop_on_signals(until_eof) as stop,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.cli.output.exits import EXTRAS, Stopped, missing
+from factorbus.cli.output.exits import EXTRAS, Stopped, missing_modules
 from factorbus.cli.output.installing import install_command
 from factorbus.cli.output.versions import LIBRARIES, installed
 from factorbus.cli.process.options import USUAL_ENDPOINT
@@ -44,10 +44,10 @@ def libraries() -> Finding:
     """the libraries"""
     have = {name: installed(name) for name in LIBRARIES}
     seen = ", ".join([f"factorbus {__version__}", *(f"{name} {version}" for name, version in have.items() if version)])
-    if missing("service"):
+    if missing_modules("service"):
         mend = f"fine for a front end; for solver and workers: {install_command('service')}"
         return Finding("libraries", "warn", f"{seen}; a light client without the solver", mend)
-    if missing("viz"):
+    if missing_modules("viz"):
         return Finding("libraries", "warn", f"{seen}; no pictures", install_command("viz"))
     return Finding("libraries", "ok", seen)
 
@@ -118,7 +118,7 @@ def port() -> Finding:
 
 def bus() -> Finding:
     """a round trip over the bus"""
-    if missing("service"):
+    if missing_modules("service"):
         return Finding("bus", "warn", "not tried: it needs a solver process", install_command("service"))
     from factorbus.cli.process.children import service
     from factorbus.client import connect
@@ -194,7 +194,7 @@ def wall_clock() -> Finding:
 
 def extras() -> Finding:
     """the extras"""
-    have = [name for name in EXTRAS if not missing(name)]
+    have = [name for name in EXTRAS if not missing_modules(name)]
     missing = [name for name in EXTRAS if name not in have]
     seen = f"{', '.join(have) or 'none'} installed" + (f"; without {', '.join(missing)}" if missing else "")
     mend = f"if wanted: {install_command(*missing)}" if missing else ""

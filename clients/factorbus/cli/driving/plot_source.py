@@ -109,7 +109,7 @@ def spread_in(drawn: Drawn, connect: str | None, most: int, zenoh: str = "") -> 
         from factorbus.cli.process.bus import open_bus
 
         with open_bus(connect, "plot", zenoh) as bus, bus.map(drawn.name, create=False, mirror=False) as joined:
-            return spread_of(drawn.graph.variables, blocks_of(joined.doubt.covariance(keys.tolist())))
+            return spread_of(drawn.graph.variables, blocks_of(joined.uncertainty.covariance(keys.tolist())))
     require("service", "--ellipses of a file")
     from factorbus.cli.driving.local import covariances_at
 

@@ -25,7 +25,7 @@ class RemoteMap:
         self._start = self._waited = self._mirror.revision
         self._received: dict[int, Mapping[str, Any]] = {}
         self._latest: Mapping[str, Any] = {}
-        self._lock, self._news = threading.RLock(), False  # entered itself: see `client/promise.py`
+        self._lock, self._news = threading.RLock(), False  # entered itself: see `client/interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._forget = self._mirror.on_delta(self._on_delta)
         self._comparisons: list[Future[Chi2]] = []

@@ -31,7 +31,7 @@ def table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
 
     lines = Table(box=box.SIMPLE_HEAD, show_header=False, pad_edge=False)
     lines.add_column(style="bold", no_wrap=True)
-    lines.add_column(overflow="record")
+    lines.add_column(overflow="fold")
     for name, value in rows:
         lines.add_row(name, value)
     console = Console(highlight=False)

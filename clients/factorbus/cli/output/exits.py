@@ -80,7 +80,7 @@ def require(extra: str, what: str) -> None:
 
     Looks without importing.  Raises Stopped.
     """
-    if missing := missing(extra):
+    if missing := missing_modules(extra):
         hint = " (compiles against SuiteSparse: apt-get install libsuitesparse-dev first)" if extra == "service" else ""
         raise Stopped(
             "missing_extra",
@@ -89,7 +89,7 @@ def require(extra: str, what: str) -> None:
         )
 
 
-def missing(extra: str) -> list[str]:
+def missing_modules(extra: str) -> list[str]:
     """The libraries of `extra` that are not installed, by import name."""
     return [name for name in EXTRAS[extra] if find_spec(name) is None]
 

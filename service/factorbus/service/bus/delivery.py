@@ -2,9 +2,9 @@
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
-executors a second, then Zenoh closes that client's transport.  Refusals have a executor of their own: of these a client can
-have filled its queue with tens of thousands before the first is taken.  So have answers that are still to be computed,
-which may take a minute: what is ready, such as stats, does not wait for them.
+executors a second, then Zenoh closes that client's transport.  Refusals have a executor of their own: of these a
+client can have filled its queue with tens of thousands before the first is taken.  So have answers that are still to
+be computed, which may take a minute: what is ready, such as stats, does not wait for them.
 """
 
 import logging
@@ -73,7 +73,7 @@ class Delivery:
         self.refusals.close()
         self.outbox.close()
 
-    # ---- on the answering executors: who does not take an answer holds up one of them for a second ----------------------
+    # ---- on the answering executors: who does not take an answer holds up one of them for a second ------------
 
     def tell(self, asker: Asker, content: dict[str, Any]) -> None:
         """Answer with `content` and what the service adds."""
@@ -91,9 +91,9 @@ class Delivery:
     def _read(self, place: MapPlace, read: Read, taken: QuestionCopies) -> None:
         try:
             check_ready(read.question, taken)
-            if read.question.name == "keyframe":
-                # Behind the delta of the same revision: a mirror that had the keyframe first would skip the delta.
-                self.outbox.hand(place.publish, "keyframe", answer(read.question, taken))
+            if read.question.name == "snapshot":
+                # Behind the delta of the same revision: a mirror that had the snapshot first would skip the delta.
+                self.outbox.hand(place.publish, "snapshot", answer(read.question, taken))
             elif read.question.name == "copy":
                 self._copied(read.asker, read.question, taken)
             elif read.question.batch:

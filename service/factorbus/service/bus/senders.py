@@ -16,7 +16,7 @@ _MOST = 4096
 class Senders:
     """The (map, client) of keys of inserts.  `find` is for any thread.
 
-    declare(key) makes a key known and gives what takes that back; it runs on the control.
+    declare(key) makes a key known and gives what takes that back; it runs on the control thread.
     """
 
     def __init__(
@@ -24,7 +24,7 @@ class Senders:
     ) -> None:
         self._control, self._declare, self._most = control, declare, most
         self._found: dict[str, tuple[str, str]] = {}
-        self._forget: dict[str, Callable[[], None]] = {}  # on the control only
+        self._forget: dict[str, Callable[[], None]] = {}  # on the control thread only
 
     def find(self, key: str) -> tuple[str, str]:
         """(map, client) of `key`.  Raises BadName."""

@@ -9,8 +9,8 @@ from factorbus.service.config import Config
 # callback's answer and delta leave on its own thread, as soon as it returns (measured with a step in between: 50 to 100
 # µs of 700 to 850).  And what comes in is not first seen by the thread that has accepted the connection, nor does every
 # query, and its end, wake one that watches how long queries take (measured: 60 of 550 µs; a third thread to wake costs
-# 15 of them again).  Two are enough, as one at most has a InsertBatch (see `host.py`).  An operator who sets it otherwise is
-# obeyed.
+# 15 of them again).  Two are enough, as one at most has an InsertBatch (see `host.py`).  An operator who sets it
+# otherwise is obeyed.
 RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 RUNTIME = "(rx: (worker_threads: 2), tx: (handover: rx), acc: (handover: rx), net: (handover: rx))"
 

@@ -33,7 +33,7 @@ _TIMED_OUT = b"Timeout"
 _PRIORITY = {
     "delta": zenoh.Priority.DATA_LOW,
     "event": zenoh.Priority.DATA_LOW,
-    "keyframe": zenoh.Priority.BACKGROUND,
+    "snapshot": zenoh.Priority.BACKGROUND,
 }
 
 
@@ -150,7 +150,7 @@ class MapPlace:
     """One map's publications, and its token."""
 
     def __init__(self, session: zenoh.Session, name: str, service: str) -> None:
-        channels = {"delta": keys.delta_key, "event": keys.event_key, "keyframe": keys.snapshot_key}
+        channels = {"delta": keys.delta_key, "event": keys.event_key, "snapshot": keys.snapshot_key}
         # DROP: one stuck subscriber must not hold up all others; whoever misses a delta sees the gap and asks.
         self._channels = {
             channel: session.declare_publisher(
@@ -162,7 +162,7 @@ class MapPlace:
         self._session, self._token = session, None
 
     def publish(self, channel: str, message: bytes) -> None:
-        """Publish on `channel` (delta, event, keyframe)."""
+        """Publish on `channel` (delta, event, snapshot)."""
         try:
             self._channels[channel].put(message)
         except zenoh.ZError as error:

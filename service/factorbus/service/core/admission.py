@@ -212,7 +212,7 @@ class Admission:
         self._clients[name] = client
 
     def took(self, inserts: int, seconds: float) -> None:
-        """Learn the pace: `inserts` were applied in `seconds`."""
+        """Learn the pace: `inserts` were applied `seconds`."""
         if inserts:
             self._pace_s += 0.1 * (seconds / inserts - self._pace_s)
 

@@ -106,7 +106,7 @@ class Stepped(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """The solver is done with a InsertBatch; how large the map is now, and what its thread has used.
+    """The solver is done with an InsertBatch; how large the map is now, and what its thread has used.
 
     refused: a further step was, and the map is where it was.
     """
@@ -142,7 +142,7 @@ class SingleInsertResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A question that needs the solver's state.  asker is None for a keyframe: its answer is published."""
+    """A question that needs the solver's state.  asker is None for a snapshot: its answer is published."""
 
     question: Question
     asker: Asker = None
@@ -186,7 +186,7 @@ class Publish(NamedTuple):
 
 
 class InsertBatch(NamedTuple):
-    """Work for the solver: first answer `reads` from the present revision, then record `inserts`.
+    """Work for the solver: first answer `reads` from the present revision, then apply `inserts`.
 
     short: most likely done sooner than another thread would have taken it over.  reload: first of all, go back to what
     the journal has.  further: there are no inserts, and one step is to go on from the last one.

@@ -2,10 +2,11 @@
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
     Asked ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
-                                    (solver thread)     └─▶ InsertBatch               what came in meanwhile; nothing did, and
+                                    (solver thread)     └─▶ InsertBatch       what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
-At most one InsertBatch is out at a time, so what the solver does next is decided when it is free, from all that waits then.
+At most one InsertBatch is out at a time, so what the solver does next is decided when it is free, from all that waits
+then.
 """
 
 import math
@@ -41,9 +42,10 @@ from factorbus.service.core.pending_questions import Reads
 from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
 
-_KEYFRAME = Read(Question("keyframe"))
-# A InsertBatch is short when it is for one insert of at most so many bytes and none of late took longer than so, unless the
-# insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be applied together.
+_SNAPSHOT = Read(Question("snapshot"))
+# An InsertBatch is short when it is for one insert of at most so many bytes and none of late took longer than so,
+# unless the insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be
+# applied together.
 _SHORT_BYTES = 16 << 10
 _SHORT_S = 0.002
 _ROUND_TRIP_S = 0.0002
@@ -82,7 +84,7 @@ class MapCore:
         self._slowest_s = math.inf  # of late: forgotten by a tenth with every InsertBatch
         self._closing: Problem | None = None
         self._drained = False
-        self._since_keyframe = [0, 0]  # steps, bytes of deltas
+        self._since_snapshot = [0, 0]  # steps, bytes of deltas
         self._solver_cpu_s = 0.0
         self._account = Account()
         self._converging = Converging()
@@ -166,7 +168,7 @@ class MapCore:
         return effects
 
     def alone(self, alone: SingleInsertResult, answered: Asker) -> list[Effect]:
-        """One insert was applied in by itself; `answered` has its answer, and the delta is published."""
+        """One insert was applied by itself; `answered` has its answer, and the delta is published."""
         insert, size = alone.insert, len(alone.delta)
         others = self._admission.answer(insert, alone.answer, answered)
         self._unjudged -= 1
@@ -180,7 +182,7 @@ class MapCore:
         return self._go_on(others, alone.now)
 
     def kept(self, events: Sequence[Verdict | Stepped], now: float) -> list[Effect]:
-        """What came of a InsertBatch is written down."""
+        """What came of an InsertBatch is written down."""
         effects: list[Effect] = []
         for event in events:
             effects += self.judged(event) if isinstance(event, Verdict) else self.stepped(event)
@@ -230,12 +232,12 @@ class MapCore:
 
     def _moved_on(self, revision: int, delta_bytes: int) -> None:
         self.revision = revision
-        self._since_keyframe[0] += 1
-        self._since_keyframe[1] += delta_bytes
-        steps, size = self._since_keyframe
-        if steps >= self._limits.keyframe_steps or size >= self._limits.keyframe_bytes:
-            self._since_keyframe = [0, 0]
-            self._reads.append(_KEYFRAME)
+        self._since_snapshot[0] += 1
+        self._since_snapshot[1] += delta_bytes
+        steps, size = self._since_snapshot
+        if steps >= self._limits.snapshot_steps or size >= self._limits.snapshot_bytes:
+            self._since_snapshot = [0, 0]
+            self._reads.append(_SNAPSHOT)
 
     def applied(self, applied: Applied) -> list[Effect]:
         """The solver is free again."""
@@ -329,7 +331,7 @@ class MapCore:
         room = self._has_room()
         further = self._may_go_on(now)
         if self._reads or self._must_reload or (self._admission.ready and room) or further:
-            reads, inserts = self._reads.take(), self._admission.take(limits.record) if room else ()
+            reads, inserts = self._reads.take(), self._admission.take(limits.step_inserts) if room else ()
             short = self._is_short(reads, inserts, now)
             self._running = InsertBatch(reads, inserts, short, self._must_reload, further)
             if inserts or further:

@@ -34,7 +34,7 @@ class Reads:
         self._waiting.clear()
 
     def take(self) -> tuple[Read, ...]:
-        """What the next InsertBatch answers: all that take copies, and of the others the oldest, up to `NEAR` variables."""
+        """What the next InsertBatch answers: all that take copies, of the others the oldest, up to `NEAR` variables."""
         taken: list[Read] = []
         stay: deque[Read] = deque()
         variables, is_full = 0, False

@@ -89,12 +89,12 @@ class _Worker:
 class _Open:
     """A job that is not done: where it was tried, and where it is (tag 0: waiting for a slot).
 
-    doubted: by worker, what it said that doing the job in place is to decide.
+    suspected: by worker, what it said that doing the job in place is to decide.
     """
 
     job: Job
     ahead: int
-    doubted: dict[str, str] = field(default_factory=dict)
+    suspected: dict[str, str] = field(default_factory=dict)
     tried: set[str] = field(default_factory=set)
     tries: int = 0
     tag: int = 0
@@ -179,8 +179,8 @@ class Dispatch:
         if not self._is_latest(job, tag):
             return self._place_waiting()
         found = self._jobs.pop(job)
-        doubted = found.doubted.items() if worker == IN_PLACE else ()
-        return [*self._distrust(doubted), Ended(job, worker, done, found.tries), *self._place_waiting()]
+        suspected = found.suspected.items() if worker == IN_PLACE else ()
+        return [*self._distrust(suspected), Ended(job, worker, done, found.tries), *self._place_waiting()]
 
     def failed(self, tag: int, problem: Any) -> list[Effect]:
         """The sending `tag` was refused, timed out or came to nothing."""
@@ -191,7 +191,7 @@ class Dispatch:
         if known is not None and problem.code == "unknown_kind" and job in self._jobs:
             known.cannot.add(self._jobs[job].job.kind)
         if worker != IN_PLACE and problem.code not in _TRY_ANOTHER:
-            return self.doubted(tag, f"refused the job, which can be done: {problem.message} [{problem.code}]")
+            return self.suspected(tag, f"refused the job, which can be done: {problem.message} [{problem.code}]")
         if worker != IN_PLACE or not self._is_latest(job, tag):
             self._again(tag)
             return self._place_waiting()
@@ -199,11 +199,11 @@ class Dispatch:
         tries = self._jobs.pop(job).tries
         return [Ended(job, worker, problem, tries), *self._place_waiting()]
 
-    def doubted(self, tag: int, why: str) -> list[Effect]:
+    def suspected(self, tag: int, why: str) -> list[Effect]:
         """What the sending `tag` came to is not believed: the job is done in place next, and that decides."""
         job, worker = self._by_tag.get(tag, ("", ""))
         if self._is_latest(job, tag):
-            self._jobs[job].doubted[worker] = why
+            self._jobs[job].suspected[worker] = why
         self._again(tag)
         return self._place_waiting()
 
@@ -278,7 +278,7 @@ class Dispatch:
             if name not in found.tried and worker.takes(found.job.kind)
         }
         tag = next(self._tags)
-        if found.doubted or found.tries >= TRIES or not untried:
+        if found.suspected or found.tries >= TRIES or not untried:
             worker, effect = IN_PLACE, InPlace(tag, found.job)
         else:
             free = [name for name, worker in untried.items() if len(worker.tags) < worker.slots + found.ahead]

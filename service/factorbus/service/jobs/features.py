@@ -75,7 +75,7 @@ class FeatureQuestions:
         self._reply, self._refuse = reply, refuse
         self._limits, self._most, self._deadline_s, self._room = limits, most, deadline_s, room
         self._rates: Rates | None = None
-        self._open = 0  # on the control
+        self._open = 0  # on the control thread
         self._stopping = False
         self._executor = SerialExecutor("features")
 
@@ -92,17 +92,17 @@ class FeatureQuestions:
             self._executor.hand(self._take, asker, payload)
 
     def stop(self) -> None:
-        """Refuse from now on; returns when all that was asked before is answered or handed to the control."""
+        """Refuse from now on; returns when all that was asked before is answered or handed to the control thread."""
         self._stopping = True
         reached = threading.Event()
         self._executor.hand(reached.set)
         reached.wait()
 
     def close(self) -> None:
-        """Return when the answers that are ready are sent; after `stop`, and after the control is closed."""
+        """Return when the answers that are ready are sent; after `stop`, and after the control thread is closed."""
         self._executor.close()
 
-    # ---- on the features executor ---------------------------------------------------------------------------------------
+    # ---- on the features executor -----------------------------------------------------------------------------------
 
     def _take(self, asker: Asker, payload: bytes) -> None:
         try:
@@ -140,7 +140,7 @@ class FeatureQuestions:
     def _answer(self, question: _Question) -> None:
         self._reply(question.asker, encode_answer([part for part in question.parts if part], question.clean))
 
-    # ---- on the control ------------------------------------------------------------------------------------------------
+    # ---- on the control thread --------------------------------------------------------------------------------------
 
     def _submit(self, asker: Asker, cutting: _Cutting) -> None:
         if self._open >= self._most:

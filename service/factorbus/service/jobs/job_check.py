@@ -26,7 +26,7 @@ from factorbus.wording import counted
 
 # χ² is summed in another order, or by another compiler; an optimum is compared with a map by no more digits.
 _CHI2 = 1e-6
-# A larger payload is not checked on the control.
+# A larger payload is not checked on the control thread.
 _QUICK_BYTES = 256 << 10
 
 

@@ -1,4 +1,7 @@
-"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.  For the control."""
+"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.
+
+For the control thread.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

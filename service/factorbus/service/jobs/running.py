@@ -1,7 +1,8 @@
 """Jobs on their way: to a worker, to the next one when that fails, in place when there is none, and back.
 
-Everything here runs on one executor (the control); workers and the in-place threads only hand their results to it.  No answer
-of a worker is passed on unchecked; what takes long to check is checked on a executor of its own.
+Everything here runs on one serial executor (the control thread); workers and the in-place threads only hand their
+results to it.  No answer of a worker is passed on unchecked; what takes long to check is checked on a executor of its
+own.
 """
 
 import logging
@@ -38,7 +39,7 @@ class _Open:
 
 
 class Jobs:
-    """The jobs of one service.  For the control executor, which `control` must be."""
+    """The jobs of one service.  For the control thread, which `control` must be."""
 
     def __init__(self, control: SerialExecutor, send: SendJob) -> None:
         self._control, self._send = control, send
@@ -108,7 +109,7 @@ class Jobs:
         timeout_s: float,
         ahead: int = 0,
     ) -> None:
-        """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the control.
+        """Have a job done; `ended` gets what came of it, a JobDone or a problem, on the control thread.
 
         deadline_s: for one worker.  timeout_s: until it is given up, with Unavailable.  ahead: of short jobs, how many
         may wait at a worker.
@@ -182,7 +183,7 @@ class Jobs:
         if isinstance(result, JobDone):
             effects = self._dispatch.done(tag, result)
         elif isinstance(result, DoubtfulAnswer):
-            effects = self._dispatch.doubted(tag, result.message)
+            effects = self._dispatch.suspected(tag, result.message)
         elif isinstance(result, WrongAnswer):
             effects = self._dispatch.wrong(tag, result.message)
         else:

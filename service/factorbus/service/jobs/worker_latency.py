@@ -1,4 +1,4 @@
-"""What the way to each worker takes: measured when it joins, with jobs too small to matter.  For the control.
+"""What the way to each worker takes: measured when it joins, with jobs too small to matter.  For the control thread.
 
 One that does not answer is asked again and again until it does.  One that does no jobs of kind `idp` says so once, and
 has no way to measure; one that answers wrongly is distrusted, as with any job.

@@ -1,8 +1,9 @@
 """A map's journal at work: a thread that writes down what was applied, and says when it is safe.
 
-    commit   what came of a InsertBatch is told when the disk has it: answers, deltas and estimates alike, so nobody ever sees
-             what a crash could take back.  While the disk is busy the next inserts are applied; all that waits then goes
-             into one transaction (group commit)
+    commit   what came of an InsertBatch is told when the disk has it: answers, deltas and estimates alike, so nobody
+    ever sees
+             what a crash could take back.  While the disk is busy the next inserts are applied; all that waits then
+             goes into one transaction (group commit)
     group    told at once, written and safe no later than `group_s` afterwards
     none     told at once, written now and then, safe when the operating system pleases
 
@@ -43,7 +44,7 @@ class Listener(Protocol):
     """Who is told what becomes of the writing; called on the journal's thread."""
 
     def kept(self, events: Events) -> None:
-        """What came of a InsertBatch is safe."""
+        """What came of an InsertBatch is safe."""
         ...
 
     def unkept(self, problem: JournalFailed) -> None:
@@ -108,8 +109,8 @@ class Keeping(Protocol):
         """The keeper, not started yet."""
         ...
 
-    def reload(self, folder: MapSolver) -> Last:
-        """Bring `folder` back to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
+    def reload(self, map_solver: MapSolver) -> Last:
+        """Bring `map_solver` back to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
         ...
 
 

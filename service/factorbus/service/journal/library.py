@@ -30,8 +30,8 @@ from factorbus.solver.state import FORMAT
 log = logging.getLogger(__name__)
 
 
-def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> MapSolver:
-    """A new folder with a solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
+def make_map_solver(mode: str, options: Mapping[str, Any], epoch: int, limits: Limits) -> MapSolver:
+    """A map solver with a new solver in `mode`, and the other settings as `options` has them.  Raises JournalOption."""
     from factorbus.solver import Options, Solver
     from factorbus.solver.errors import BadOption
 
@@ -46,10 +46,10 @@ def make_folder(mode: str, options: Mapping[str, Any], epoch: int, limits: Limit
     return MapSolver(lambda: Solver(settings), epoch, limits, settings.as_dict())
 
 
-def restored(folder: MapSolver, differs: str | None = None) -> Restored:
-    """How the map in `folder` is.  differs: as `Restored` has it."""
-    chi2 = folder.chi2() if folder.revision else 0.0
-    return Restored(folder.revision, *folder.size, chi2, folder.converged, folder.unfinished, differs)
+def restored(map_solver: MapSolver, differs: str | None = None) -> Restored:
+    """How the map in `map_solver` is.  differs: as `Restored` has it."""
+    chi2 = map_solver.chi2() if map_solver.revision else 0.0
+    return Restored(map_solver.revision, *map_solver.size, chi2, map_solver.converged, map_solver.unfinished, differs)
 
 
 def log_owner(owner: str) -> None:
@@ -96,9 +96,9 @@ class Library:
     def make(self, name: str, mode: str, limits: Limits) -> "Kept":
         """A new map, and its journal.  Raises JournalFailed."""
         where, epoch = self._owned.folder / name, secrets.randbits(62) | 1
-        folder = make_folder(mode, {}, epoch, limits)
-        store = create(where, name, mode, folder.options(), epoch, self._config.durability)
-        return Kept(store, store.header(), folder, Recovered(store.last()), self._config)
+        map_solver = make_map_solver(mode, {}, epoch, limits)
+        store = create(where, name, mode, map_solver.options(), epoch, self._config.durability)
+        return Kept(store, store.header(), map_solver, Recovered(store.last()), self._config)
 
     def open(self, name: str, limits: Limits) -> "Kept":
         """The map `name` as it was.  Raises JournalDamaged, JournalDiffers, JournalVersion, JournalFailed."""
@@ -128,9 +128,9 @@ class Library:
         store = open_store(where / target, config.durability)
         try:
             header = store.header()
-            folder = make_folder(header.mode, header.options, header.epoch, limits)
-            folder.load(state)
-            return Kept(store, header, folder, Recovered(store.last(), record, differs=copied.differs), config)
+            map_solver = make_map_solver(header.mode, header.options, header.epoch, limits)
+            map_solver.load(state)
+            return Kept(store, header, map_solver, Recovered(store.last(), record, differs=copied.differs), config)
         except BaseException:
             store.close()
             self.remove(target)
@@ -160,14 +160,14 @@ class Kept:
     """A map with its journal, open: what a host and its core are to begin with."""
 
     def __init__(
-        self, store: Store, header: Header, folder: MapSolver, recovered: Recovered, config: Config,
+        self, store: Store, header: Header, map_solver: MapSolver, recovered: Recovered, config: Config,
         epoch: Epoch | None = None,
     ) -> None:  # fmt: skip
         """epoch: a new one, which is not in the journal yet."""
-        self.store, self.folder, self.recovered = store, folder, recovered
+        self.store, self.map_solver, self.recovered = store, map_solver, recovered
         self.header = replace(header, epochs=(*header.epochs, epoch)) if epoch else header
         self._config, self._epoch = config, epoch
-        folder.enter(self.header.epoch)
+        map_solver.enter(self.header.epoch)
 
     def restore(self, core: MapCore) -> None:
         """Tell `core` how the map is."""
@@ -175,7 +175,7 @@ class Kept:
         senders = self.store.senders(epoch.record, limits.clients, limits.remembered)
         core.restore(
             [(sender.client, sender.next, answers(sender)) for sender in senders],
-            restored(self.folder, self.recovered.differs),
+            restored(self.map_solver, self.recovered.differs),
         )
 
     def keeper(self, listener: Listener) -> Keeper:
@@ -194,11 +194,11 @@ class Kept:
         here, makers = Maker(self.recovered.last.record + 1, present_build()), store.makers()
         return None if makers and makers[-1].build == here.build else here
 
-    def reload(self, folder: MapSolver) -> Last:
+    def reload(self, map_solver: MapSolver) -> Last:
         """As `keeping.Keeping`."""
         store = open_store(self.store.path.parent, read_only=True)
         try:
-            return recover(store, folder).last
+            return recover(store, map_solver).last
         finally:
             store.close()
 
@@ -220,8 +220,8 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
     started = time.perf_counter()
     store.check_form()
     header = store.header()
-    folder = make_folder(header.mode, header.options, header.epoch, limits)
-    recovered = recover(store, folder)
+    map_solver = make_map_solver(header.mode, header.options, header.epoch, limits)
+    recovered = recover(store, map_solver)
     if store.writable:
         remove_strangers(store.path.parent, {saved.record for saved in store.snapshots()})
     epoch = None
@@ -236,7 +236,7 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
         log.warning("map %s was made by another build of the solver: %s", header.map, recovered.other_build)
     if recovered.differs:
         log.warning("map %s is not reproducible: %s", header.map, recovered.differs)
-    return Kept(store, header, folder, recovered, config, epoch)
+    return Kept(store, header, map_solver, recovered, config, epoch)
 
 
 def _reason_for_an_epoch(header: Header, recovered: Recovered) -> str:

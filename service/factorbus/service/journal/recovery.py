@@ -33,9 +33,9 @@ class Recovered(NamedTuple):
     """Where a folder is now.
 
     from_record: the snapshot it began with, or 0.  records, solver_s: what was applied again, and what its steps took.
-    other_build: in what the build that made the map differs from this one; empty: in nothing.  same: no record gave other
-    bits than it had.  differs: why the journal, run again from its first insert, may give other bits; empty: as far as
-    is known it gives the same.
+    other_build: in what the build that made the map differs from this one; empty: in nothing.  same: no record gave
+    other bits than it had.  differs: why the journal, run again from its first insert, may give other bits; empty: as
+    far as is known it gives the same.
     """
 
     last: Last
@@ -47,11 +47,11 @@ class Recovered(NamedTuple):
     differs: str = ""
 
 
-def recover(store: Store, folder: MapSolver) -> Recovered:
-    """Bring `folder` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
-    saved, whole = _from_snapshot(store, folder)
+def recover(store: Store, map_solver: MapSolver) -> Recovered:
+    """Bring `map_solver` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
+    saved, whole = _from_snapshot(store, map_solver)
     begin = store.at(saved.record) if saved else Last(0, 0, chain.START)
-    history, (other, compared) = _History(store, folder), _other_builds(store, saved)
+    history, (other, compared) = _History(store, map_solver), _other_builds(store, saved)
     last, records, differs_from = begin, 0, 0
     for record in store.records(begin.record):
         if history.again(record, last.chain, bool(other)) != record.chain and not differs_from:
@@ -64,23 +64,23 @@ def recover(store: Store, folder: MapSolver) -> Recovered:
     return Recovered(last, begin.record, records, history.solver_s, other, whole and not differs_from, differs)
 
 
-def verify(store: Store, folder: MapSolver) -> Iterator[tuple[JournalRecord, bool]]:
+def verify(store: Store, map_solver: MapSolver) -> Iterator[tuple[JournalRecord, bool]]:
     """JournalRecord everything again from the beginning; gives each record, and whether it gave the same bits.
 
     Raises JournalDamaged, JournalDiffers.
     """
-    folder.load(None)
-    last, history, other = chain.START, _History(store, folder), bool(_other_builds(store, None)[0])
+    map_solver.load(None)
+    last, history, other = chain.START, _History(store, map_solver), bool(_other_builds(store, None)[0])
     for record in store.records():
         yield record, history.again(record, last, other) == record.chain
         last = record.chain
 
 
 class _History:
-    """What happened to a map, once more, to `folder`."""
+    """What happened to a map, once more, to `map_solver`."""
 
-    def __init__(self, store: Store, folder: MapSolver) -> None:
-        self._store, self._folder = store, folder
+    def __init__(self, store: Store, map_solver: MapSolver) -> None:
+        self._store, self._map_solver = store, map_solver
         self.solver_s = 0.0
 
     def again(self, record: JournalRecord, before: bytes, other: bool) -> bytes:
@@ -90,22 +90,22 @@ class _History:
         have the same.  other: another build made the map, which a threshold may have taken another way: where
         that cost a step more or less, revisions are counted as the journal has them.
         """
-        store, folder = self._store, self._folder
+        store, map_solver = self._store, self._map_solver
         present = self._apply(record, before)
-        if folder.revision != record.revision:
+        if map_solver.revision != record.revision:
             tried = record.further or record.rebuilt or any(entry.outcome != UNTRIED for entry in record.entries)
             if not (other and tried):
                 raise JournalDiffers(
                     store.path,
-                    f"record {record.number} led to revision {record.revision}, and leads to {folder.revision}",
+                    f"record {record.number} led to revision {record.revision}, and leads to {map_solver.revision}",
                 )
-            folder.count_from(record.revision)
+            map_solver.count_from(record.revision)
         return present
 
     def _apply(self, record: JournalRecord, present: bytes) -> bytes:
         inserts = [_arrived(entry) for entry in record.entries if entry.outcome != UNTRIED]
         outcomes: dict[tuple[str, int], int] = {}
-        for event in self._folder.apply_again(inserts, record.rebuilt, record.further):
+        for event in self._map_solver.apply_again(inserts, record.rebuilt, record.further):
             if isinstance(event, Verdict):
                 for outcome in event.outcomes:
                     done = ACCEPTED if isinstance(outcome.answer, bytes) else REFUSED
@@ -132,22 +132,22 @@ def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:
         yield entry.sequence, message_digest(entry.message), answer
 
 
-def _from_snapshot(store: Store, folder: MapSolver) -> tuple[Saved | None, bool]:
-    """Begin with the newest snapshot that can be used, or with nothing; and whether `folder` has it to the bit."""
+def _from_snapshot(store: Store, map_solver: MapSolver) -> tuple[Saved | None, bool]:
+    """Begin with the newest snapshot that can be used, or with nothing; and whether `map_solver` has it to the bit."""
     for saved in store.snapshots():
         path = file_of(store.path.parent, saved.record)
         if saved.format != FORMAT:
             log.warning("%s has a state of format %d, this version reads %d: not used", path, saved.format, FORMAT)
             continue
         try:
-            return saved, folder.load(read_snapshot(path))
+            return saved, map_solver.load(read_snapshot(path))
         except (OSError, ValueError, KeyError, TypeError, SolverError) as error:
             log.warning("%s cannot be used: %s", path, error)
-    return None, folder.load(None)
+    return None, map_solver.load(None)
 
 
 def _other_builds(store: Store, saved: Saved | None) -> tuple[str, int]:
-    """In what another build differs that made the snapshot or a record after it, and how many records such a one made."""
+    """In what another build differs that made the snapshot or a record after it, and how many records it made."""
     here, begin, makers = present_build(), saved.record if saved else 0, store.makers()
     found, count = differences(saved.build, here) if saved else "", 0
     ends = [*(maker.record for maker in makers[1:]), store.last().record + 1]

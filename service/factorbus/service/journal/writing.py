@@ -1,4 +1,4 @@
-"""What is written down of a InsertBatch: its inserts in their order, what became of each, and a digest of what changed."""
+"""What is written down of an InsertBatch: its inserts in order, what became of each, a digest of what changed."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from factorbus.solver.errors import SolverError
 def written(
     number: int, inserts: Sequence[Arrived], events: Sequence[Verdict | Stepped], last: Last, further: bool = False
 ) -> JournalRecord:
-    """What is written down of a InsertBatch.  further: it was for a further step, which may have been refused."""
+    """What is written down of an InsertBatch.  further: it was for a further step, which may have been refused."""
     present, revision, rebuilt = last.chain, last.revision, False
     outcomes: dict[int, tuple[Outcome, Verdict]] = {}
     for event in events:

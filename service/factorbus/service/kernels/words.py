@@ -37,7 +37,7 @@ _PIECES = (
     b"\xa5epoch",
     b"\xa8revision",
     b"\xacfirst_factor",
-    b"\xa6folded\x01",
+    b"\xa7applied\x01",
     b"\xa6report",
     b"\x85\xa5epoch",
     b"\xa8previous",

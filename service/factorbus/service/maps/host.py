@@ -3,11 +3,11 @@
 Whoever brings an event takes the lock for the microseconds that the core needs; what the core wants done is done
 after the lock is free again.
 
-There is one InsertBatch at a time, and whoever has it has the solver.  It goes to the map's own thread, unless it is short:
-then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small exchange).
-That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the inline_run):
-however wrong the guess was, only the client that sent the insert is not heard meanwhile.  A InsertBatch ends (Applied) when its
-messages are sent or in the outbox, so deltas leave in order.
+There is one InsertBatch at a time, and whoever has it has the solver.  It goes to the map's own thread, unless it is
+short: then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small
+exchange). That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the
+inline_run): however wrong the guess was, only the client that sent the insert is not heard meanwhile.  An InsertBatch
+ends (Applied) when its messages are sent or in the outbox, so deltas leave in order.
 """
 
 import logging
@@ -52,7 +52,8 @@ AnswerReads: TypeAlias = Callable[[Sequence[Read], QuestionCopies], None]
 
 
 class Host:
-    """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short InsertBatch.
+    """A map, running.  Its methods may be called from any thread and return at once; `insert` does after a short
+    InsertBatch.
 
     perform: has done what the core wants done, in order, elsewhere; send: the same, at once if the order allows.
     inline_run: shared by all maps; who has it may do short Runs.  send_both: `send` for an answer and a delta.
@@ -61,7 +62,7 @@ class Host:
     def __init__(
         self,
         core: MapCore,
-        folder: MapSolver,
+        map_solver: MapSolver,
         perform: Perform,
         send: Perform,
         answer: AnswerReads,
@@ -72,7 +73,13 @@ class Host:
         self.core = core
         self._keeper = keeping.keeper(self) if keeping else None
         self._keeping = keeping
-        self._folder, self._do, self._send, self._answer, self._inline_run = folder, perform, send, answer, inline_run
+        self._map_solver, self._do, self._send, self._answer, self._inline_run = (
+            map_solver,
+            perform,
+            send,
+            answer,
+            inline_run,
+        )
         self._send_both = send_both
         self._lock = threading.Lock()
         self._runs: queue.SimpleQueue[InsertBatch | Callable[[], None] | None] = queue.SimpleQueue()
@@ -166,7 +173,7 @@ class Host:
         self._runs.put(None)
         self._thread.join()
         if self._keeper is not None:
-            self._keeper.close(self._folder.dump if keep else None)
+            self._keeper.close(self._map_solver.dump if keep else None)
 
     @property
     def unwritable(self) -> str:
@@ -180,7 +187,7 @@ class Host:
     # ---- what becomes of the writing: on the journal's thread -------------------------------------------------------
 
     def kept(self, events: Events) -> None:
-        """What came of a InsertBatch is safe."""
+        """What came of an InsertBatch is safe."""
         with self._lock:
             effects = self.core.kept(events, time.monotonic())
         self._perform(effects)
@@ -224,7 +231,7 @@ class Host:
                 return
             if run.reads:
                 self._read(run.reads)
-            events = self._folder.apply_batch(run.inserts, run.further)
+            events = self._map_solver.apply_batch(run.inserts, run.further)
             if not isinstance(events, SingleInsertResult):
                 self._tell(events, tell)
                 return
@@ -245,7 +252,7 @@ class Host:
             self._perform(effects)
 
     def _tell(self, events: Iterable[Verdict | Stepped | Applied], tell: Perform) -> None:
-        """What comes of a InsertBatch, step by step."""
+        """What comes of an InsertBatch, step by step."""
         effects: list[Effect] = []
         for event in events:
             if isinstance(event, Applied):
@@ -266,10 +273,10 @@ class Host:
     def _run_kept(self, run: InsertBatch, keeper: Keeper, tell: Perform) -> None:
         """The same with a journal: what comes of it is told when that is safe, or at once if it need not be."""
         if run.reload and self._keeping is not None:
-            keeper.reloaded(self._keeping.reload(self._folder))
+            keeper.reloaded(self._keeping.reload(self._map_solver))
         if run.reads:
             self._read(run.reads)
-        events, applied = self._folder.apply_whole(run.inserts, run.further)
+        events, applied = self._map_solver.apply_whole(run.inserts, run.further)
         keeper.hand(run.inserts, events, run.further)
         if not keeper.waits:
             with self._lock:
@@ -278,14 +285,14 @@ class Host:
         replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
         if replaced or ((run.inserts or run.further) and keeper.wants_snapshot()):
             started = time.perf_counter()
-            keeper.snapshot(self._folder.dump(), time.perf_counter() - started)
+            keeper.snapshot(self._map_solver.dump(), time.perf_counter() - started)
         with self._lock:
             effects = self.core.applied(applied)
         self._perform(effects)
 
     def _read(self, reads: Sequence[Read]) -> None:
         try:
-            taken = self._folder.snapshot([read.question for read in reads])
+            taken = self._map_solver.snapshot([read.question for read in reads])
         except (Problem, SolverError) as problem:
             self._refuse(reads, problem)
         except Exception:

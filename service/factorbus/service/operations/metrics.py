@@ -134,7 +134,7 @@ def _of_maps(maps: Iterable[Mapping[str, Any]]) -> Iterator[Family]:
         yield _by(f"map_{name}", "gauge", what, "map", {m: row[name] for m, row in rows.items()})
     yield _by("steps", "counter", "Steps of the solver", "map", {m: row["steps"] for m, row in rows.items()})
     cpu = {m: row["solver_cpu_s"] for m, row in rows.items()}
-    yield _by("solver_cpu_seconds", "counter", "Processor time of folding and solving", "map", cpu)
+    yield _by("solver_cpu_seconds", "counter", "Processor time of applying inserts", "map", cpu)
     for name, key, what, label in (
         ("strategy", "strategies", "Steps by how they were made", "strategy"),
         ("inserts", "inserts", "Inserts by what became of them", "outcome"),

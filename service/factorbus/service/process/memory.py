@@ -55,7 +55,7 @@ class MemoryLimit:
         self._file = os.open("/proc/self/statm", os.O_RDONLY)
         self.resident = self._measure()
         self._promised = 0  # bytes taken in since that was measured
-        self._lent, self._lending = 0, threading.Lock()  # bytes that questions being answered may come to
+        self._reserved, self._lending = 0, threading.Lock()  # bytes that questions being answered may come to
 
     def look(self) -> None:
         """Measure anew; a few microseconds."""
@@ -77,23 +77,23 @@ class MemoryLimit:
         self.look()
         return max(self.limit - self.resident, 0)
 
-    def lend(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
         """Bytes for a question, until `give_back`; all of them together have what is left, or a quarter of the limit.
 
-        Raises OutOfMemory: then nothing is lent.
+        Raises OutOfMemory: then nothing is reserved.
         """
         with self._lending:
-            more = self._lent + size
+            more = self._reserved + size
             if more > _QUESTIONS * self.limit and self.resident + more > self.limit:
                 self.look()
                 if self.resident + more > self.limit:
                     raise NoRoom(self.resident, self.limit, size)
-            self._lent = more
+            self._reserved = more
 
     def give_back(self, size: int) -> None:
         """They are free again."""
         with self._lending:
-            self._lent -= size
+            self._reserved -= size
 
     def close(self) -> None:
         """No more measuring."""

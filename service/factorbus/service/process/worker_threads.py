@@ -1,11 +1,11 @@
-"""Threads that lend their cores to the eliminations of all maps, which are long in large ones.  MATH §9.5."""
+"""Worker threads for the eliminations of all maps, which are long in large ones.  MATH §9.5."""
 
 import os
 import threading
 from typing import Any
 
 from factorbus.service.process.control_groups import limit_files
-from factorbus.solver.sparse.lending import WorkerThread, can_work, count_free
+from factorbus.solver.sparse.worker_threads import WorkerThread, can_work, count_free
 
 
 def core_count() -> int:
@@ -34,7 +34,7 @@ class WorkerThreads:
 
     def __init__(self, cores: int) -> None:
         self._more = min(cores, core_count()) - 1
-        self._lenders: list[WorkerThread] = []
+        self._workers: list[WorkerThread] = []
         self._threads: list[threading.Thread] = []
         self.tick()
 
@@ -42,21 +42,21 @@ class WorkerThreads:
         """Time went by: somebody may have compiled or loaded the kernel."""
         if self._threads or not can_work():
             return
-        self._lenders = [WorkerThread() for _ in range(min(self._more, count_free()))]
+        self._workers = [WorkerThread() for _ in range(min(self._more, count_free()))]
         self._threads = [
-            threading.Thread(target=lender.lend, name=f"core {n}", daemon=True)
-            for n, lender in enumerate(self._lenders, 1)
+            threading.Thread(target=worker.run, name=f"core {n}", daemon=True)
+            for n, worker in enumerate(self._workers, 1)
         ]
         for thread in self._threads:
             thread.start()
 
     def account(self) -> dict[str, Any]:
         """How many that is, with the one that a map's own thread has; pieces of eliminations that the others made."""
-        return {"used": 1 + len(self._threads), "pieces": sum(lender.made for lender in self._lenders)}
+        return {"used": 1 + len(self._threads), "pieces": sum(worker.made for worker in self._workers)}
 
     def close(self) -> None:
         """Eliminations go on alone; returns when the threads have ended."""
-        for lender in self._lenders:
-            lender.leave()
+        for worker in self._workers:
+            worker.leave()
         for thread in self._threads:
             thread.join()

@@ -54,7 +54,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Copied:
-    """A folder's whole state, from which another one can go on.  state: None if it did not fit into the room."""
+    """The whole state of a map's solver, for another one to go on from.  state: None if there was no room for it."""
 
     state: Mapping[str, Any] | None
     bytes: int
@@ -65,8 +65,8 @@ class QuestionCopies:
     """Copies of what some questions need, all of one revision.
 
     uncertain: R, if it was copied.  ready: answers, or why there is none, by the identity of the question.  content: a
-    solver's copy of everything.  copied: the folder's, and after which record of the journal that was.  room: for what
-    is made of it.
+    solver's copy of everything.  copied: the map solver's, and after which record of the journal that was.  room: for
+    what is made of it.
     """
 
     epoch: int
@@ -139,7 +139,7 @@ def snapshot(
     names = {question.name for question in questions}
     whole = bool(names & {"graph", "export"}) or any(q.batch for q in questions)
     variables, factors = solver.graph() if whole else ((), ())
-    if not whole and names & {"estimate", "keyframe"}:
+    if not whole and names & {"estimate", "snapshot"}:
         variables = solver.estimate()
     chi2 = solver.chi2() if "chi2" in names else 0.0
     asked = [question for question in questions if question.name in DECODE]
@@ -197,7 +197,7 @@ def as_factors(groups: Iterable[Any]) -> tuple[Factors, ...]:
 def answer(question: Question, taken: QuestionCopies) -> bytes:
     """The answer to any question but stats and chi2 against batch.  Raises Problem, SolverError."""
     message = _answer(question, taken)
-    if question.name != "keyframe":
+    if question.name != "snapshot":
         taken.room.fits("the answer", len(message))
     return message
 
@@ -220,7 +220,7 @@ def _answer(question: Question, taken: QuestionCopies) -> bytes:
     if question.ask is not None:
         ready = taken.ready.get(id(question))
         return ready if isinstance(ready, bytes) else _uncertain(taken).answer(question.ask)
-    if question.name in ("estimate", "keyframe"):
+    if question.name in ("estimate", "snapshot"):
         chosen = taken.variables if question.keys is None else _chosen(taken.variables, question.keys)
         return codec.encode_estimate(Estimate(taken.epoch, taken.revision, chosen))
     if question.name == "chi2":

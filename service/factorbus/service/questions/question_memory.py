@@ -23,7 +23,7 @@ class Taken:
     def take(self, size: int) -> None:
         """So many bytes more, until it is answered.  Raises OutOfMemory."""
         if self._memory is not None and size > _LITTLE:
-            self._memory.lend(size)
+            self._memory.reserve(size)
             self.bytes += size
 
 

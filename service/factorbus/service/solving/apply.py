@@ -67,12 +67,12 @@ class MapSolver(Holding):
         self._out = np.empty(_ALONE_BYTES, np.uint8)
         self._out_bytes = self._out.data
         self._pack = codec.report_encoder()
-        self._doubt: Exception | None = None  # a fault of the solver that is still to be dealt with
+        self._fault_before: Exception | None = None  # a fault of the solver that is still to be dealt with
 
     def apply_again(
         self, inserts: Sequence[Arrived], rebuilt: bool = False, further: bool = False
     ) -> Iterator[Verdict | Stepped]:
-        """JournalRecord in what was applied in together before: no limit that has been set since refuses it.
+        """Apply what was applied together before: no limit that has been set since refuses it.
 
         rebuilt: the solver was replaced meanwhile.  further: there was nothing, it was a further step.
         """
@@ -85,7 +85,7 @@ class MapSolver(Holding):
             self._limits = limits
 
     def apply_whole(self, inserts: Sequence[Arrived], further: bool = False) -> tuple[list[Verdict | Stepped], Applied]:
-        """All that comes of a record, at its end.  Of the same inserts in the same groups always the same, to the bit."""
+        """All that comes of them, at its end.  Of the same inserts in the same groups always the same, to the bit."""
         came = self.apply_batch(inserts, further)
         if isinstance(came, SingleInsertResult):
             judged = Verdict((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
@@ -105,10 +105,10 @@ class MapSolver(Holding):
     def apply_batch(
         self, inserts: Sequence[Arrived], further: bool
     ) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
-        """All that a InsertBatch asks for: `inserts`, or a `further` step where there are none."""
+        """All that an InsertBatch asks for: `inserts`, or a `further` step where there are none."""
         if further:
             return self.go_on()
-        return self.apply_single(inserts[0]) if len(inserts) == 1 else self.record(inserts)
+        return self.apply_single(inserts[0]) if len(inserts) == 1 else self.apply(inserts)
 
     def go_on(self) -> Iterator[Stepped | Applied]:
         """One step without an insert: Stepped, unless the solver refuses it and is as it was; Applied."""
@@ -148,8 +148,8 @@ class MapSolver(Holding):
         self._next(account)
         return [self._told(account)._replace(changed=report.changed, damping=report.damping)], False
 
-    def record(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped | Applied]:
-        """JournalRecord `inserts` in; every one of them is accepted or refused whole.
+    def apply(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped | Applied]:
+        """Apply `inserts`; every one of them is accepted or refused whole.
 
         Yields, for every step, Verdict (the answers, which stand whatever becomes of the delta) and Stepped; Applied at
         the end.
@@ -226,7 +226,7 @@ class MapSolver(Holding):
             yield from self._convert_to_points(content.convert_below)
 
     def apply_single(self, insert: Arrived) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
-        """What `record` comes to for one insert: in one piece where all goes as usual, in a third of the time.
+        """What `apply` comes to for one insert: in one piece where all goes as usual, in a third of the time.
 
         That time is mostly one of code that is not in the caches: so it is written in few calls.
         """
@@ -234,21 +234,21 @@ class MapSolver(Holding):
         variables, factors = self._held
         has_room = variables + most <= limits.variables and factors + most <= limits.factors
         if not isinstance(content, ParsedInsert) or self._broken or not has_room:
-            return self.record((insert,))
+            return self.apply((insert,))
         started = time.perf_counter()
         try:
             first_factor = solver.try_stage(content.message, content.groups)
             if first_factor is None:
-                return self.record((insert,))
+                return self.apply((insert,))
             if self._wary or not is_usual(solver, variables, factors):
                 unstage(solver)
-                return self.record((insert,))
+                return self.apply((insert,))
             report = solver.step(content.settle)
         except SolverError:
-            return self.record((insert,))  # it was taken back, and is now refused in the usual way
+            return self.apply((insert,))  # it was taken back, and is now refused in the usual way
         except Exception as fault:
-            self._doubt = fault
-            return self.record((insert,))
+            self._fault_before = fault
+            return self.apply((insert,))
         try:
             changed, graph = solver.pick_changed()
             if not is_sound(changed, graph, report):
@@ -293,7 +293,7 @@ class MapSolver(Holding):
         return None
 
     def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Verdict | Stepped | Applied]:
-        """The rest of `record`, after the step."""
+        """The rest of `apply`, after the step."""
         cpu_s = time.thread_time()
         self._cpu_s += time.perf_counter() - started
         yield from self._stepped([staged], [], report, started)
@@ -309,11 +309,11 @@ class MapSolver(Holding):
         started = time.perf_counter()
         staged: list[_Staged] = []
         outcomes: list[Outcome] = []
-        doubt, self._doubt = self._doubt, None
+        fault, self._fault_before = self._fault_before, None
         kept: Any = None  # the solver as it was, where inserts are tried on a copy
         try:
-            if doubt is not None:
-                raise doubt
+            if fault is not None:
+                raise fault
             for insert in inserts:
                 try:
                     staged.append(self._stage(insert))
@@ -427,7 +427,7 @@ class MapSolver(Holding):
         Where that step fails they stay what they are.
         """
         started = time.perf_counter()
-        keys = self._solver.ripe(below)
+        keys = self._solver.convertible(below)
         if not keys.size:
             return
         try:

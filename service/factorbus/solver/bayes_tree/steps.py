@@ -23,7 +23,7 @@ from factorbus.solver.optimize.gauss_newton import Course, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
-from factorbus.solver.report import CompileSplit, StepReport, Stopwatch
+from factorbus.solver.report import PhaseShares, StepReport, Stopwatch
 from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
 from factorbus.solver.sparse.elimination import Elimination
 from factorbus.wording import counted
@@ -250,7 +250,7 @@ class TreeSteps:
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
         told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
-        nonzeros, asleep, changed, eliminated, relinearized, _, moved, flops, rounds = told[:_COUNTS]
+        nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = told[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
@@ -276,12 +276,12 @@ class TreeSteps:
             self._moved.size if course else changed,
             relinearized,
             eliminated,
-            asleep,
+            inactive,
             nonzeros,
             float(flops),
             0.0,  # damping
             converged,
-            CompileSplit(tl.PHASES, told[_COUNTS:], compiled_ms),
+            PhaseShares(tl.PHASES, told[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip

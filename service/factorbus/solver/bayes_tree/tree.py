@@ -22,7 +22,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
 from factorbus.solver.options import Options
-from factorbus.solver.sparse.lending import TASK_QUEUE
+from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 
 _FEW = 8  # new variables for which good first values are looked for
 

@@ -28,7 +28,7 @@ class FactorAccount:
 
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
     loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one   rho: ρ(s), what it counts in χ²; s without a loss
-    asleep: why a sight has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
+    inactive: why a sight has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
     influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: by how much χ² would fall without it (10.8); None: nothing else measures what it does
     of a piece of negative weight (`joints`) Ω = −L Lᵀ: χ² and influence are not above 0, and there is no `without`
@@ -46,7 +46,7 @@ class FactorAccount:
     loss: str
     weight: float
     rho: float
-    asleep: str
+    inactive: str
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
@@ -157,7 +157,7 @@ def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccoun
     softened, W, T = linear.r[0, :d], linear.W[0, :d, :d], T[:d, :d]
     keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
     r, s = _plain(graph, place, d)
-    rho, asleep = _chi2(graph, place), sights.why_asleep(graph, place)
+    rho, inactive = _chi2(graph, place), sights.why_inactive(graph, place)
     sign = -1.0 if W[0, 0] < 0.0 else 1.0
     L = np.linalg.cholesky(sign * W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
@@ -167,8 +167,8 @@ def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccoun
         without = rho + float(pull @ np.linalg.solve(np.eye(d) - M, M @ pull))
     return FactorAccount(
         factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,
-        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), 0.0 if asleep else _weight(r, softened), rho,
-        asleep,
+        LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), 0.0 if inactive else _weight(r, softened), rho,
+        inactive,
     )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ def check(graph: Graph, first_factor: int) -> None:
         raise errors.BadSight(graph.describe(graph.fac[row]), pixel, REASONS[int(status)])
 
 
-def asleep(graph: Graph) -> list[tuple[int, str, str]]:
+def inactive(graph: Graph) -> list[tuple[int, str, str]]:
     """(id, the factor, why) of every sight that has no pixel at the present values."""
     found, row, last = [], -1, int(graph.counts[at.FACTORS])
     while True:
@@ -60,7 +60,7 @@ def asleep(graph: Graph) -> list[tuple[int, str, str]]:
         found.append((int(graph.ids_of(np.array([row]))[0]), graph.describe(graph.fac[row]), REASONS[int(status)]))
 
 
-def why_asleep(graph: Graph, factor: int) -> str:
+def why_inactive(graph: Graph, factor: int) -> str:
     """Why the sight `factor` has no pixel at the present values; empty: it has one, or is no sight."""
     row, status = find_lost(False, factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload)
     return REASONS[int(status)] if row >= 0 else ""

@@ -79,9 +79,9 @@ class Span:
             more = keys[self._rows[self._known : self.count]]
             self._apart = _behind_each_other(self._apart, self._apart[: self._known], more)
             self._known = self.count
-        lent = self._apart[: self.count]
-        lent.flags.writeable = False
-        return lent
+        view = self._apart[: self.count]
+        view.flags.writeable = False
+        return view
 
     def _look_at(self, keys: I64, values: F64) -> None:
         """Remember these arenas from the first of them on: to shape them takes as long as to copy a hundred values."""

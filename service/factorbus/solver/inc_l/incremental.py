@@ -51,7 +51,7 @@ class Incremental:
         """Bytes of R, in fronts and in block rows."""
         return self.elimination.memory_bytes() + self.rows.memory_bytes()
 
-    def record(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
+    def apply(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
         """R and d follow what came after `since`, which Λ and η hold already; or R is given up."""
         if not self.have_r:
             return Plan("full", "the linearization point has moved, or nothing was factorized yet")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph import observations as sights
+from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.inc_l.incremental import Incremental, Where
 from factorbus.solver.inc_l.strategy import Plan
@@ -199,7 +199,7 @@ class IncrementalSteps:
         if suspects.size:
             self._system.factor.moved()
             return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
-        return self._system.factor.record(self._graph, self._system.blocks, self._done.graph, watch)
+        return self._system.factor.apply(self._graph, self._system.blocks, self._done.graph, watch)
 
     def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> tuple[Course, bool]:
         """Gauss-Newton from the present values, or between forced batches one linear step; and whether that is the
@@ -293,7 +293,7 @@ class IncrementalSteps:
             changed=int(self._changed.size),
             relinearized=course.iterations * columns,
             eliminated=plan.rows + course.factorizations * columns,
-            asleep=len(sights.asleep(self._graph)) if self._graph.sights else 0,
+            inactive=len(observations.inactive(self._graph)) if self._graph.sights else 0,
             nnz_r=nonzeros,
             flops=flops,
             damping=course.damping,

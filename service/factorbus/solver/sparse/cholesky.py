@@ -14,9 +14,9 @@ from factorbus.solver.kernels.sparse.triangular_solve import (
     solve_lower,
     solve_upper,
 )
-from factorbus.solver.sparse.lending import TASK_QUEUE
 from factorbus.solver.sparse.ordering import integers
 from factorbus.solver.sparse.symbolic import Symbolic
+from factorbus.solver.sparse.worker_threads import TASK_QUEUE
 from factorbus.wording import counted
 
 _LINE = 8  # doubles in a cache line

@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from factorbus.client.interruptible_future import InterruptibleFuture
 from factorbus.client.link import Link
-from factorbus.client.promise import InterruptibleFuture
 from factorbus.client.replies import Again, Reply, Silence, judge
 from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import ClosedHere, Problem, Refused, Unavailable
@@ -62,12 +62,12 @@ class RequestSender:
         self._due: list[tuple[float, int, Request]] = []
         self._order = itertools.count()
         self._open: set[Request] = set()
-        self._lock = threading.RLock()  # entered itself, and not by its condition: see `promise.py`
+        self._lock = threading.RLock()  # entered itself, and not by its condition: see `interruptible_future.py`
         self._changed = threading.Condition(self._lock)
         self._closed = False
         self._heard = False  # somebody has answered here, if only with a problem
         self._look_at = 0.0
-        self._thread = threading.Thread(target=self._run, name="factorbus-sender", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="factorbus-request-sender", daemon=True)
         self._thread.start()
 
     def carry(self, request: Request) -> Request:

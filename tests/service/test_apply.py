@@ -48,7 +48,7 @@ def waiting(content: Batch | Problem, client: str = "a", sequence: int = 1, sett
 
 @dataclass(frozen=True)
 class Result:
-    """All that came of one record."""
+    """All that came of one apply."""
 
     outcomes: tuple[Outcome, ...]
     steps: tuple[Stepped, ...]
@@ -56,8 +56,8 @@ class Result:
     factors: int
 
 
-def record(folder: MapSolver, *inserts: Arrived) -> Result:
-    *events, end = folder.record(inserts)
+def apply(map_solver: MapSolver, *inserts: Arrived) -> Result:
+    *events, end = map_solver.apply(inserts)
     assert isinstance(end, Applied)
     outcomes = tuple(o for e in events if isinstance(e, Verdict) for o in e.outcomes)
     assert sorted(map(id, inserts)) == sorted(id(o.insert) for o in outcomes), "everybody is answered once"
@@ -76,8 +76,8 @@ def deltas(applied: Result) -> list[Delta]:
     return [codec.decode_delta(step.delta) for step in applied.steps]
 
 
-def values(folder: MapSolver) -> dict[int, bytes]:
-    taken = folder.snapshot([Question("estimate")])
+def values(map_solver: MapSolver) -> dict[int, bytes]:
+    taken = map_solver.snapshot([Question("estimate")])
     return {
         int(key): row.tobytes() for g in taken.variables if g.values is not None
         for key, row in zip(g.keys, g.values, strict=True)
@@ -89,15 +89,15 @@ def make() -> Solver:
 
 
 @pytest.fixture
-def folder() -> MapSolver:
+def map_solver() -> MapSolver:
     made = MapSolver(make, EPOCH, Limits())
-    record(made, waiting(start()))
+    apply(made, waiting(start()))
     return made
 
 
-def test_several_inserts_in_one_step(folder: MapSolver) -> None:
-    applied = record(
-        folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2)
+def test_several_inserts_in_one_step(map_solver: MapSolver) -> None:
+    applied = apply(
+        map_solver, waiting(pose("x1", "x0")), waiting(pose("x2", "x0"), "b"), waiting(pose("x3", "x1"), "a", 2)
     )
     assert codes(applied) == ["accepted"] * 3
     assert [(a.revision, a.first_factor, a.applied, a.epoch) for a in accepted(applied)] == [
@@ -112,9 +112,9 @@ def test_several_inserts_in_one_step(folder: MapSolver) -> None:
     assert delta.report["solver_ms"] > 0
 
 
-def test_a_bad_insert_is_refused_and_the_others_go_on(folder: MapSolver) -> None:
-    applied = record(
-        folder,
+def test_a_bad_insert_is_refused_and_the_others_go_on(map_solver: MapSolver) -> None:
+    applied = apply(
+        map_solver,
         waiting(pose("x1", "x0")),
         waiting(pose("x1", "x0"), "b"),
         waiting(pose("x2", "x9"), "c"),
@@ -132,42 +132,42 @@ def test_a_bad_insert_is_refused_and_the_others_go_on(folder: MapSolver) -> None
     assert len(applied.steps) == 1
 
 
-def test_nothing_accepted_means_no_step_and_not_a_bit_changed(folder: MapSolver) -> None:
-    record(folder, waiting(pose("x1", "x0")))
-    before = values(folder)
-    applied = record(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x7"), "b"))
+def test_nothing_accepted_means_no_step_and_not_a_bit_changed(map_solver: MapSolver) -> None:
+    apply(map_solver, waiting(pose("x1", "x0")))
+    before = values(map_solver)
+    applied = apply(map_solver, waiting(pose("x1", "x0")), waiting(pose("x2", "x7"), "b"))
     assert codes(applied) == ["duplicate_variable", "unknown_variable"]
     assert applied.steps == ()
-    assert values(folder) == before
-    assert folder.snapshot([Question("chi2")]).revision == 2
+    assert values(map_solver) == before
+    assert map_solver.snapshot([Question("chi2")]).revision == 2
 
 
-def test_when_the_step_fails_only_the_guilty_are_refused(folder: MapSolver) -> None:
+def test_when_the_step_fails_only_the_guilty_are_refused(map_solver: MapSolver) -> None:
     alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
-    applied = record(folder, waiting(pose("x1", "x0")), waiting(alone, "b"), waiting(pose("x2", "x1"), "c"))
+    applied = apply(map_solver, waiting(pose("x1", "x0")), waiting(alone, "b"), waiting(pose("x2", "x1"), "c"))
     assert codes(applied) == ["accepted", "underconstrained", "accepted"]
     assert [step.revision for step in applied.steps] == [2, 3], "one step each"
-    assert parse_symbol("x8") not in values(folder)
+    assert parse_symbol("x8") not in values(map_solver)
     assert [a.first_factor for a in accepted(applied)] == [0, 1]
 
 
-def test_a_lonely_guilty_insert_is_tried_once(folder: MapSolver) -> None:
+def test_a_lonely_guilty_insert_is_tried_once(map_solver: MapSolver) -> None:
     alone = Batch((Variables("se2", keys_of("x8"), np.zeros((1, 3))),))
-    applied = record(folder, waiting(alone))
+    applied = apply(map_solver, waiting(alone))
     assert (codes(applied), applied.steps, applied.variables) == (["underconstrained"], (), 1)
 
 
-def test_a_map_has_a_size(folder: MapSolver) -> None:
+def test_a_map_has_a_size(map_solver: MapSolver) -> None:
     small = MapSolver(make, EPOCH, Limits(variables=2, factors=1))
-    applied = record(small, waiting(start()), waiting(pose("x1", "x0"), "b"), waiting(pose("x2", "x0"), "c"))
+    applied = apply(small, waiting(start()), waiting(pose("x1", "x0"), "b"), waiting(pose("x2", "x0"), "c"))
     assert codes(applied) == ["accepted", "accepted", "too_large"]
     assert [o.answer.detail["limit"] for o in applied.outcomes if isinstance(o.answer, Problem)] == [2]
 
 
-def test_settle_iterates_until_converged(folder: MapSolver) -> None:
-    record(folder, waiting(pose("x1", "x0")), waiting(pose("x2", "x1"), "b"))
-    record(folder, waiting(Batch(factors=(edge("x0", "x2", 2.5),))))
-    applied = record(folder, waiting(Batch(), settle=True))
+def test_settle_iterates_until_converged(map_solver: MapSolver) -> None:
+    apply(map_solver, waiting(pose("x1", "x0")), waiting(pose("x2", "x1"), "b"))
+    apply(map_solver, waiting(Batch(factors=(edge("x0", "x2", 2.5),))))
+    applied = apply(map_solver, waiting(Batch(), settle=True))
     assert deltas(applied)[0].report["converged"] is True
 
 
@@ -215,54 +215,56 @@ class Faulty(Solver):
 
 def with_faults() -> tuple[MapSolver, list[str]]:
     failing: list[str] = []
-    folder = MapSolver(lambda: Faulty(failing), EPOCH, Limits())
+    map_solver = MapSolver(lambda: Faulty(failing), EPOCH, Limits())
     for sequence, batch in enumerate((start(), pose("x1", "x0"), pose("x2", "x1")), 1):
-        record(folder, waiting(batch, sequence=sequence))
-    return folder, failing
+        apply(map_solver, waiting(batch, sequence=sequence))
+    return map_solver, failing
 
 
 @pytest.mark.parametrize("fault", ["before stage", "after stage", "before step", "after step"])
 def test_a_fault_of_the_solver_refuses_its_insert_and_keeps_what_was_accepted(fault: str) -> None:
-    folder, failing = with_faults()
-    held = set(values(folder))
+    map_solver, failing = with_faults()
+    held = set(values(map_solver))
     failing.append(fault)
-    applied = record(folder, waiting(pose("x3", "x2")))
+    applied = apply(map_solver, waiting(pose("x3", "x2")))
     assert codes(applied) == ["internal"]
-    assert set(values(folder)) == held
+    assert set(values(map_solver)) == held
     (delta,) = deltas(applied)
     assert (delta.previous, delta.revision) == (3, 4), "readers are told of everything again"
     assert {int(k) for g in delta.variables for k in g.keys} == held
-    assert codes(record(folder, waiting(pose("x3", "x2"), sequence=2))) == ["accepted"]
+    assert codes(apply(map_solver, waiting(pose("x3", "x2"), sequence=2))) == ["accepted"]
 
 
 def test_a_fault_after_the_answer_costs_only_a_delta() -> None:
-    folder, failing = with_faults()
+    map_solver, failing = with_faults()
     failing.append("before changed")
-    applied = record(folder, waiting(pose("x3", "x2")))
+    applied = apply(map_solver, waiting(pose("x3", "x2")))
     assert codes(applied) == ["accepted"]
     (delta,) = deltas(applied)
     assert (accepted(applied)[0].revision, delta.previous, delta.revision) == (4, 4, 5), "a reader at 3 sees the gap"
-    assert {int(k) for g in delta.variables for k in g.keys} == set(values(folder))
+    assert {int(k) for g in delta.variables for k in g.keys} == set(values(map_solver))
 
 
 def test_a_fault_among_several_inserts_hits_only_the_one_that_brings_it() -> None:
-    folder, failing = with_faults()
+    map_solver, failing = with_faults()
     failing.append("x13")
-    applied = record(folder, waiting(pose("x3", "x2")), waiting(pose("x13", "x2"), "b"), waiting(pose("x4", "x2"), "c"))
+    applied = apply(
+        map_solver, waiting(pose("x3", "x2")), waiting(pose("x13", "x2"), "b"), waiting(pose("x4", "x2"), "c")
+    )
     assert codes(applied) == ["accepted", "internal", "accepted"]
-    assert set(values(folder)) == set(keys_of("x0", "x1", "x2", "x3", "x4").tolist())
+    assert set(values(map_solver)) == set(keys_of("x0", "x1", "x2", "x3", "x4").tolist())
     assert [d.revision - d.previous for d in deltas(applied)] == [1] * len(applied.steps)
 
 
 def test_what_cannot_be_brought_back_is_said_for_good() -> None:
-    folder, failing = with_faults()
+    map_solver, failing = with_faults()
     failing += ["before step", "before graph"]
-    assert codes(record(folder, waiting(pose("x3", "x2")))) == ["internal"]
-    applied = record(folder, waiting(pose("x4", "x2")))
+    assert codes(apply(map_solver, waiting(pose("x3", "x2")))) == ["internal"]
+    applied = apply(map_solver, waiting(pose("x4", "x2")))
     assert codes(applied) == ["internal"]
     assert "drop it" in applied.outcomes[0].answer.message
     with pytest.raises(Problem, match="drop it"):
-        folder.snapshot([Question("estimate")])
+        map_solver.snapshot([Question("estimate")])
 
 
 # ---- one insert, read where it lies -------------------------------------------------------------------------------
@@ -276,9 +278,9 @@ def located(batch: Batch, sequence: int = 1, settle: bool = False) -> Arrived:
     return arrived._replace(askers=[])
 
 
-def apply_single(folder: MapSolver, insert: Arrived) -> tuple[Result, bool]:
+def apply_single(map_solver: MapSolver, insert: Arrived) -> tuple[Result, bool]:
     """What came of it, and whether it was had in one piece."""
-    events = folder.apply_single(insert)
+    events = map_solver.apply_single(insert)
     if isinstance(events, SingleInsertResult):
         outcome = Outcome(events.insert, events.answer, events.first_factor)
         stepped = Stepped(events.revision, events.delta, events.strategy, events.chi2, events.solver_ms)
@@ -314,28 +316,28 @@ def test_one_insert_comes_to_the_same_either_way(mode: str) -> None:
     for sequence, batch in enumerate(random_steps(3, steps=25), 1):
         settle = sequence % 10 == 0
         applied, in_one_piece = apply_single(quick, located(batch, sequence, settle))
-        assert told(applied) == told(record(usual, waiting(batch, sequence=sequence, settle=settle)))
+        assert told(applied) == told(apply(usual, waiting(batch, sequence=sequence, settle=settle)))
         alone += in_one_piece
     assert alone > 10, "where there is room"
     assert values(quick) == values(usual)
 
 
-def test_a_guilty_insert_is_refused_in_the_same_words_either_way(folder: MapSolver) -> None:
+def test_a_guilty_insert_is_refused_in_the_same_words_either_way(map_solver: MapSolver) -> None:
     for n in range(1, 20):
-        apply_single(folder, located(pose(f"x{n}", f"x{n - 1}")))
+        apply_single(map_solver, located(pose(f"x{n}", f"x{n - 1}")))
     lonely = Batch((Variables("se2", keys_of("x80"), np.zeros((1, 3))),))
-    before = values(folder)
+    before = values(map_solver)
     for bad in (pose("x1", "x0"), pose("x90", "x77"), lonely, Batch(factors=(edge("x1", "x1"),))):
-        quick, in_one_piece = apply_single(folder, located(bad))
+        quick, in_one_piece = apply_single(map_solver, located(bad))
         assert not in_one_piece
-        assert told(quick) == told(record(folder, waiting(bad)))
-        assert quick.outcomes[0].answer.message == record(folder, waiting(bad)).outcomes[0].answer.message
-    assert values(folder) == before
-    assert apply_single(folder, located(Batch(factors=(edge("x3", "x5", 2.0),))))[1], "and the next one is taken"
+        assert told(quick) == told(apply(map_solver, waiting(bad)))
+        assert quick.outcomes[0].answer.message == apply(map_solver, waiting(bad)).outcomes[0].answer.message
+    assert values(map_solver) == before
+    assert apply_single(map_solver, located(Batch(factors=(edge("x3", "x5", 2.0),))))[1], "and the next one is taken"
 
 
-def test_several_located_inserts_in_one_step(folder: MapSolver) -> None:
-    applied = record(folder, located(pose("x1", "x0")), located(pose("x2", "x0"), 2), located(pose("x2", "x0"), 3))
+def test_several_located_inserts_in_one_step(map_solver: MapSolver) -> None:
+    applied = apply(map_solver, located(pose("x1", "x0")), located(pose("x2", "x0"), 2), located(pose("x2", "x0"), 3))
     assert codes(applied) == ["accepted", "accepted", "duplicate_variable"]
 
 
@@ -345,32 +347,32 @@ def test_the_size_of_a_map_is_kept_either_way() -> None:
     assert [code for result in applied for code in codes(result)] == ["accepted", "accepted", "too_large"]
 
 
-def test_what_does_not_fit_into_one_piece_is_told_in_two(folder: MapSolver) -> None:
-    folder._out = folder._out[:100]
+def test_what_does_not_fit_into_one_piece_is_told_in_two(map_solver: MapSolver) -> None:
+    map_solver._out = map_solver._out[:100]
     for n in range(1, 6):
-        applied, in_one_piece = apply_single(folder, located(pose(f"x{n}", f"x{n - 1}")))
+        applied, in_one_piece = apply_single(map_solver, located(pose(f"x{n}", f"x{n - 1}")))
         assert not in_one_piece
         assert [(d.previous, d.revision) for d in deltas(applied)] == [(n, n + 1)]
 
 
 @pytest.mark.parametrize("fault", ["before try_stage", "after try_stage", "before step", "after step"])
 def test_a_fault_with_a_located_insert_refuses_it_and_keeps_what_was_accepted(fault: str) -> None:
-    folder, failing = with_faults()
-    held = set(values(folder))
+    map_solver, failing = with_faults()
+    held = set(values(map_solver))
     failing.append(fault)
-    applied, in_one_piece = apply_single(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    applied, in_one_piece = apply_single(map_solver, located(Batch(factors=(edge("x1", "x2", 2.0),))))
     assert (codes(applied), in_one_piece) == (["internal"], False)
     (delta,) = deltas(applied)
     assert (delta.previous, delta.revision, applied.steps[0].rebuilt) == (3, 4, True)
-    assert {int(k) for g in delta.variables for k in g.keys} == held == set(values(folder))
-    assert codes(apply_single(folder, located(pose("x3", "x2"), 2))[0]) == ["accepted"]
+    assert {int(k) for g in delta.variables for k in g.keys} == held == set(values(map_solver))
+    assert codes(apply_single(map_solver, located(pose("x3", "x2"), 2))[0]) == ["accepted"]
 
 
 def test_a_fault_after_the_step_of_a_located_insert_costs_only_a_delta() -> None:
-    folder, failing = with_faults()
+    map_solver, failing = with_faults()
     failing += ["before pick_changed", "before changed"]
-    applied, in_one_piece = apply_single(folder, located(Batch(factors=(edge("x1", "x2", 2.0),))))
+    applied, in_one_piece = apply_single(map_solver, located(Batch(factors=(edge("x1", "x2", 2.0),))))
     assert (codes(applied), in_one_piece) == (["accepted"], False)
     (delta,) = deltas(applied)
     assert (accepted(applied)[0].revision, delta.previous, delta.revision) == (4, 4, 5)
-    assert {int(k) for g in delta.variables for k in g.keys} == set(values(folder))
+    assert {int(k) for g in delta.variables for k in g.keys} == set(values(map_solver))

@@ -1,7 +1,7 @@
-"""Where threads of this process lend their cores to the eliminations of this process.  MATH §9.5.
+"""Where worker threads of this process work on the eliminations of this process.  MATH §9.5.
 
-The solver has no thread of its own: whoever has one to spare makes a `WorkerThread`, and calls its `lend` on that thread.
-There is one board in a process, as there is one set of cores.
+The solver has no thread of its own: whoever has one to spare makes a `WorkerThread`, and calls its `run` on that
+thread. There is one board in a process, as there is one set of cores.
 """
 
 import ctypes
@@ -17,29 +17,29 @@ from factorbus.solver.kernels.sparse import task_queue as at
 TASK_QUEUE: I64 = lines(at.WORDS, np.int64)  # see `kernels/sparse/task_queue.py`
 _NOTHING: I64 = np.empty(0, np.int64)
 
-# Words of lenders that nobody has; none where threads cannot sleep in a kernel.
+# Words of workers that nobody has; none where threads cannot sleep in a kernel.
 _free = list(range(at.LENDERS, at.WORDS, 8)) if CAN_SLEEP else []
 
 
 def count_free() -> int:
-    """How many lenders there may be in addition to those that there are."""
+    """How many workers there may be in addition to those that there are."""
     return len(_free)
 
 
 def can_work() -> bool:
-    """Whether the kernel that lenders run is compiled or loaded: called before, `lend` has to do that first."""
+    """Whether the kernel that workers run is compiled or loaded: called before, `run` has to do that first."""
     return CAN_SLEEP and bool(tree_step.signatures)
 
 
 class WorkerThread:
-    """One thread that lends its core.  Raises ValueError when there are as many as there may be.
+    """A worker thread.  Raises ValueError when there are as many as there may be.
 
     made: chunks of eliminations that it has made.
     """
 
     def __init__(self) -> None:
         if not _free:
-            raise ValueError(f"{at.MOST} threads lend their cores, which is all that can, or none can on this system")
+            raise ValueError(f"{at.MOST} worker threads, which is all that can, or none can on this system")
         self._word = _free.pop()
         self._semaphore = ctypes.c_void_p(TASK_QUEUE.ctypes.data + 8 * (self._word + at.ASLEEP))
         self._libc = ctypes.CDLL(None)
@@ -51,7 +51,7 @@ class WorkerThread:
     def made(self) -> int:
         return int(self._line[at.MADE])
 
-    def lend(self) -> None:
+    def run(self) -> None:
         """Returns after `leave`.  Once, on the thread whose core it is."""
         tree_step(_NOTHING, _NOTHING, TASK_QUEUE, self._word)
         self._line[0] = at.AWAY
@@ -59,6 +59,6 @@ class WorkerThread:
         _free.append(self._word)
 
     def leave(self) -> None:
-        """Have `lend` return, if need be after the chunk that it is at.  Once."""
+        """Have `run` return, if need be after the chunk that it is at.  Once."""
         self._line[0] = at.LEAVES
         self._libc.sem_post(self._semaphore)

@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from factorbus.viz.rate_limited import RateLimited
 
 from factorbus.client import Map, Snapshot
 from factorbus.client.stream import DeltaStream
@@ -18,6 +17,7 @@ from factorbus.proto.messages import Batch, Delta, Factors, Graph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.viz.certainty import MapCertainty
 from factorbus.viz.ellipses import Spread
+from factorbus.viz.rate_limit import RateLimited
 
 
 @dataclass(frozen=True, slots=True)

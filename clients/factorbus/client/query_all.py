@@ -10,7 +10,7 @@ from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, Unavailable
 
 
-def gather(link: Link, operation: str, timeout_s: float) -> list[bytes]:
+def query_all(link: Link, operation: str, timeout_s: float) -> list[bytes]:
     """What all who answer `admin/<operation>` say; asked again until somebody does.
 
     Raises Refused, Unavailable, OtherProtocol.

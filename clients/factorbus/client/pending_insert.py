@@ -2,9 +2,8 @@
 
 from concurrent.futures import Future
 
-from factorbus.client.sender import Request
-
 from factorbus.client.arguments import seconds
+from factorbus.client.request_sender import Request
 from factorbus.proto.messages import Accepted
 from factorbus.proto.problems import Unavailable
 

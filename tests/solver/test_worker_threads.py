@@ -1,4 +1,4 @@
-"""Threads that lend their cores: what an elimination comes to does not depend on them, nor does it wait for them."""
+"""Worker threads: what an elimination comes to does not depend on them, nor does it wait for them."""
 
 import threading
 from collections.abc import Iterator
@@ -28,27 +28,27 @@ from factorbus.solver.kernels.bayes_tree.eliminate import (
 from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
 from factorbus.solver.kernels.sparse.task_queue import MOST
-from factorbus.solver.sparse.lending import TASK_QUEUE, WorkerThread, count_free
+from factorbus.solver.sparse.worker_threads import TASK_QUEUE, WorkerThread, count_free
 
 pytestmark = pytest.mark.skipif(
-    count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be lent"
+    count_free() == 0, reason="threads cannot sleep in kernels here, so no core can be working"
 )
 
 POSES = 1500
 
 
 @contextmanager
-def lent(count: int = 1) -> Iterator[list[WorkerThread]]:
-    """So many threads lend their cores meanwhile."""
-    lenders = [WorkerThread() for _ in range(count)]
-    threads = [threading.Thread(target=lender.lend) for lender in lenders]
+def working(count: int = 1) -> Iterator[list[WorkerThread]]:
+    """So many worker threads meanwhile."""
+    workers = [WorkerThread() for _ in range(count)]
+    threads = [threading.Thread(target=worker.run) for worker in workers]
     for thread in threads:
         thread.start()
     try:
-        yield lenders
+        yield workers
     finally:
-        for lender in lenders:
-            lender.leave()
+        for worker in workers:
+            worker.leave()
         for thread in threads:
             thread.join()
 
@@ -82,8 +82,8 @@ def eliminated(driven: Solver) -> tuple[list[bytes], int]:
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_front_has_the_same_bits(p: int, m: int, count: int) -> None:
     expected = factorized(p, m)
-    with lent(count) as lenders:
-        while not any(lender.made for lender in lenders):
+    with working(count) as workers:
+        while not any(worker.made for worker in workers):
             assert factorized(p, m) == expected
     assert factorized(p, m) == expected
 
@@ -104,8 +104,8 @@ def factorized(p: int, m: int) -> bytes:
 @pytest.mark.parametrize("count", [1, MOST])
 def test_a_whole_map_has_the_same_bits(driven: Solver, count: int) -> None:
     alone = eliminated(driven)
-    with lent(count) as lenders:
-        while not any(lender.made for lender in lenders):
+    with working(count) as workers:
+        while not any(worker.made for worker in workers):
             assert eliminated(driven) == alone
     assert eliminated(driven) == alone
 
@@ -120,15 +120,15 @@ def test_a_drive_has_the_same_bits() -> None:
         return numbers(solver), flops
 
     alone = drive()
-    with lent() as (lender,):
-        while not lender.made:
+    with working() as (worker,):
+        while not worker.made:
             assert drive() == alone
 
 
 def test_maps_that_are_eliminated_at_once_share_the_cores(driven: Solver) -> None:
     alone, found = eliminated(driven), []
-    with lent() as (lender,):
-        while not lender.made:
+    with working() as (worker,):
+        while not worker.made:
             threads = [threading.Thread(target=lambda: found.append(eliminated(driven))) for _ in range(3)]
             for thread in threads:
                 thread.start()
@@ -159,29 +159,29 @@ def test_pivots_below_rounding_are_raised_alike() -> None:
         return b"".join(group.values.tobytes() for group in solver.estimate())
 
     alone = taken()
-    with lent() as (lender,):
-        while not lender.made:
+    with working() as (worker,):
+        while not worker.made:
             assert taken() == alone
 
 
 def test_who_leaves_is_no_longer_there_and_makes_room_for_others(driven: Solver) -> None:
     alone, free = eliminated(driven), count_free()
     for _ in range(2 * MOST):
-        with lent(2) as lenders:
+        with working(2) as workers:
             assert count_free() == free - 2
         assert count_free() == free
-    made = [lender.made for lender in lenders]
+    made = [worker.made for worker in workers]
     assert eliminated(driven) == alone
-    assert [lender.made for lender in lenders] == made
+    assert [worker.made for worker in workers] == made
 
 
 def test_there_is_room_for_so_many_and_no_more() -> None:
-    with lent(count_free()), pytest.raises(ValueError, match=f"{MOST} threads lend their cores"):
+    with working(count_free()), pytest.raises(ValueError, match=f"{MOST} worker threads"):
         WorkerThread()
 
 
 @given(st.lists(st.tuples(st.integers(1, 300), st.integers(0, 600)), max_size=60), st.data(), st.integers(1, 3))
-def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: st.DataObject, lenders: int) -> None:
+def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: st.DataObject, workers: int) -> None:
     records = np.zeros((len(sizes), fr.FRONT), np.int64)
     records[:, fr.PARENT] = -1
     # Postorder: who comes next takes some of the last roots as children.
@@ -191,12 +191,12 @@ def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: s
         for _ in range(data.draw(st.integers(0, min(len(roots), 3)))):
             records[roots.pop(), fr.PARENT] = f
         roots.append(f)
-    cut = cut_subtrees(records, lenders)
+    cut = cut_subtrees(records, workers)
     takes = [(p + ASSEMBLY) * (p + m + 1) ** 2 + BOOKKEEPING for p, m in sizes]
     if sum(takes) < LONG:
         assert len(cut) == 0
         return
-    most, above = sum(takes) / (PIECES * (1 + lenders)), records[:, fr.PARENT]
+    most, above = sum(takes) / (PIECES * (1 + workers)), records[:, fr.PARENT]
     inside = np.full(len(sizes), -1)
     for k, (first, end) in enumerate(cut[:, [FIRST, END]]):
         assert (inside[first:end] == -1).all()

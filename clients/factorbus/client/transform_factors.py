@@ -1,9 +1,9 @@
 """Factors of a map that goes into another frame: most relative ones are the same in every frame."""
 
 import numpy as np
-from factorbus.client.transform_linear import transform_linear
 
 from factorbus.client.frames import rotation
+from factorbus.client.transform_linear import transform_linear
 from factorbus.proto.arrays import F64
 from factorbus.proto.linear import LINEAR_PAIRS
 from factorbus.proto.messages import Factors

@@ -10,7 +10,7 @@ from types import FrameType
 
 import pytest
 
-from factorbus.client.promise import InterruptibleFuture
+from factorbus.client.interruptible_future import InterruptibleFuture
 
 WAITERS = 4
 INTERRUPTS = 200
@@ -18,44 +18,44 @@ _PAUSE_S = 1e-4
 
 
 def test_all_who_wait_get_it() -> None:
-    promise: InterruptibleFuture[int] = InterruptibleFuture()
+    future: InterruptibleFuture[int] = InterruptibleFuture()
     with ThreadPoolExecutor(WAITERS) as pool:
-        waiting = [pool.submit(promise.result, 60) for _ in range(WAITERS)]
-        promise.set_result(7)
+        waiting = [pool.submit(future.result, 60) for _ in range(WAITERS)]
+        future.set_result(7)
         assert [each.result() for each in waiting] == [7] * WAITERS
-    assert promise.result() == promise.result(0) == 7
-    assert promise.exception() is None
+    assert future.result() == future.result(0) == 7
+    assert future.exception() is None
 
 
 def test_what_failed_raises_for_all() -> None:
-    promise: InterruptibleFuture[int] = InterruptibleFuture()
-    promise.set_exception(KeyError("x1"))
+    future: InterruptibleFuture[int] = InterruptibleFuture()
+    future.set_exception(KeyError("x1"))
     for _ in range(2):
         with pytest.raises(KeyError, match="x1"):
-            promise.result(0)
-    assert isinstance(promise.exception(0), KeyError)
+            future.result(0)
+    assert isinstance(future.exception(0), KeyError)
 
 
 @pytest.mark.parametrize("timeout_s", [0.0, 0.001, -1.0])
 def test_time_is_up(timeout_s: float) -> None:
-    promise: InterruptibleFuture[int] = InterruptibleFuture()
+    future: InterruptibleFuture[int] = InterruptibleFuture()
     with pytest.raises(TimeoutError):
-        promise.result(timeout_s)
-    assert not promise.done()
+        future.result(timeout_s)
+    assert not future.done()
 
 
 def test_asyncio_waits_for_it_and_cannot_cancel_it() -> None:
-    promise: InterruptibleFuture[int] = InterruptibleFuture()
+    future: InterruptibleFuture[int] = InterruptibleFuture()
 
     async def wait() -> int:
-        impatient = asyncio.wrap_future(promise)
+        impatient = asyncio.wrap_future(future)
         impatient.cancel()
-        patient = asyncio.wrap_future(promise)
-        threading.Thread(target=promise.set_result, args=(7,)).start()
+        patient = asyncio.wrap_future(future)
+        threading.Thread(target=future.set_result, args=(7,)).start()
         return await patient
 
     assert asyncio.run(wait()) == 7
-    assert not promise.cancelled()
+    assert not future.cancelled()
 
 
 @pytest.fixture
@@ -74,24 +74,24 @@ def interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("interrupts")
 def test_interrupted_again_and_again_it_still_can_be_kept() -> None:
     for number in range(INTERRUPTS):
-        promise: InterruptibleFuture[int] = InterruptibleFuture()
+        future: InterruptibleFuture[int] = InterruptibleFuture()
         end = time.monotonic() + 60
         try:
             signal.setitimer(signal.ITIMER_REAL, _PAUSE_S * (1 + number % 7))
             while time.monotonic() < end:
-                with_no_time(promise)
+                with_no_time(future)
             pytest.fail("no signal came in a minute")
         except KeyboardInterrupt:
-            keeper = threading.Thread(target=promise.set_result, args=(number,), daemon=True)
+            keeper = threading.Thread(target=future.set_result, args=(number,), daemon=True)
             keeper.start()
             keeper.join(10)
             assert not keeper.is_alive(), "the lock is held by nobody"
-            assert promise.result(10) == number
+            assert future.result(10) == number
 
 
-def with_no_time(promise: InterruptibleFuture[int]) -> None:
+def with_no_time(future: InterruptibleFuture[int]) -> None:
     try:
-        promise.result(0)
+        future.result(0)
     except TimeoutError:
         return
     pytest.fail("there is nothing to get yet")

@@ -45,16 +45,16 @@ class SharedMemoryPool:
         matrix = memory.array(start, shape)
         return SharedAllocation(memory, memory.segment(start + 8 * first_row * shape[1]), matrix)
 
-    def settle(self, lent: SharedAllocation, clean: bool) -> None:
+    def settle(self, allocation: SharedAllocation, clean: bool) -> None:
         """The answer is there (or will not be used).  clean: nobody will write to the memory any more.
 
         It is used again once the matrix, and everything made of it, is gone.
         """
         if not clean or self._closed:
-            lent.memory.close()
+            allocation.memory.close()
         else:
             # Whatever is made of an array (slices, views of it in other libraries) keeps that array.
-            weakref.finalize(lent.matrix, self._give_back, lent.memory).atexit = False
+            weakref.finalize(allocation.matrix, self._give_back, allocation.memory).atexit = False
 
     def close(self) -> None:
         """Let go of what is spare; what is looked at lives on."""

@@ -62,15 +62,15 @@ def loop(i: int, j: int, x: float) -> Batch:
     return Batch(factors=(Factors("between_se2", keys, np.array([[x, 0.0, 0.3]]), information),))
 
 
-def make(folder: MapSolver | None = None, solver: type[Solver] = Solver) -> MapSolver:
-    folder = folder or MapSolver(lambda: solver(Options()), EPOCH, Limits())
+def make(map_solver: MapSolver | None = None, solver: type[Solver] = Solver) -> MapSolver:
+    map_solver = map_solver or MapSolver(lambda: solver(Options()), EPOCH, Limits())
     for n in range(5):
-        list(folder.record([waiting(pose(n), n + 1)]))
-    return folder
+        list(map_solver.apply([waiting(pose(n), n + 1)]))
+    return map_solver
 
 
-def came(folder: MapSolver, *inserts: Arrived) -> tuple[list[Verdict], list[Stepped]]:
-    events, _ = folder.apply_whole(inserts)
+def came(map_solver: MapSolver, *inserts: Arrived) -> tuple[list[Verdict], list[Stepped]]:
+    events, _ = map_solver.apply_whole(inserts)
     return [e for e in events if isinstance(e, Verdict)], [e for e in events if isinstance(e, Stepped)]
 
 
@@ -78,15 +78,15 @@ def outcomes(judged: list[Verdict]) -> list[Outcome]:
     return [outcome for each in judged for outcome in each.outcomes]
 
 
-def keys_in(folder: MapSolver) -> list[int]:
-    taken = folder.snapshot([Question("estimate")])
+def keys_in(map_solver: MapSolver) -> list[int]:
+    taken = map_solver.snapshot([Question("estimate")])
     return sorted(int(key) - symbol("x", 0) for group in taken.variables for key in group.keys)
 
 
 def test_a_change_is_a_step_of_its_own_whose_delta_has_everything() -> None:
-    folder = make()
+    map_solver = make()
     inserts = [waiting(pose(5), 6), waiting(gone(3, 4, 5), 7), waiting(pose(3), 8), waiting(pose(4), 9)]
-    judged, steps = came(folder, *inserts)
+    judged, steps = came(map_solver, *inserts)
     answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
     assert [(a.sequence, a.revision, a.first_factor, a.applied) for a in answers] == [
         (6, 6, 4, 1),
@@ -99,32 +99,32 @@ def test_a_change_is_a_step_of_its_own_whose_delta_has_everything() -> None:
     assert sorted(int(k) - symbol("x", 0) for g in deltas[1].variables for k in g.keys) == [0, 1, 2]
     assert answers[1].report["removed_variables"] == 3
     assert answers[1].report["removed_factors"] == 3
-    assert keys_in(folder) == [0, 1, 2, 3, 4]
-    assert folder.size == (5, 4)
+    assert keys_in(map_solver) == [0, 1, 2, 3, 4]
+    assert map_solver.size == (5, 4)
 
 
 def test_what_cannot_be_changed_is_refused_and_its_neighbours_go_on() -> None:
-    folder = make()
+    map_solver = make()
     unknown = (Change("remove_factors", np.array([77])),)
     alone = (gone(4)[0]._replace(alone=True),)
-    judged, _ = came(folder, waiting(unknown, 6), waiting(pose(5), 7), waiting(gone(2), 8), waiting(alone, 9))
+    judged, _ = came(map_solver, waiting(unknown, 6), waiting(pose(5), 7), waiting(gone(2), 8), waiting(alone, 9))
     codes = [getattr(o.answer, "code", "accepted") for o in outcomes(judged)]
     assert codes == ["unknown_factor", "accepted", "underconstrained", "in_use"]
-    assert keys_in(folder) == [0, 1, 2, 3, 4, 5]
+    assert keys_in(map_solver) == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_fault_in_a_change_leaves_the_map_as_it_was() -> None:
-    folder = make(solver=Broken)
-    judged, steps = came(folder, waiting(gone(4), 6))
+    map_solver = make(solver=Broken)
+    judged, steps = came(map_solver, waiting(gone(4), 6))
     assert [o.answer.code for o in outcomes(judged)] == ["internal"]
     assert steps == []
-    assert keys_in(folder) == [0, 1, 2, 3, 4]
-    judged, _ = came(folder, waiting(pose(5), 7))
+    assert keys_in(map_solver) == [0, 1, 2, 3, 4]
+    judged, _ = came(map_solver, waiting(pose(5), 7))
     assert codec.decode_accepted(outcomes(judged)[0].answer).revision == 6
 
 
 def test_the_same_folds_give_the_same_bits_again() -> None:
-    """As a restart records them: from the bytes of the messages."""
+    """As a restart applies them: from the bytes of the messages."""
     records = [[waiting(pose(n), n + 1)] for n in range(5)]
     records += [[waiting(pose(5), 6), waiting(gone(5), 7), waiting(pose(5, 1.2), 8)]]
     records += [
@@ -152,20 +152,20 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
 def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
-    folder = make(MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
-    came(folder, waiting(gone(4), 6))
+    map_solver = make(MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
+    came(map_solver, waiting(gone(4), 6))
     again = MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
-    again.load(folder.dump())
-    for each in (folder, again):
+    again.load(map_solver.dump())
+    for each in (map_solver, again):
         judged, _ = came(each, waiting(pose(4), 7))
         assert codec.decode_accepted(outcomes(judged)[0].answer).first_factor == 4
-    one, other = (each.snapshot([Question("estimate")]).variables for each in (folder, again))
+    one, other = (each.snapshot([Question("estimate")]).variables for each in (map_solver, again))
     assert [g.values.tobytes() for g in one] == [g.values.tobytes() for g in other]
 
 
 def test_a_change_of_factors_is_a_step_whose_delta_has_what_moved() -> None:
-    folder = make()
-    judged, steps = came(folder, waiting(loop(1, 3, 2.5), 6), waiting((weighed(4, 0.5),), 7), waiting(pose(5), 8))
+    map_solver = make()
+    judged, steps = came(map_solver, waiting(loop(1, 3, 2.5), 6), waiting((weighed(4, 0.5),), 7), waiting(pose(5), 8))
     answers = [codec.decode_accepted(outcome.answer) for outcome in outcomes(judged)]
     assert [(a.sequence, a.revision, a.applied) for a in answers] == [(6, 6, 1), (7, 7, 1), (8, 8, 1)]
     deltas = [codec.decode_delta(step.delta) for step in steps]
@@ -181,21 +181,21 @@ def test_a_change_of_factors_is_a_step_whose_delta_has_what_moved() -> None:
     }
     held = {
         int(k): row.tobytes()
-        for g in folder.snapshot([Question("estimate")]).variables
+        for g in map_solver.snapshot([Question("estimate")]).variables
         for k, row in zip(g.keys, g.values, strict=True)
     }
     assert {key: held[key] for key in told} == told
-    _, steps = came(folder, waiting((Change("remove_factors", np.array([4])),), 9))
+    _, steps = came(map_solver, waiting((Change("remove_factors", np.array([4])),), 9))
     assert codec.decode_delta(steps[0].delta).previous == 8
-    assert folder.size == (6, 5)
+    assert map_solver.size == (6, 5)
 
 
 def test_a_fault_in_a_change_of_factors_has_the_solver_replaced() -> None:
-    folder = make(solver=BrokenInPlace)
-    judged, steps = came(folder, waiting((weighed(1, 0.5),), 6))
+    map_solver = make(solver=BrokenInPlace)
+    judged, steps = came(map_solver, waiting((weighed(1, 0.5),), 6))
     assert [o.answer.code for o in outcomes(judged)] == ["internal"]
     assert [step.rebuilt for step in steps] == [True]
-    assert folder.size == (5, 4)
+    assert map_solver.size == (5, 4)
 
 
 def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_snapshot() -> None:

@@ -7,7 +7,7 @@ import pytest
 from factorbus.service.operations.compile_split import CompileSplit, functions_of
 from factorbus.solver.kernels.bayes_tree import step as tree_step
 from factorbus.solver.kernels.jit import compile as _jit
-from factorbus.solver.kernels.model import linearize as linearize
+from factorbus.solver.kernels.model import linearize
 
 KERNELS = {"a": {"a1": 10, "a2": 10}, "a small": {"a1": 10}, "b": {"b1": 9, "b2": 2}, "b small": {"b1": 9, "a2": 10}}
 

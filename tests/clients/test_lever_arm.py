@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorbus.client import Draft
-from factorbus.client.mounted import transform_se2, transform_se3
+from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.proto.messages import Batch
 from factorbus.proto.problems import BadInformation, BadShape
 from factorbus.proto.symbols import symbol
