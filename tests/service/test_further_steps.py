@@ -132,7 +132,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     steps = map_.converge()
     assert 1 <= len(steps) <= 3
     assert all(step.converged and step.further for step in steps)
-    assert map_.folder.chi2() == pytest.approx(judge.step(settle=True).chi2, rel=1e-6)
+    assert map_.map_solver.chi2() == pytest.approx(judge.step(settle=True).chi2, rel=1e-6)
     again, late = (folder_in(mode, max_iterations=10, max_nonmonotone_steps=20) for _ in range(2))
     assert recover(map_.store, again).same
     late.load(state)
@@ -310,8 +310,8 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
     assert len(told([codec.decode_delta(stepped.delta)])) == POSES
     again = folder_in("all-batch")
     assert recover(map_.store, again).same
-    assert values(again) == values(map_.folder)
-    assert again.revision == map_.folder.revision == revision + 1
+    assert values(again) == values(map_.map_solver)
+    assert again.revision == map_.map_solver.revision == revision + 1
 
 
 def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypatch: pytest.MonkeyPatch) -> None:

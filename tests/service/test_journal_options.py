@@ -4,7 +4,7 @@ import pytest
 
 from factorbus.journal.problems import JournalOption
 from factorbus.service.config import Limits
-from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.library import make_map_solver
 from factorbus.solver import Options, Tuning
 
 
@@ -19,11 +19,11 @@ from factorbus.solver import Options, Tuning
 )
 def test_what_is_no_option_or_no_value_of_it_is_refused_by_name(name: str, value: object, says: str) -> None:
     with pytest.raises(JournalOption, match=name) as refused:
-        make_folder("auto", {name: value}, 1, Limits())
+        make_map_solver("auto", {name: value}, 1, Limits())
     assert says in str(refused.value)
 
 
 def test_options_and_tuning_of_a_journal_are_those_of_the_solver() -> None:
     told = Options(max_rounds=4, tuning=Tuning(chi2_epsilon=1e-9)).as_dict()
     settings = {name: value for name, value in told.items() if name != "mode"}
-    assert make_folder("inc-l", settings, 1, Limits()).options() == {**told, "mode": "inc-l"}
+    assert make_map_solver("inc-l", settings, 1, Limits()).options() == {**told, "mode": "inc-l"}

@@ -52,7 +52,7 @@ class Session:
     """A map open, and at work without a bus."""
 
     def __init__(self, kept: Kept) -> None:
-        self.kept, self.folder, self.recovered = kept, kept.folder, kept.recovered
+        self.kept, self.map_solver, self.recovered = kept, kept.map_solver, kept.recovered
         self.keeper = kept.keeper(Untold())
         assert self.keeper.start() is None
 
@@ -62,7 +62,7 @@ class Session:
             made = read_insert(None, "a", codec.encode_insert(Insert(number, batch)), REQUEST_LIMITS, 0.0)
             assert isinstance(made, Arrived)
             inserts = [made._replace(askers=[])]
-            events, _ = self.folder.apply_whole(inserts)
+            events, _ = self.map_solver.apply_whole(inserts)
             self.keeper.hand(inserts, events)
 
     def row(self) -> dict[str, Any]:
@@ -72,14 +72,14 @@ class Session:
         return core.row()
 
     def values(self) -> dict[int, bytes]:
-        taken = self.folder.snapshot([Question("estimate")])
+        taken = self.map_solver.snapshot([Question("estimate")])
         return {int(key): row.tobytes() for g in taken.variables for key, row in zip(g.keys, g.values, strict=True)}
 
     def makers(self) -> list[Maker]:
         return self.kept.store.makers()
 
     def close(self, snapshot: bool = False) -> None:
-        self.keeper.close(self.folder.dump if snapshot else None)
+        self.keeper.close(self.map_solver.dump if snapshot else None)
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def values(library: Library, request: pytest.FixtureRequest) -> dict[int, bytes]
     """A map with twelve inserts and a snapshot after the eighth, closed; what its values were."""
     session = Session(library.make("m", request.param, Limits()))
     session.insert(*BATCHES[:SNAPSHOT])
-    session.keeper.snapshot(session.folder.dump(), 0.0)
+    session.keeper.snapshot(session.map_solver.dump(), 0.0)
     session.insert(*BATCHES[SNAPSHOT:INSERTS])
     found = session.values()
     session.close()
@@ -162,7 +162,7 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
 ) -> None:
     session = reopen()
     session.insert(BATCHES[INSERTS])
-    session.keeper.snapshot(session.folder.dump(), 0.0)
+    session.keeper.snapshot(session.map_solver.dump(), 0.0)
     session.close()
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
@@ -180,7 +180,7 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
     session.close()
     session = reopen()
     assert session.row()["reason"] == row["reason"], "a record that this build made itself compares nothing"
-    session.keeper.snapshot(session.folder.dump(), 0.0)
+    session.keeper.snapshot(session.map_solver.dump(), 0.0)
     session.close()
     session = reopen()
     assert session.recovered.other_build == ""
@@ -205,7 +205,7 @@ def test_other_bits_after_the_snapshot_are_said_and_begin_an_epoch(
     assert len(session.kept.header.epochs) == 2
     assert "other bits" in session.kept.header.epochs[-1].because
     assert session.keeper.wants_snapshot(), "another restart would not lead to these bits by another build"
-    session.keeper.snapshot(session.folder.dump(), 0.0)
+    session.keeper.snapshot(session.map_solver.dump(), 0.0)
     session.insert(BATCHES[INSERTS])
     present = session.values()
     session.close()
@@ -233,7 +233,7 @@ def test_a_fold_with_other_bits_does_not_hide_those_after_it(
     """Each is compared from what the journal has of the one before."""
     changed(tmp_path / "m", "UPDATE record SET chain = x'00112233445566778899aabbccddeeff' WHERE number = 9")
     kept = library.open("m", Limits())
-    same = {record.number: alike for record, alike in verify(kept.store, kept.folder)}
+    same = {record.number: alike for record, alike in verify(kept.store, kept.map_solver)}
     kept.store.close()
     assert [number for number, alike in same.items() if not alike] == [9, 10], "10 begins with the digest of 9"
 
@@ -295,7 +295,7 @@ def test_vectors_of_another_width_leave_the_estimate_and_r_is_computed_anew(
         f"R was computed anew: snapshot {SNAPSHOT} has it for vectors of another width"
     )
     assert len(session.kept.header.epochs) == 2
-    assert session.folder.revision == INSERTS
+    assert session.map_solver.revision == INSERTS
     for key, row in session.values().items():
         assert np.frombuffer(row) == pytest.approx(np.frombuffer(values[key]), abs=1e-3)
     session.insert(*BATCHES[INSERTS:])
@@ -316,7 +316,7 @@ def test_a_step_more_or_less_by_another_build_keeps_no_map_closed(
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
     assert (session.recovered.from_record, session.recovered.same) == (SNAPSHOT, False)
-    assert session.folder.revision == INSERTS + 1
+    assert session.map_solver.revision == INSERTS + 1
     session.close()
     changed(tmp_path / "m", "DELETE FROM entry WHERE record = 11")
     with pytest.raises(JournalDiffers, match="record 11 led to revision 12, and leads to 11"):
@@ -327,7 +327,7 @@ def test_a_fork_has_what_is_known_of_the_original(
     values: dict[int, bytes], library: Library, reopen: Callable[[], Session], tmp_path: Path
 ) -> None:
     session = reopen()
-    forked = Session(library.fork("m", "n", CopiedAt(INSERTS, session.folder.dump(), "it is so"), Limits()))
+    forked = Session(library.fork("m", "n", CopiedAt(INSERTS, session.map_solver.dump(), "it is so"), Limits()))
     assert forked.values() == values
     assert forked.row()["reason"] == "it is so"
     forked.insert(BATCHES[INSERTS])

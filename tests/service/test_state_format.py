@@ -14,7 +14,7 @@ import numpy as np
 from naive.random_graphs import random_steps
 
 from factorbus.service.config import Limits
-from factorbus.service.journal.library import make_folder
+from factorbus.service.journal.library import make_map_solver
 from factorbus.solver.graph.factors import FACTOR_KINDS, LOSSES
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.bayes_tree import layout as tree_layout
@@ -47,7 +47,7 @@ def present() -> dict[str, Any]:
 
 def state_in(mode: str) -> dict[str, Any]:
     """Of a map that has all that a state can have: kinds in plane and space, stamps, named factors."""
-    folder = make_folder(mode, {}, 1, Limits())
+    folder = make_map_solver(mode, {}, 1, Limits())
     solver = folder._solver
     for batch in random_steps(1, steps=20):
         solver.stage(batch)

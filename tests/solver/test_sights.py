@@ -229,7 +229,7 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
     assert solver.chi2() == pytest.approx(ASLEEP + 16.0, rel=1e-3)
     accounts = why_variable(Blocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False).factors
-    assert [account.asleep for account in accounts] == ["", why, ""]
+    assert [account.inactive for account in accounts] == ["", why, ""]
     assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, ASLEEP)
     assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], ASLEEP)
 
@@ -249,7 +249,7 @@ def test_why_says_what_a_loss_leaves_of_a_factor(loss: str) -> None:
         solver.step(settle=True)
         s = float(np.sum((solver.estimate()[0].values[0] - places[1]) ** 2))
         account = why_factor(Blocks(solver.covariances.factored()), 1)
-        assert (account.loss, account.asleep) == (loss, "")
+        assert (account.loss, account.inactive) == (loss, "")
         assert account.weight == pytest.approx(weight(loss, 2.0, s), rel=1e-6)
         assert account.chi2 == pytest.approx(s, rel=1e-6)
         np.testing.assert_allclose(account.residual, solver.estimate()[0].values[0] - places[1], rtol=1e-6)

@@ -71,7 +71,7 @@ def index(twin: Solver, *names: str) -> np.ndarray:
 def test_covariances_are_those_of_the_solver(square: tuple[Map, Solver]) -> None:
     joined, twin = square
     blocks, revision = Blocks(twin.covariances.factored()), joined.stats()["revision"]
-    every = joined.doubt.covariance()
+    every = joined.uncertainty.covariance()
     assert every.revision == revision
     assert sum(len(group.keys) for group in every.groups) == twin.variable_count
     for name in ("x4", "x8", "l1"):
