@@ -69,7 +69,11 @@ def parts(value: Any, path: str = "") -> list[tuple[str, str]]:
 
 def constants(module: ModuleType) -> dict[str, Any]:
     """Every number of the module, and every list of names."""
-    found = {name: value for name, value in vars(module).items() if name.isupper() and name not in OF_THE_PROCESSOR}
+    found = {
+        name: value
+        for name, value in vars(module).items()
+        if name.isupper() and name not in OF_THE_PROCESSOR and isinstance(value, int | float | tuple)
+    }
     return {name: ", ".join(value) if isinstance(value, tuple) else value for name, value in sorted(found.items())}
 
 
