@@ -6,7 +6,7 @@ export PYTHON
 # Tests start hundreds of processes; without its bytecode on disk each would compile what it imports, a service for 0.3 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-SETUP := deploy/setup/environment.sh deploy/setup/system.sh deploy/setup/browser.sh
+SETUP := deploy/setup/environment.sh deploy/setup/system.sh deploy/setup/browser.sh deploy/setup/cholmod.sh
 # Stamps: what is installed follows from pyproject.toml and the set-up scripts; only their change runs pip again.
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
@@ -17,7 +17,7 @@ READY_DEV := $(VENV)/.ready-dev
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-setup: $(READY_DEV) ## system package, virtual environment, the project with all its extras
+setup: $(READY_DEV) ## virtual environment, the project with all its extras; CHOLMOD where it can be compiled
 
 $(READY): pyproject.toml $(SETUP)
 	@bash deploy/setup/environment.sh $(VENV) service,viz,gateway
@@ -56,10 +56,13 @@ KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_ker
 CHECKED_TESTS := tests/solver/test_solver_steps.py tests/solver/test_tree.py tests/solver/test_covariance.py \
 	tests/solver/test_joints.py tests/solver/test_lending.py tests/solver/test_packing.py tests/solver/test_renew.py \
 	tests/solver/test_room.py
-test-kernels: $(READY_DEV) ## the kernels again: as plain Python, and with every index checked
+# Numba as it is, without what we change in it.
+STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
+test-kernels: $(READY_DEV) ## the kernels again: as plain Python, with every index checked, and by Numba as it is
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(ARGS)
 	@NUMBA_BOUNDSCHECK=1 $(BIN)/factorbus warm
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(CHECKED_TESTS) $(ARGS)
+	FACTORBUS_STOCK_NUMBA=1 $(BIN)/python -m pytest $(STOCK_TESTS) $(ARGS)
 
 test-faults: $(READY_DEV) ## workers killed and frozen in mid-job, 400 times
 	@$(BIN)/factorbus warm

@@ -23,8 +23,9 @@ def run(script: str, *arguments: str, **environment: str) -> "subprocess.Complet
 
 
 def test_nothing_is_missing_where_these_tests_run() -> None:
-    ran = run("system.sh", "python3")
-    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
+    for script in ("system.sh", "cholmod.sh"):
+        ran = run(script, "python3")
+        assert (ran.returncode, ran.stdout, ran.stderr) == (0, "", "")
 
 
 def test_what_is_missing_is_named_with_how_to_install_it(tmp_path: Path) -> None:
@@ -36,9 +37,14 @@ def test_what_is_missing_is_named_with_how_to_install_it(tmp_path: Path) -> None
         (tmp_path / tool).symlink_to(shutil.which(tool) or "")
     ran = run("system.sh", "python3", PATH=str(tmp_path))
     assert ran.returncode == 1
+    for text in ("missing on this machine: Python's venv and ensurepip modules", "sudo apt-get install python3-venv"):
+        assert text in ran.stderr
+    ran = run("cholmod.sh", "python3", PATH=str(tmp_path))
+    assert ran.returncode == 1
     for text in (
-        "a C compiler; Python's headers (Python.h); Python's venv and ensurepip modules",
-        "sudo apt-get install build-essential python3-dev python3-venv libsuitesparse-dev",
+        "a C compiler; Python's headers (Python.h)",
+        'everything but backend="cholmod" works without it',
+        "sudo apt-get install build-essential python3-dev libsuitesparse-dev",
         "sudo dnf install gcc python3-devel suitesparse-devel",
         "sudo pacman -S --needed base-devel suitesparse",
         "brew install suite-sparse",

@@ -15,8 +15,20 @@ main() {
         echo "set-up: $("$python" --version) -> $venv" >&2
         "$python" -m venv --clear "$venv"
     fi
-    echo "set-up: installing factorbus[$extras] (the first time takes a few minutes: scikit-sparse is compiled)" >&2
+    echo "set-up: installing factorbus[$extras]" >&2
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$here[$extras]"
+    [[ ,$extras, != *,dev,* ]] || try_cholmod "$here" "$venv" "$python"
+}
+
+# scikit-sparse is compiled, where that can be done.  Without it the tests that compare with CHOLMOD are skipped, and say why.
+try_cholmod() {
+    local here=$1 venv=$2 python=$3
+    if bash "$here/deploy/setup/cholmod.sh" "$python"; then
+        echo "set-up: installing factorbus[cholmod] (the first time takes some minutes: scikit-sparse is compiled)" >&2
+        "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$here[cholmod]" && return 0
+        echo "set-up: scikit-sparse could not be compiled; pip says why above" >&2
+    fi
+    echo "set-up: without CHOLMOD: backend=\"cholmod\" is refused, and the tests that compare with it are skipped" >&2
 }
 
 # PYTHON where it is given, else the first of the usual names that is new enough.

@@ -1,66 +1,40 @@
 #!/usr/bin/env bash
-# What pip cannot bring: a C compiler, Python's headers and venv module, and SuiteSparse (scikit-sparse is built against it).
-# Says what is missing and, where it may (root or password-less sudo, with apt-get), installs it; elsewhere it says how and stops.
+# What pip cannot bring and nothing works without: Python's venv module.
+# Says that it is missing and, where it may (root or password-less sudo, with apt-get), installs it; elsewhere it says how and stops.
 #
 #     deploy/setup/system.sh [PYTHON]
 set -euo pipefail
 
 main() {
-    local python=${1:-python3} missing
-    missing=$(what_is_missing "$python")
-    [ -z "$missing" ] && return 0
-    echo "set-up: missing on this machine: $missing" >&2
+    local python=${1:-python3}
+    has_venv "$python" && return 0
+    echo "set-up: missing on this machine: Python's venv and ensurepip modules" >&2
     if [ "${FACTORBUS_NO_SYSTEM:-}" = "" ] && try_apt; then
-        missing=$(what_is_missing "$python")
-        [ -z "$missing" ] && return 0
-        echo "set-up: still missing after apt-get: $missing" >&2
+        has_venv "$python" && return 0
+        echo "set-up: still missing after apt-get" >&2
     fi
-    say_how "$python"
+    cat >&2 <<EOF
+set-up: install it and run the same command again:
+  Debian, Ubuntu   sudo apt-get install python3-venv
+The interpreter is $(command -v "$python"); another one: make setup PYTHON=/path/to/python3.12
+EOF
     return 1
 }
 
-what_is_missing() {
-    local python=$1
-    command -v cc >/dev/null || command -v gcc >/dev/null || echo -n "a C compiler; "
-    has_header cholmod.h || echo -n "SuiteSparse's headers (cholmod.h); "
-    "$python" -c 'import os, sysconfig, sys; sys.exit(not os.path.isfile(os.path.join(sysconfig.get_path("include"), "Python.h")))' ||
-        echo -n "Python's headers (Python.h); "
-    "$python" -c 'import ensurepip, venv' 2>/dev/null || echo -n "Python's venv and ensurepip modules; "
+has_venv() {
+    "$1" -c 'import ensurepip, venv' 2>/dev/null
 }
 
-# scikit-sparse looks in the same places (and in SUITESPARSE_INCLUDE_DIR, which its build honours).
-has_header() {
-    local folder
-    for folder in "${SUITESPARSE_INCLUDE_DIR:-}" /usr/include/suitesparse /usr/include /usr/local/include/suitesparse \
-        /usr/local/include /opt/homebrew/include/suitesparse /opt/homebrew/include /opt/local/include "${CONDA_PREFIX:-/nowhere}/include/suitesparse"; do
-        [ -n "$folder" ] && [ -f "$folder/$1" ] && return 0
-    done
-    return 1
-}
-
-# OpenBLAS comes along because Debian's reference BLAS makes CHOLMOD several times slower.
 try_apt() {
-    local sudo=() packages=(build-essential python3-dev python3-venv libsuitesparse-dev libopenblas0-pthread)
+    local sudo=()
     command -v apt-get >/dev/null || return 1
     if [ "$(id -u)" != 0 ]; then
         { command -v sudo >/dev/null && sudo -n true 2>/dev/null; } || return 1
         sudo=(sudo -n)
     fi
-    echo "set-up: ${sudo[*]} apt-get install ${packages[*]}" >&2
-    local install=("${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends "${packages[@]}")
+    echo "set-up: ${sudo[*]} apt-get install python3-venv" >&2
+    local install=("${sudo[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends python3-venv)
     "${install[@]}" >&2 || { "${sudo[@]}" apt-get update -q >&2 && "${install[@]}" >&2; }
-}
-
-say_how() {
-    cat >&2 <<EOF
-set-up: install it and run the same command again:
-  Debian, Ubuntu   sudo apt-get install build-essential python3-dev python3-venv libsuitesparse-dev libopenblas0-pthread
-  Fedora           sudo dnf install gcc python3-devel suitesparse-devel openblas-devel
-  Arch             sudo pacman -S --needed base-devel suitesparse openblas
-  macOS            xcode-select --install; brew install suite-sparse openblas
-                   export SUITESPARSE_INCLUDE_DIR=\$(brew --prefix)/include/suitesparse SUITESPARSE_LIBRARY_DIR=\$(brew --prefix)/lib
-The interpreter is $(command -v "$1"); another one: make setup PYTHON=/path/to/python3.12
-EOF
 }
 
 main "$@"

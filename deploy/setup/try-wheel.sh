@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the wheel and installs it, with the base dependencies only, into a virtual environment of its own:
 # the four source roots must arrive as one namespace package, the light client must work without the service's extras,
-# and what needs them must say so.  Then, with those extras, the demo must run.
+# and what needs them must say so.  Then, with those extras, which are wheels only, the demo must run.
 #
 #     deploy/setup/try-wheel.sh PYTHON        PYTHON has pip; the build back end is brought by pip itself
 set -euo pipefail
@@ -20,9 +20,10 @@ main() {
     every_root_is_there
     light_client_works
     service_says_what_it_needs
-    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check \
+    "$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check --only-binary :all: \
         "$(echo "$folder"/dist/factorbus-*.whl)[service,viz]"
     demo_runs
+    cholmod_is_asked_for
     echo "wheel: $(cd dist && ls) is whole, light, and says what it lacks"
 }
 
@@ -39,6 +40,11 @@ EOF
 demo_runs() {
     says "every one: 100 steps" venv/bin/factorbus demo --poses 100 --workers 1
     [ -s out/demo.png ]
+}
+
+cholmod_is_asked_for() {
+    says "pip install 'factorbus[cholmod]'" venv/bin/python -c \
+        'from factorbus.solver import Options, Solver; Solver(Options(backend="cholmod"))'
 }
 
 light_client_works() {

@@ -36,13 +36,14 @@ from bench.replays.full_pass import cholmod_blas, system_of
 from bench.replays.problems import file_of
 from naive.block_systems import BlockSystem, grid
 from scipy.sparse import csc_matrix, tril
-from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.datasets import find
 from factorbus.formats import read
 from factorbus.solver import Options, Solver
+from factorbus.solver.errors import NoBackend
 from factorbus.solver.kernels.jit.simd import LANES
 from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
 
@@ -58,6 +59,10 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on standard output")
     parser.add_argument("--repetitions", type=int, default=15)
     options = parser.parse_args()
+    try:
+        require_cholmod()
+    except NoBackend as problem:
+        sys.exit(f"bench cholesky: {problem}")
     core = pin()
     names = options.names or [*GENERATED, *(name for name in DATASETS if find(name))]
     report: dict[str, Any] = {"cholmod_blas": cholmod_blas(), "core": core, "lanes": LANES, "problems": []}
@@ -93,7 +98,7 @@ def measure(system: BlockSystem, repetitions: int) -> dict[str, Any]:
     symbolic, cholesky = analyze(system.dims, system.rows, system.cols, perm), Cholesky()
     lower, in_order = cholmod_matrix(system, symbolic), symbolic.scalar_order()
     eta = np.random.default_rng(1).normal(size=symbolic.size)
-    peers = {mode: cholmod_analyze(lower, mode=mode, ordering_method="natural") for mode in MODES}
+    peers = {mode: require_cholmod().analyze(lower, mode=mode, ordering_method="natural") for mode in MODES}
     jobs: dict[str, Callable[[], Any]] = {
         "order": lambda: order(system.dims, system.rows, system.cols),
         "analyze": lambda: analyze(system.dims, system.rows, system.cols, perm),
@@ -156,7 +161,7 @@ def cholmod_matrix(system: BlockSystem, symbolic: Symbolic) -> csc_matrix:
 def cholmod_nonzeros(system: BlockSystem) -> int:
     """Nonzeros of CHOLMOD's own factor when it orders Λ itself, by AMD."""
     matrix = csc_matrix(system.sparse())
-    factor = cholmod_analyze(matrix, mode="simplicial", ordering_method="amd")
+    factor = require_cholmod().analyze(matrix, mode="simplicial", ordering_method="amd")
     factor.cholesky_inplace(matrix)
     return int(factor.L().nnz)
 

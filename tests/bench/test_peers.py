@@ -29,6 +29,7 @@ from bench.replays.problems import ALL, Problem, load
 from bench.replays.reference import optima
 from bench.replays.samples import Sampling
 from bench.replays.targets import MET, MISSED, NOT_MEASURED, Verdict
+from naive.cholmod import cholmod
 
 from factorbus.solver import Options, Solver, warm
 
@@ -215,6 +216,7 @@ def factors_of(problem: Problem) -> int:
 
 
 def test_a_full_pass_solves_the_whole_graph_at_the_optimum(tmp_path: Path) -> None:
+    cholmod()
     world = Problem("city_trees", "CityTrees", poses=150, seed=2)
     steps = load(world)
     columns = columns_of(steps)
@@ -304,6 +306,7 @@ def test_bars_of_python_and_starting() -> None:
 
 
 def test_the_command_measures_prints_and_draws(tmp_path: Path) -> None:
+    cholmod()
     pytest.importorskip("gtsam")
     environment = {**os.environ, "FACTORBUS_DATASETS": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
     command = [sys.executable, str(PEERS), "--quick", "--only", "city_trees,replays,full-pass,auto,isam2-0.1,gn-loop"]

@@ -10,6 +10,7 @@ from bench.replays.problems import Problem
 from bench.replays.reference import optima
 from hypothesis import given
 from hypothesis import strategies as st
+from naive.cholmod import cholmod
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import WORLDS
@@ -201,6 +202,7 @@ def test_samples_see_a_batch_at_every_hundredth_step_at_all_its_moments() -> Non
 @pytest.mark.parametrize("kind", ["poses", "landmarks", "space"])
 def test_fill_counts_what_a_dense_factorization_fills(kind: str) -> None:
     columns = columns_of(REPLAYS[kind])
+    cholmod()
     numbers, pictures = fill.orderings(columns, pixels=40)
     dims, rows, cols, _ = fill.block_pattern(columns)
     scalar_rows, scalar_cols, _ = fill.scalar_pattern(dims, rows, cols)

@@ -25,6 +25,7 @@ from factorbus.cli.output.exits import (
 )
 from factorbus.cli.output.installing import install_command, requirement
 from factorbus.proto.problems import BadName, Refused, Unavailable
+from factorbus.solver import why_stock_numba
 
 FACTORBUS = str(Path(sys.executable).with_name("factorbus"))
 
@@ -207,14 +208,33 @@ def test_doctor_in_json_finds_this_machine_fit(tmp_path: Path) -> None:
     assert found["healthy"], checks
     assert ran.returncode == OK
     assert set(checks) == {
-        "python", "libraries", "extras", "cholmod", "kernel cache", "machine", "clock", "wall clock", "shared memory",
-        "permissions", "port", "bus",
+        "python", "libraries", "extras", "cholmod", "numba", "kernel cache", "machine", "clock", "wall clock",
+        "shared memory", "permissions", "port", "bus",
     }  # fmt: skip
     assert checks["kernel cache"]["state"] == "warn"
     assert checks["kernel cache"]["mend"] == "factorbus warm compiles ahead"
     assert "CHOLMOD" in checks["cholmod"]["seen"]
     assert "answers on loopback" in checks["bus"]["seen"]
     assert not [path for path in tmp_path.rglob("*") if path.is_file()], "it has compiled nothing"
+
+
+def test_doctor_says_why_numba_is_used_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    from factorbus.cli.doctor import checks
+
+    assert why_stock_numba() == ""
+    assert checks.numba().state == "ok"
+    monkeypatch.setenv("FACTORBUS_STOCK_NUMBA", "1")
+    found = checks.numba()
+    assert (found.state, found.mend) == ("warn", "unset FACTORBUS_STOCK_NUMBA")
+    assert "as it is: FACTORBUS_STOCK_NUMBA is 1" in found.seen
+    monkeypatch.delenv("FACTORBUS_STOCK_NUMBA")
+    monkeypatch.setattr("factorbus.solver.kernels.jit.releases.version", lambda _: "0.68.99")
+    found = checks.numba()
+    assert found.state == "warn"
+    assert "numba 0.68.99 is not one of those tested (0.68.1)" in found.seen
+    monkeypatch.setenv("FACTORBUS_STOCK_NUMBA", "yes")
+    with pytest.raises(ValueError, match="FACTORBUS_STOCK_NUMBA is 'yes'; wanted 1"):
+        why_stock_numba()
 
 
 def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +246,7 @@ def test_doctor_names_the_extras_that_are_not_there(monkeypatch: pytest.MonkeyPa
     assert re.fullmatch(r"if wanted: \S.* install .*\[watch\]'", found.mend)
     assert "without watch" in found.seen
     monkeypatch.setattr("factorbus.cli.output.exits.find_spec", lambda _: None)
-    assert checks.extras().seen == "none installed; without service, viz, watch, record, gateway, ros2"
+    assert checks.extras().seen == "none installed; without service, cholmod, viz, watch, record, gateway, ros2"
 
 
 @pytest.mark.parametrize(("answer", "state"), [(0, "ok"), (5, "warn"), (-1, "ok")])

@@ -45,6 +45,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ('maps = "a/*"', "wanted a map name"),
         ("job_deadline_s = -1", "wanted more than 0"),
         ("cores = 0", "cores is 0; wanted 1"),
+        ("cores_from_bytes = -1", "cores_from_bytes is -1; wanted 0"),
         ("mode = ", "not TOML"),
     ],
 )

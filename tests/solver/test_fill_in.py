@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 from naive.block_rows import dense_lambda
+from naive.cholmod import cholmod
 from naive.tree_records import tree_of
 from scipy.sparse import csc_matrix
-from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.formats import read
 from factorbus.proto.messages import Batch
@@ -84,6 +84,6 @@ def assert_stays_well_ordered(name: str, steps: Iterable[Batch]) -> None:
 def cholmod_nonzeros(solver: Solver) -> int:
     """Of CHOLMOD's factor of Λ, ordered by its AMD."""
     matrix = csc_matrix(dense_lambda(solver, sparse=True)[0])
-    factor = cholmod_analyze(matrix, mode="simplicial", ordering_method="amd")
+    factor = cholmod().analyze(matrix, mode="simplicial", ordering_method="amd")
     factor.cholesky_inplace(matrix)
     return int(factor.L().nnz)

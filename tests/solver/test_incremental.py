@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.block_rows import dense_lambda, dense_r
+from naive.cholmod import cholmod
 from naive.random_graphs import factor, random_steps
 
 from factorbus.cli.process.options import MODES as CLI_MODES
@@ -202,6 +203,7 @@ def test_a_refused_step_leaves_values_and_graph_and_the_map_goes_on() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cholmod_gives_the_same_r(seed: int) -> None:
+    cholmod()
     ours, theirs = Solver(Options.of(mode="inc-l", incremental_tolerance=0.0, reuse_factor=False)), Solver(
         Options.of(mode="inc-l", incremental_tolerance=0.0, reuse_factor=False, backend="cholmod")
     )  # fmt: skip
@@ -218,7 +220,7 @@ def test_cholmod_gives_the_same_r(seed: int) -> None:
 
 def test_a_backend_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sksparse.cholmod", None)
-    with pytest.raises(errors.NoBackend, match="scikit-sparse") as caught:
+    with pytest.raises(errors.NoBackend, match=r"scikit-sparse.*pip install 'factorbus\[cholmod\]'") as caught:
         Solver(Options(backend="cholmod"))
     assert caught.value.code == "no_backend"
 

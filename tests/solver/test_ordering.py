@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from naive.block_systems import BlockSystem, from_g2o, grid, random_system, systems
+from naive.cholmod import cholmod
 from naive.elimination import minimum_degree_nonzeros, row_lengths
 from scipy.sparse import csc_matrix
-from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import analyze
@@ -104,6 +104,6 @@ def fill(system: BlockSystem) -> int:
 
 def cholmod_fill(system: BlockSystem) -> int:
     matrix = csc_matrix(system.sparse())
-    factor = cholmod_analyze(matrix, mode="simplicial", ordering_method="amd")
+    factor = cholmod().analyze(matrix, mode="simplicial", ordering_method="amd")
     factor.cholesky_inplace(matrix)
     return factor.L().nnz

@@ -17,7 +17,6 @@ from factorbus.client.listening import heard
 from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, TimedOut
 from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
-from factorbus.proto.kept_state import keep_state
 from factorbus.proto.problems import BadSetting, ClosedHere, NobodyListens, Unavailable
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
@@ -47,7 +46,6 @@ class Link:
                 done(reply)
 
         def on_reply(reply: zenoh.Reply) -> None:
-            keep_state()
             finish(_read(reply))
 
         self._query(self._short(key), payload, timeout_s, on_reply, lambda: finish(Silence()))
@@ -118,7 +116,6 @@ class Link:
         """While inside, every publication on `key` goes to `hear`."""
 
         def on_sample(sample: zenoh.Sample) -> None:
-            keep_state()
             hear(sample.payload.to_bytes())
 
         subscriber = self._session.declare_subscriber(key, Callback(on_sample, indirect=False))

@@ -85,7 +85,7 @@ def serve(
             if config.standby:
                 library = open_library(config, log_owner, stop)
             if not stop.is_set():
-                with closing(WorkerThreads(config.cores)) as cores:
+                with closing(WorkerThreads(config.cores, config.cores_from_bytes)) as cores:
                     _serve(config, library, cores, on_ready, stop, on_look)
     finally:
         if library is not None:
@@ -114,7 +114,7 @@ def _serve(
             on_ready(endpoints)
             while not stop.wait(_TICK_S):
                 shell.tick()
-                cores.tick()
+                cores.tick(shell.maps.largest_bytes)
                 on_look(shell.health_report.health)
         finally:
             shell.close()

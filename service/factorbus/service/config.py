@@ -89,6 +89,8 @@ class Config:
     group_s: float = 0.05  # durability group: written no later than this after the answer
     snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
+    # From so much memory of a map on; before, each on its own thread alone.  10,000 poses in a plane, 2,000 in space.
+    cores_from_bytes: int = 64 << 20
     standby: bool = False  # wait until whoever owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
@@ -124,6 +126,8 @@ def checked(config: Config) -> Config:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
     if config.cores < 1:
         raise BadConfig(f"cores is {config.cores}; wanted 1, for the map's own thread alone, or more")
+    if config.cores_from_bytes < 0:
+        raise BadConfig(f"cores_from_bytes is {config.cores_from_bytes}; wanted 0, for maps of any size, or more")
     if config.metrics and not _HOST_PORT.fullmatch(config.metrics):
         raise BadConfig(f"metrics is {config.metrics!r}; wanted HOST:PORT, such as 127.0.0.1:9464")
     if config.durability not in DURABILITIES:

@@ -87,6 +87,10 @@ class Maps:
         """All there are, by name."""
         return {name: found.host for name, found in list(self._maps.items())}
 
+    def largest_bytes(self) -> int:
+        """What the solver of the largest map has in use."""
+        return max((host.memory_bytes() for host in self.hosts().values()), default=0)
+
     def rows(self) -> list[dict[str, Any]]:
         """What admin/maps says: of those that are open, and of those that are on disk and do not open."""
         return [host.core.row() for host in self.hosts().values()] + self.unopened()

@@ -12,6 +12,7 @@ from factorbus.solver import errors
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.kernels.jit.compile import compiled_seconds
+from factorbus.solver.kernels.jit.releases import why_stock as why_stock_numba
 from factorbus.solver.optimize.evaluate import chi2_at
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport
@@ -34,4 +35,5 @@ __all__ = [
     "errors",
     "solve_batch",
     "warm",
+    "why_stock_numba",
 ]

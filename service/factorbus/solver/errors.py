@@ -94,7 +94,9 @@ class NoBackend(SolverError):
 
     def __init__(self, backend: str, package: str, problem: str) -> None:
         super().__init__(
-            f'backend "{backend}" needs {package}, which cannot be imported ({problem}); install it, or use "blocks"',
+            f'backend "{backend}" needs {package}, which cannot be imported ({problem}): '
+            f"pip install 'factorbus[{backend}]' (where pip compiles it, apt-get install libsuitesparse-dev first), "
+            'or use backend "blocks"',
             backend=backend,
             package=package,
         )

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csc_matrix, tril
-from sksparse.cholmod import analyze as cholmod_analyze
 
+from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import analyze
 
@@ -49,7 +49,7 @@ def orderings(columns: Columns, pixels: int = 0) -> tuple[dict[str, Any], dict[s
     for name, factor in factors.items():
         if factor.nnz != nnz[name]:
             raise RuntimeError(f"{name}: R has {nnz[name]} nonzeros by our analysis and {factor.nnz} by CHOLMOD's")
-    amd = cholmod_analyze(pattern, mode="simplicial", ordering_method="amd")
+    amd = require_cholmod().analyze(pattern, mode="simplicial", ordering_method="amd")
     amd.cholesky_inplace(pattern)
     nnz["cholmod_amd"] = int(amd.L().nnz)
     numbers = {
@@ -173,6 +173,6 @@ def _cholmod_pattern(pattern: csc_matrix, perm: I64) -> csc_array:
     """L of the permuted pattern, by CHOLMOD."""
     lower = csc_matrix(tril(pattern[perm][:, perm]))
     lower.sort_indices()
-    factor = cholmod_analyze(lower, mode="simplicial", ordering_method="natural")
+    factor = require_cholmod().analyze(lower, mode="simplicial", ordering_method="natural")
     factor.cholesky_inplace(lower)
     return csc_array(factor.L())

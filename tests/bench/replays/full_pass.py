@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from naive.block_systems import BlockSystem
 from scipy.sparse import csc_matrix, tril
-from sksparse.cholmod import analyze as cholmod_analyze
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, warm
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.sparse.cholesky import Cholesky
+from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import analyze
 
@@ -124,7 +124,8 @@ def system_of(solver: Solver) -> BlockSystem:
 
 
 def cholmod_blas() -> list[str]:
-    """The BLAS libraries in this process that are not numpy's or scipy's own."""
+    """The BLAS libraries of CHOLMOD: those in this process that are not numpy's or scipy's own.  Raises NoBackend."""
+    require_cholmod()
     paths = {row.split()[-1] for row in Path("/proc/self/maps").read_text().splitlines() if "blas" in row.lower()}
     return sorted(path for path in paths if "site-packages" not in path)
 
@@ -145,8 +146,8 @@ class _Watch:
 
 
 def _cholmod(lower: csc_matrix, eta: F64, mode: str, ordering: str) -> tuple[Laps, F64]:
-    watch = _Watch()
-    factor = cholmod_analyze(lower, mode=mode, ordering_method=ordering)
+    cholmod, watch = require_cholmod(), _Watch()
+    factor = cholmod.analyze(lower, mode=mode, ordering_method=ordering)
     watch.lap("analyse")
     factor.cholesky_inplace(lower)
     watch.lap("numeric")

@@ -55,7 +55,9 @@ def libraries() -> Finding:
 def cholmod() -> Finding:
     """SuiteSparse's CHOLMOD and its BLAS"""
     if find_spec("sksparse") is None:
-        return Finding("cholmod", "warn", "scikit-sparse is not installed", install_command("service"))
+        seen = 'CHOLMOD is not installed (scikit-sparse): all but backend="cholmod" works without it'
+        mend = f"if wanted: apt-get install libsuitesparse-dev build-essential, then {install_command('cholmod')}"
+        return Finding("cholmod", "ok", seen, mend)
     try:
         import sksparse.cholmod  # noqa: F401
     except ImportError as error:
@@ -69,6 +71,23 @@ def cholmod() -> Finding:
         mend = "the reference BLAS makes CHOLMOD several times slower: apt-get install libopenblas0-pthread"
         return Finding("cholmod", "warn", seen, mend)
     return Finding("cholmod", "ok", seen)
+
+
+def numba() -> Finding:
+    """Numba"""
+    if missing_modules("service"):
+        return Finding(
+            "numba", "warn", "not looked at: solver and workers are not installed", install_command("service")
+        )
+    try:
+        from factorbus.solver import why_stock_numba
+    except ValueError as wrong:
+        return Finding("numba", "fail", str(wrong), "unset FACTORBUS_STOCK_NUMBA")
+    seen = f"numba {installed('numba')}"
+    if why := why_stock_numba():
+        mend = "unset FACTORBUS_STOCK_NUMBA" if "FACTORBUS_STOCK_NUMBA" in why else "pip install one of those tested"
+        return Finding("numba", "warn", f"{seen}, as it is: {why}; kernels compile and run slower", mend)
+    return Finding("numba", "ok", f"{seen}, which kernels have been tested with")
 
 
 def cache() -> Finding:
@@ -220,7 +239,7 @@ def permissions() -> Finding:
 _TIMEX_BYTES, _UNSYNCHRONIZED = 512, 5
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    python, libraries, extras, cholmod, cache, machine, clock, wall_clock, shared_memory, permissions, port, bus,
+    python, libraries, extras, cholmod, numba, cache, machine, clock, wall_clock, shared_memory, permissions, port, bus,
 )  # fmt: skip
 
 

@@ -26,7 +26,8 @@ EXIT_CODES = {
 
 # What the extras of pyproject.toml bring, by import name.
 EXTRAS = {
-    "service": ("numba", "scipy", "sksparse", "prometheus_client"),
+    "service": ("numba", "llvmlite", "scipy", "prometheus_client"),
+    "cholmod": ("sksparse",),
     "viz": ("matplotlib",),
     "watch": ("rerun",),
     "record": ("foxglove",),
@@ -81,10 +82,9 @@ def require(extra: str, what: str) -> None:
     Looks without importing.  Raises Stopped.
     """
     if missing := missing_modules(extra):
-        hint = " (compiles against SuiteSparse: apt-get install libsuitesparse-dev first)" if extra == "service" else ""
         raise Stopped(
             "missing_extra",
-            f"{what} needs {', '.join(missing)}, not installed here: {install_command(extra)}{hint}",
+            f"{what} needs {', '.join(missing)}, not installed here: {install_command(extra)}",
             extra=extra,
         )
 

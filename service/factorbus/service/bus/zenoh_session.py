@@ -15,7 +15,6 @@ import zenoh
 from zenoh.handlers import Callback
 
 from factorbus.proto import codec, keys, redact
-from factorbus.proto.kept_state import keep_state
 from factorbus.proto.messages import Job
 from factorbus.proto.ports import check_endpoints
 from factorbus.proto.problems import Problem, Unavailable
@@ -87,7 +86,6 @@ class ServiceBus:
         """Every query on `key` goes to `take`."""
 
         def on_query(query: zenoh.Query) -> None:
-            keep_state()
             take(query)
 
         self._declared.append(self._session.declare_queryable(key, Callback(on_query, indirect=False)))

@@ -89,6 +89,10 @@ class Host:
         if self._keeper is not None and (problem := self._keeper.start()) is not None:
             core.block(problem, time.monotonic())  # it has nothing yet that would come of it; `created` tells
 
+    def memory_bytes(self) -> int:
+        """What the map's solver has in use, seen from any thread: by a step more or less."""
+        return self._map_solver.memory_bytes()
+
     def created(self) -> None:
         """The map is on the bus."""
         self._perform(self.core.created())

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from factorbus.service.process.heap import lay_out_heaps
+from factorbus.solver import why_stock_numba
 
 log = logging.getLogger(__name__)
 
@@ -19,6 +20,8 @@ def ready_to_compute(warm: bool) -> Iterator[None]:
     as laid out here; glibc does not say how they were.
     """
     lay_out_heaps()
+    if why := why_stock_numba():
+        log.warning("kernels are compiled by Numba as it is, which takes longer, and take longer themselves: %s", why)
     if warm:
         from factorbus.service.operations.warm import warm as warm_all
 

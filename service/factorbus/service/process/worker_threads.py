@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from factorbus.service.process.control_groups import limit_files
@@ -28,19 +29,19 @@ def core_count() -> int:
 class WorkerThreads:
     """Until it is closed, an elimination may be at work on `cores` of those that there are at once.
 
-    From when the kernel that eliminates is at hand: threads that asked for it before would compile it, for nobody yet,
-    and whoever closes this would have to wait for them.
+    From when a map has `from_bytes` of memory: the steps of a smaller one are over before another core has brought
+    anything.  And from when the kernel that eliminates is at hand: threads that asked for it before would compile it,
+    for nobody yet, and whoever closes this would have to wait for them.
     """
 
-    def __init__(self, cores: int) -> None:
-        self._more = min(cores, core_count()) - 1
+    def __init__(self, cores: int, from_bytes: int) -> None:
+        self._more, self._from_bytes = min(cores, core_count()) - 1, from_bytes
         self._workers: list[WorkerThread] = []
         self._threads: list[threading.Thread] = []
-        self.tick()
 
-    def tick(self) -> None:
-        """Time went by: somebody may have compiled or loaded the kernel."""
-        if self._threads or not can_work():
+    def tick(self, largest: Callable[[], int]) -> None:
+        """Time went by: a map may have grown.  largest: returns the bytes of the largest one."""
+        if self._threads or not self._more or not can_work() or largest() < self._from_bytes:
             return
         self._workers = [WorkerThread() for _ in range(min(self._more, count_free()))]
         self._threads = [

@@ -1,4 +1,4 @@
-"""How kernels are compiled and kept: numba is imported here, in `lowering` and `compile_time`; flags are chosen here.
+"""How kernels are compiled and kept: numba is imported here, in `lowering` and in `disk`; flags are chosen here.
 
 `kernel`         compiled on first use, without the interpreter lock, kept on disk.  With signatures it accepts exactly
                  those and never compiles for others:  @kernel("int64(float64[::1], int64[::1])")
@@ -23,24 +23,23 @@ With every index checked they are errors.
 
 FACTORBUS_CACHE names the folder of these folders (default ~/.cache/factorbus).  What is in them is run as code, so it
 is used only if nobody but this user and root can write there, to a folder or a file; what is made is for them alone.
-NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.
+NUMBA_DISABLE_JIT=1 leaves the plain Python functions; NUMBA_BOUNDSCHECK=1 checks every index.  FACTORBUS_STOCK_NUMBA=1,
+or a release of Numba that was not tested (`releases`), leaves Numba as it is: each kernel and part is compiled by its
+own compiler, with its rules for references and indices.
 """
 
 import atexit
-import contextlib
 import functools
 import hashlib
 import os
-import pickle
 import platform
-import secrets
 import shutil
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import llvmlite
 import llvmlite.binding
@@ -48,17 +47,18 @@ import numba
 import numba.extending
 import numpy as np
 from llvmlite import ir
-from numba.core import caching, cgutils, config, event, types
+from numba.core import cgutils, config, event, types
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.typing.templates import AttributeTemplate
 from numpy.typing import NDArray
 
-from factorbus.ownership import check_file, make_private
+from factorbus.ownership import make_private
 from factorbus.proto import kinds
 
 # From beside this file: a copy of all three elsewhere is one by itself.
-from . import compile_time, lowering
-from .lowering import KernelCompiler, PartCompiler
+from . import disk, lowering, releases
+from .disk import cache_in
+from .lowering import KernelCompiler, PartCompiler, changed_numba
 
 __all__ = [
     "BOUNDSCHECK",
@@ -92,6 +92,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 DISABLED = bool(getattr(config, "DISABLE_JIT"))  # noqa: B009  (numba sets these when it is imported)
+STOCK = bool(releases.why_stock())
 BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
 
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
@@ -118,7 +119,7 @@ class KernelFolder:
     ) -> None:
         self._sources, self._family, self._also = sources, family, also
         self._flags = _QUICK_FLAGS if quick else _EXACT_FLAGS if exact else _FLAGS
-        self._cache = _cache_in(self)
+        self._cache = cache_in(self.path)
         self._path: Path | None = None
 
     def kernel(self, *signatures: Any) -> Any:
@@ -148,10 +149,11 @@ class KernelFolder:
     def _compiled(self, function: Callable[..., Any], signatures: tuple[Any, ...]) -> Any:
         if DISABLED:
             return function
-        dispatcher = _ours(numba.njit(pipeline_class=KernelCompiler, **self._flags)(function))
-        part = functools.cache(lambda: self._linked(function))  # what other kernels link
-        dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
-        dispatcher.get_overload = lambda signature: part().get_overload(signature)
+        dispatcher = self._alone(function)
+        if not STOCK:
+            part = functools.cache(lambda: self._linked(function))  # what other kernels link
+            dispatcher.get_call_template = lambda args, kws: part().get_call_template(args, kws)
+            dispatcher.get_overload = lambda signature: part().get_overload(signature)
         dispatcher._cache = self._cache(function)
         dispatcher.factorbus_signatures = signatures
         if signatures:
@@ -160,17 +162,21 @@ class KernelFolder:
 
     def _linked(self, function: Callable[..., Any], **flags: Any) -> Any:
         """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
+        if STOCK:
+            return _ours(numba.njit(**flags, **self._flags)(function))
         dispatcher = _ours(numba.njit(pipeline_class=PartCompiler, **flags, **self._flags)(function))
         find = dispatcher.get_call_template
         dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
 
-        @functools.cache
-        def alone() -> Any:
-            return _ours(numba.njit(pipeline_class=KernelCompiler, **self._flags)(function))
-
+        alone = functools.cache(lambda: self._alone(function))
         dispatcher.add_overload = lambda result: dispatcher.overloads.update({tuple(result.signature.args): result})
         dispatcher._compile_for_args = lambda *_args, **_kwargs: alone()
         return dispatcher
+
+    def _alone(self, function: Callable[..., Any]) -> Any:
+        """A function that Python calls."""
+        compiler = {} if STOCK else {"pipeline_class": KernelCompiler}
+        return _ours(numba.njit(**compiler, **self._flags)(function))
 
     def _make(self) -> Path:
         base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
@@ -220,11 +226,11 @@ def sources_hash(folder: Path, *also: Path) -> str:
     """The name of the cache folder for kernels whose sources are the Python files in `folder`, those that make
     kernels, and `also`."""
     digest = hashlib.sha256()
-    makers = (Path(one) for one in (__file__, compile_time.__file__, lowering.__file__))
+    makers = (Path(one) for one in (__file__, disk.__file__, lowering.__file__, releases.__file__))
     for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
-    digest.update(repr((sys.version, sorted(machine().items()), sorted(_FASTMATH))).encode())
+    digest.update(repr((sys.version, sorted(machine().items()), sorted(_FASTMATH), STOCK)).encode())
     return digest.hexdigest()[:20]
 
 
@@ -273,6 +279,14 @@ def _common(kind: Any) -> Any:
 
 def _ours(dispatcher: Any) -> Any:
     dispatcher.factorbus = True
+    if not STOCK:
+        compile_ = dispatcher.compile
+
+        def compile_changed(signature: Any) -> Any:
+            with global_compiler_lock, changed_numba():
+                return compile_(signature)
+
+        dispatcher.compile = compile_changed
     return dispatcher
 
 
@@ -302,90 +316,6 @@ def _prune(base: Path, keep: Path) -> None:
     folders.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     for path in folders[_KEPT_FOLDERS - 1 :]:
         shutil.rmtree(path, ignore_errors=True)
-
-
-def _cache_in(folder: KernelFolder) -> type[caching.FunctionCache]:
-    """Numba's cache of a function, in `folder`.  The folder's name stands for the sources: nothing else is stamped."""
-
-    class Locator(caching._CacheLocator):
-        def __init__(self, function: Callable[..., Any]) -> None:
-            self._name = f"{function.__module__}.{function.__qualname__}"
-
-        def get_cache_path(self) -> str:
-            return str(folder.path())
-
-        def get_source_stamp(self) -> str:
-            return self._name
-
-        def get_disambiguator(self) -> str:
-            return hashlib.sha256(self._name.encode()).hexdigest()[:8]
-
-        @classmethod
-        def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "Locator":
-            return cls(py_func)
-
-    class Content(caching.CompileResultCacheImpl):
-        _locator_classes = (Locator,)
-
-    class Cache(caching.FunctionCache):
-        _impl_class = Content
-
-        def __init__(self, function: Callable[..., Any]) -> None:
-            super().__init__(function)
-            # As numba makes it, but for how files are opened.
-            content = self._impl
-            self._cache_file = _OwnFiles(self._cache_path, content.filename_base, content.locator.get_source_stamp())
-
-    return Cache
-
-
-class _OwnFiles(caching.IndexDataCacheFile):
-    """The files of one function: written for this user alone, and read only if nobody else can have written them.
-
-    Folders are checked once, when a process begins; a file is checked as it is opened, so that none can be put in its
-    place in between.
-    """
-
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            with _opened(self._index_path) as file:
-                version, data = pickle.load(file), file.read()
-        except FileNotFoundError:
-            return {}
-        if version != self._version:
-            return {}
-        stamp, overloads = pickle.loads(data)
-        return overloads if stamp == self._source_stamp else {}
-
-    def _load_data(self, name: str) -> Any:
-        with _opened(self._data_path(name)) as file:
-            return pickle.loads(file.read())
-
-    @contextlib.contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
-        beside = f"{filepath}.tmp.{secrets.token_hex(8)}"
-        try:
-            with open(beside, "xb", opener=_for_us_alone) as file:
-                yield file
-            os.replace(beside, filepath)
-        except Exception:
-            Path(beside).unlink(missing_ok=True)
-            raise
-
-
-def _opened(path: str) -> IO[bytes]:
-    """A file of the cache, to be read.  Raises UnsafeFolder: somebody else may have written it; OSError."""
-    file = open(path, "rb")  # noqa: SIM115
-    try:
-        check_file("the compiled kernel", Path(path), os.fstat(file.fileno()))
-    except BaseException:
-        file.close()
-        raise
-    return file
-
-
-def _for_us_alone(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
 
 
 _COMPILATIONS = _Compilations()

@@ -2,8 +2,14 @@
 
 Arrays that a function is given are borrowed.  Of indices only constants count from the end.  A part stays as it was
 written until a kernel links it, and what a kernel links is its own.
+
+All of this is Numba's private side, so it is done with releases that were tested (`releases`), and three functions of
+Numba's are exchanged only while a function of ours is compiled (`changed_numba`).  What each change is worth is in
+docs/decisions/private-numba.md.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import llvmlite.binding
@@ -18,9 +24,6 @@ from numba.core.runtime.context import NRTContext
 from numba.core.typed_passes import NativeLowering
 from numba.np import arrayobj
 
-# From beside this file: a copy of both elsewhere is one by itself.
-from .compile_time import QuickFlags, keep_needed
-
 _from_the_end = arrayobj.fix_integer_index
 
 
@@ -30,9 +33,6 @@ def _fix_integer_index(context: Any, builder: Any, kind: Any, index: Any, size: 
     if constant or not getattr(builder.module, "factorbus", False):
         return _from_the_end(context, builder, kind, index, size)
     return context.cast(builder, index, kind, types.intp)
-
-
-arrayobj.fix_integer_index = _fix_integer_index
 
 
 class OurLower(Lower):
@@ -88,7 +88,40 @@ def _count_owned(self: Any, builder: Any, typ: Any, value: Any, funcname: str) -
         _count(self, builder, typ, value, funcname)
 
 
-NRTContext._call_incref_decref = _count_owned
+_find_call_type = types.BaseFunction.get_call_type
+_call_types: dict[int, tuple[Any, dict[Any, Any]]] = {}  # by the identity of the function, which is kept with them
+
+
+def _known_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """What a built-in function comes to with such arguments.  Numba finds that out anew at every call, and in every
+    round of its inference: a quarter of all the time that it takes to compile."""
+    _, known = _call_types.setdefault(id(self), (self, {}))
+    asked = context, tuple(args), tuple(kws.items())
+    if asked not in known:
+        known[asked] = _find_call_type(self, context, args, kws)
+    return known[asked]
+
+
+# The first two look at the module that they are called for, the third changes no code: Numba's own functions, which are
+# compiled on the way and kept for others, come out as they always do.
+_EXCHANGED = (
+    (arrayobj, "fix_integer_index", _fix_integer_index),
+    (NRTContext, "_call_incref_decref", _count_owned),
+    (types.BaseFunction, "get_call_type", _known_call_type),
+)
+
+
+@contextmanager
+def changed_numba() -> Iterator[None]:
+    """Numba with our functions in place of its own, which are back afterwards.  For who holds the compiler's lock."""
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in _EXCHANGED]
+    try:
+        for owner, name, ours in _EXCHANGED:
+            setattr(owner, name, ours)
+        yield
+    finally:
+        for owner, name, theirs in found:
+            setattr(owner, name, theirs)
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -159,16 +192,37 @@ def _add_linked(linked: list[Any], library: Any) -> None:
         linked.append(one)
 
 
+# Passes for what no kernel has: closures, `with`, `literal_unroll`, whole arrays in one expression and the like.  They
+# changed none of all functions that were compiled.
+_FOR_OTHERS = {
+    "DumpParforDiagnostics",
+    "FindLiterallyCalls",
+    "InlineClosureLikes",
+    "InlineInlinables",
+    "InlineOverloads",
+    "LiteralPropagationSubPipelinePass",
+    "LiteralUnroll",
+    "MakeFunctionToJitFunction",
+    "NoPythonSupportedFeatureValidation",
+    "NopythonRewrites",
+    "RewriteDynamicRaises",
+    "WithLifting",
+}
+
+
 class _Compiler(Compiler):
-    """Numba's own compiler, with our lowering."""
+    """Numba's own compiler, with our lowering and without the passes that find nothing to do."""
 
     lowering = _Lowering
 
     def define_pipelines(self) -> list[Any]:
         pipelines = super().define_pipelines()
         for pipeline in pipelines:
-            keep_needed(pipeline)
-            pipeline.passes = [(self.lowering if one is NativeLowering else one, why) for one, why in pipeline.passes]
+            pipeline.passes = [
+                (self.lowering if one is NativeLowering else one, why)
+                for one, why in pipeline.passes
+                if one.__name__ not in _FOR_OTHERS
+            ]
             pipeline.finalize()
         return pipelines
 
@@ -182,7 +236,7 @@ class KernelCompiler(_Compiler):
         if library is None:
             library = _KernelLibrary(targetctx.codegen(), "kernel")
             library.enable_object_caching()
-        ours: Any = QuickFlags(flags)
+        ours: Any = Flags(flags)
         ours.no_cfunc_wrapper = True  # nobody calls it from C
         super().__init__(typingctx, targetctx, library, args, return_type, ours, names)
 
@@ -210,4 +264,4 @@ class PartCompiler(_Compiler):
         self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Flags, names: Any
     ) -> None:
         library = library or _PartLibrary(targetctx.codegen(), "part")
-        super().__init__(typingctx, targetctx, library, args, return_type, QuickFlags(flags), names)
+        super().__init__(typingctx, targetctx, library, args, return_type, Flags(flags), names)
