@@ -280,7 +280,17 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> int | str
 def test_the_command_gives_rows_and_seeds_that_repeat_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    good = ("--mode", "all-batch", "--option", "tolerance=1e-12", "--only", "manhattan", "--poses", "80", "--json")
+    good = (
+        "--mode",
+        "all-batch",
+        "--option",
+        "batch_tolerance=1e-12",
+        "--only",
+        "manhattan",
+        "--poses",
+        "80",
+        "--json",
+    )
     assert run(tmp_path, monkeypatch, *good, "--seeds", "2") == 0
     told, notes = capsys.readouterr()
     document = json.loads(told)

@@ -208,7 +208,7 @@ WRONG = [
     (manhattan, {"sigma_xy_m": 0.0}, "sigma_xy_m is 0.0; wanted a standard deviation above 0"),
     (manhattan, {"sigma_theta_rad": float("nan")}, "sigma_theta_rad is nan"),
     (manhattan, {"sigma_theta_rad": 2.0}, "up to 0.5"),
-    (manhattan, {"loop_threshold_share": 1.5}, "loop_share is 1.5; wanted a number from 0 to 1"),
+    (manhattan, {"loop_share": 1.5}, "loop_share is 1.5; wanted a number from 0 to 1"),
     (manhattan, {"loops": -1}, "loops is -1"),
     (manhattan, {"loop_gap": 1}, "loop_gap is 1; wanted 2 or more"),
     (manhattan, {"loop_radius_m": float("inf")}, "loop_radius_m is inf"),

@@ -17,6 +17,7 @@ from factorbus.service.questions.question_memory import COPIES, Room
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.source import CovarianceSource
 
 POSES = 400
 INFORMATION = np.array([100.0, 0, 0, 100, 0, 400])
@@ -112,7 +113,7 @@ def test_what_there_is_no_memory_for_is_refused_with_the_limit(
 @pytest.mark.parametrize("count", [3000, 30_000, 1_000_000])
 def test_many_keys_are_refused_before_r_is_copied(solver: Solver, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Known ones or not, a key given again and again among them."""
-    monkeypatch.setattr(Solver, "factoring", lambda _: pytest.fail("R was copied"))
+    monkeypatch.setattr(CovarianceSource, "factoring", lambda _: pytest.fail("R was copied"))
     for keys in (np.arange(count), np.zeros(count, np.int64)):
         problem = refused(solver, "covariance", ask_joint(keys), Room(answer_bytes=64 << 20))
         assert (problem.code, problem.detail["limit"]) == ("too_large", 64 << 20)
