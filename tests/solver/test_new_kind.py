@@ -52,7 +52,7 @@ solver.step(settle=True)
 (group,) = solver.estimate()
 # Two measurements of one number: their mean by weight.
 assert abs(group.values[0, 2] - (pose[2] + 100.0 / 101.0)) < 1e-9
-blocks = Blocks(solver.factored())
+blocks = Blocks(solver.covariances.factored())
 covariance = blocks.joint(np.array([0]))
 end = group.values[0]
 (J,) = jacobians("depth_se3", ["se3"], [end], np.array([pose[2] + 1.0]))
@@ -172,10 +172,10 @@ def test_a_loss_that_has_no_function_is_an_error_at_import() -> None:
 def test_a_model_that_does_not_fit_its_kind_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     model = kinds.FactorModel(kinds.FACTOR_MODELS["range_se2"].residual, "", positive_at=1)
     monkeypatch.setitem(kinds.FACTOR_MODELS, "range_se2", model)
-    with pytest.raises(ImportError, match="'range_se2' has 1 numbers measured and declares checks at"):
+    with pytest.raises(ImportError, match="'range_se2' has a measurement of the size 1 and checks at"):
         kinds.check_kinds()
 
 
 def test_an_example_has_the_numbers_that_are_measured() -> None:
-    with pytest.raises(ValueError, match="'depth_se3' measures 1 numbers and its example has 2"):
+    with pytest.raises(ValueError, match="'depth_se3' has the size 1, and its example 2"):
         FactorKind("depth_se3", ("se3",), 1, 1, "z", "t_z − z", (1.0, 2.0))

@@ -4,7 +4,7 @@
 """
 
 from factorbus.datasets.catalogue import Dataset, Source, named
-from factorbus.datasets.checksum import Verdict, check
+from factorbus.datasets.checksum import ChecksumResult, check
 from factorbus.datasets.convert import convert
 from factorbus.datasets.errors import DatasetProblem
 from factorbus.datasets.fetch import fetch
@@ -13,12 +13,12 @@ from factorbus.datasets.places import Place, Places, find, locate
 
 __all__ = [
     "CATALOGUE",
+    "ChecksumResult",
     "Dataset",
     "DatasetProblem",
     "Place",
     "Places",
     "Source",
-    "Verdict",
     "check",
     "convert",
     "fetch",

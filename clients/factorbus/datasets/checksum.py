@@ -9,7 +9,7 @@ from factorbus.datasets.errors import CannotRead
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ChecksumResult:
     """What a file turned out to be."""
 
     name: str
@@ -22,9 +22,9 @@ class Verdict:
         return self.seen == self.wanted
 
 
-def check(dataset: Dataset, path: Path) -> Verdict:
+def check(dataset: Dataset, path: Path) -> ChecksumResult:
     """Hold the file at `path` against the catalogue.  Raises CannotRead."""
-    return Verdict(dataset.name, path, sha256_of(path), dataset.sha256)
+    return ChecksumResult(dataset.name, path, sha256_of(path), dataset.sha256)
 
 
 def sha256_of(path: Path) -> str:

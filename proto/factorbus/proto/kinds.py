@@ -39,7 +39,7 @@ class FactorKind:
     def __post_init__(self) -> None:
         if len(self.example) != self.size:
             raise ValueError(
-                f"the size of the factor kind {self.name!r} is {self.size} and that of its example {len(self.example)}; "
+                f"the factor kind {self.name!r} has the size {self.size}, and its example {len(self.example)}; "
                 "give an example of a measurement"
             )
 

@@ -121,14 +121,14 @@ def check_kinds() -> None:
         ends = [VARIABLE_KINDS[end] for end in kind.connects]
         if not 1 <= len(ends) <= 2 or max(kind.dim, *(end.dim for end in ends)) > _MOST:
             raise ImportError(
-                f"of the factor kind {name!r} the variables are {len(ends)} and the numbers in the residual {kind.dim}; "
+                f"the factor kind {name!r} has {len(ends)} ends and a residual of the size {kind.dim}; "
                 f"kernels have room for 1 or 2 variables and {_MOST} numbers"
             )
         starts = (*model.quaternions, *model.directions, model.positive_at)
         units = max(len(model.quaternions), len(model.directions))
         if max(starts) >= kind.size or units > _MOST_UNITS:
             raise ImportError(
-                f"the measurement of the factor kind {name!r} has the size {kind.size}, and its checks are at {starts}; "
+                f"the factor kind {name!r} has a measurement of the size {kind.size} and checks at {starts}; "
                 f"declare positions in the measurement, at most {_MOST_UNITS} quaternions and directions"
             )
 
