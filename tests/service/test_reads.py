@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import factorbus.service.bus.delivery as delivery
-import factorbus.solver.solver as solver_of
+import factorbus.solver.covariance.source as source_of
 from factorbus.proto import asking, asking_codec, codec
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.service.bus.delivery import Delivery
@@ -98,8 +98,8 @@ def solved(mode: str) -> Solver:
 @pytest.mark.parametrize("mode", ["inc-l", "all-batch"])
 def test_a_mode_without_a_tree_is_factorized_by_who_answers(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     solver, made = solved(mode), list[int]()
-    real = solver_of.factored_anew
-    monkeypatch.setattr(solver_of, "factored_anew", lambda graph: made.append(1) or real(graph))
+    real = source_of.factored_anew
+    monkeypatch.setattr(source_of, "factored_anew", lambda graph: made.append(1) or real(graph))
     question = parse("covariance", b"")
     copy = snapshot(solver, 1, 1, [question], {})
     assert not made, "the solver's thread has other work"

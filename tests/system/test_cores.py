@@ -25,7 +25,7 @@ def test_what_was_made_on_several_cores_is_what_one_core_makes(
     services: Callable[..., Services], tmp_path: Path
 ) -> None:
     batches = [step.batch for step in manhattan(POSES, 7)]
-    running = services(tmp_path / "journal", "cores=2")
+    running = services(tmp_path / "journal", "cores=2", "cores_from_bytes=0")
     with (
         connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
         bus.map("m2", "bayes-tree", window=32) as map_,

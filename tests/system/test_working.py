@@ -106,7 +106,7 @@ def test_stats_name_the_thresholds_in_force(spawn: Spawn) -> None:
     with service(spawn) as (_, _, client):
         told = client.stats("m")
         assert told["options"] == Options(mode=told["mode"]).as_dict()
-        assert told["options"]["small_loop"] > 0
+        assert told["options"]["small_loop_threshold"] > 0
         assert "clock" not in told["options"]
 
 
