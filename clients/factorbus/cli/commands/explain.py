@@ -15,7 +15,8 @@ _PAGES = Path(__file__).parents[1] / "codes.md"
 _CODES = {
     "apart": "not_positive_definite", "broken": "internal", "dataset_problem": "problem", "format_error": "bad_file",
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
-    "not_here": "unknown_map", "missing_variables": "unknown_variable", "not_in_map": "unknown_variable", "solver_error": "problem",
+    "not_here": "unknown_map", "missing_variables": "unknown_variable",
+    "not_in_map": "unknown_variable", "solver_error": "problem",
     "unsafe_journal": "unsafe_folder", "unsafe_keys": "unsafe_folder", "unusable": "internal",
 }  # fmt: skip
 
