@@ -288,7 +288,7 @@ def test_vectors_of_another_width_leave_the_estimate_and_r_is_computed_anew(
     """Rows of R as they were would be read past their ends."""
     by_another(tmp_path / "m", processor="elsewhere")
     true_load = Solver.load
-    monkeypatch.setattr(Solver, "load", lambda solver, state: true_load(solver, {**state, "executors": 0}))
+    monkeypatch.setattr(Solver, "load", lambda solver, state: true_load(solver, {**state, "lanes": 0}))
     session = reopen()
     assert (session.recovered.from_record, session.recovered.records) == (SNAPSHOT, INSERTS - SNAPSHOT)
     assert session.row()["reason"].startswith(

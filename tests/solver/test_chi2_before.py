@@ -68,7 +68,7 @@ def test_of_a_map_that_goes_on_in_another_solver_it_is_that_of_the_estimate(mode
     renewed, eliminated = Solver(Options(mode=mode)), Solver(Options(mode=mode))
     reports = (
         renewed.renew(solver, solver.variable_count, solver.factor_count),
-        eliminated.load(solver.dump() | {"executors": 0}),
+        eliminated.load(solver.dump() | {"lanes": 0}),
     )
     for report in reports:
         assert report is not None

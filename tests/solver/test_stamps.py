@@ -217,7 +217,7 @@ def test_copies_have_them(mode: str) -> None:
     other, renewed, anew = (Solver(Options(mode=mode)) for _ in range(3))
     other.load(solver.dump())
     renewed.renew(solver, solver.variable_count, solver.factor_count)
-    anew.load(solver.dump() | {"executors": 0})
+    anew.load(solver.dump() | {"lanes": 0})
     for made in (other, renewed, anew):
         assert kept(made) == wanted
 

@@ -29,7 +29,7 @@ from factorbus.solver.sparse.cholmod import require_cholmod
 from factorbus.solver.state import State, dump, load
 from factorbus.solver.stepper import Stepper
 
-_LANES = "executors"
+_LANES = "lanes"
 _VALUES = MappingProxyType({kind.__name__: kind for kind in STATE_TYPES})
 
 

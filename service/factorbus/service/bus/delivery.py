@@ -2,7 +2,7 @@
 
 A SIGSTOPped client cannot hold up the others: deltas to it are dropped (lower priority than answers, so that they do
 not stand in their way), and answers to it wait in its own queue; a large one that fills it costs one of the answering
-executors a second, then Zenoh closes that client's transport.  Refusals have a executor of their own: of these a
+executors a second, then Zenoh closes that client's transport.  Refusals have an executor of their own: of these a
 client can have filled its queue with tens of thousands before the first is taken.  So have answers that are still to
 be computed, which may take a minute: what is ready, such as stats, does not wait for them.
 """

@@ -1,7 +1,7 @@
 """Jobs on their way: to a worker, to the next one when that fails, in place when there is none, and back.
 
 Everything here runs on one serial executor (the control thread); workers and the in-place threads only hand their
-results to it.  No answer of a worker is passed on unchecked; what takes long to check is checked on a executor of its
+results to it.  No answer of a worker is passed on unchecked; what takes long to check is checked on an executor of its
 own.
 """
 

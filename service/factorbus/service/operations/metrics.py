@@ -43,7 +43,7 @@ class Metrics:
 
 
 def open_metrics(where: str, health_report: HealthReport) -> Metrics:
-    """Serve what `health_report` know at `where` (HOST:PORT); nowhere if that is empty.
+    """Serve what `health_report` knows at `where` (HOST:PORT); nowhere if that is empty.
 
     Raises BadConfig, PortTaken, CannotListen.
     """
