@@ -38,6 +38,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,9 @@ from numpy.typing import NDArray
 from factorbus.ownership import make_private
 from factorbus.proto import kinds
 
-# From beside this file: a copy of all three elsewhere is one by itself.
-from . import disk, lowering, releases
+# From beside this file: a copy of them elsewhere is one by itself.
+from . import releases
 from .disk import cache_in
-from .lowering import KernelCompiler, PartCompiler, changed_numba
 
 __all__ = [
     "BOUNDSCHECK",
@@ -94,6 +94,9 @@ I64 = NDArray[np.int64]
 DISABLED = bool(getattr(config, "DISABLE_JIT"))  # noqa: B009  (numba sets these when it is imported)
 STOCK = bool(releases.why_stock())
 BOUNDSCHECK = bool(getattr(config, "BOUNDSCHECK"))  # noqa: B009
+
+# Not even imported where Numba is used as it is: another release may not have the names.
+_lowering: Any = None if STOCK else import_module(".lowering", __package__)
 
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
@@ -164,7 +167,7 @@ class KernelFolder:
         """A function that kernels link.  Called from Python, as tests do, it is compiled as a kernel."""
         if STOCK:
             return _ours(numba.njit(**flags, **self._flags)(function))
-        dispatcher = _ours(numba.njit(pipeline_class=PartCompiler, **flags, **self._flags)(function))
+        dispatcher = _ours(numba.njit(pipeline_class=_lowering.PartCompiler, **flags, **self._flags)(function))
         find = dispatcher.get_call_template
         dispatcher.get_call_template = lambda args, kws: find(tuple(map(_common, args)), kws)
 
@@ -175,7 +178,7 @@ class KernelFolder:
 
     def _alone(self, function: Callable[..., Any]) -> Any:
         """A function that Python calls."""
-        compiler = {} if STOCK else {"pipeline_class": KernelCompiler}
+        compiler = {} if STOCK else {"pipeline_class": _lowering.KernelCompiler}
         return _ours(numba.njit(**compiler, **self._flags)(function))
 
     def _make(self) -> Path:
@@ -226,7 +229,8 @@ def sources_hash(folder: Path, *also: Path) -> str:
     """The name of the cache folder for kernels whose sources are the Python files in `folder`, those that make
     kernels, and `also`."""
     digest = hashlib.sha256()
-    makers = (Path(one) for one in (__file__, disk.__file__, lowering.__file__, releases.__file__))
+    here = Path(__file__)
+    makers = (here, *map(here.with_name, ("disk.py", "lowering.py", "releases.py")))
     for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
@@ -283,7 +287,7 @@ def _ours(dispatcher: Any) -> Any:
         compile_ = dispatcher.compile
 
         def compile_changed(signature: Any) -> Any:
-            with global_compiler_lock, changed_numba():
+            with global_compiler_lock, _lowering.changed_numba():
                 return compile_(signature)
 
         dispatcher.compile = compile_changed
