@@ -12,12 +12,9 @@ from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import FAILED, OK, input_file
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
 from factorbus.cli.process.options import (
-    DEFAULT_ENDPOINT,
     Number,
+    asks_map,
     file_argument,
-    json_option,
-    timeout_option,
-    zenoh_option,
 )
 from factorbus.cli.process.reading import read_graph
 from factorbus.wording import counted
@@ -39,19 +36,6 @@ def command() -> None:
     """
 
 
-def _asking(command: F) -> F:
-    """NAME, --connect, --timeout and --json."""
-    for option in (
-        json_option,
-        zenoh_option,
-        timeout_option(30),
-        click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
-        click.argument("name"),
-    ):
-        command = option(command)
-    return command
-
-
 _probability = click.option(
     "--probability",
     type=Number(0, 1, min_open=True, max_open=True),
@@ -62,13 +46,13 @@ _probability = click.option(
 
 
 @command.command("covariance")
-@_asking
+@asks_map
 @click.argument("keys", nargs=-1)
 @click.option("--joint", "blocks", flag_value="joint", help="Of all KEYS together, one matrix.")
 @click.option("--relative", "blocks", flag_value="relative", help="Of the second as seen from the first, pair by pair.")
 @click.option("--last", "blocks", flag_value="last", help="Of the pose that was inserted last.")
 def covariance_command(
-    name: str, keys: tuple[str, ...], blocks: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+    name: str, keys: tuple[str, ...], blocks: str | None, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
 ) -> int:
     """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
 
@@ -87,7 +71,7 @@ def covariance_command(
         raise click.UsageError(
             f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
         )
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         found = asked.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
     if found.covariance is not None:
         names = [format_symbol(int(key)) for key in found.keys]
@@ -113,11 +97,11 @@ def covariance_command(
 
 
 @command.command("gate")
-@_asking
+@asks_map
 @file_argument("candidates")
 @_probability
 def gate_command(
-    name: str, candidates: Path, probability: float, connect: str, zenoh: str, timeout_s: float, as_json: bool
+    name: str, candidates: Path, probability: float, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
 ) -> int:
     """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
@@ -128,7 +112,7 @@ def gate_command(
     """
     read = _read(candidates)
     factors = read.batch.factors
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         found = asked.uncertainty.ask.gate(factors, probability, timeout_s).result()
     columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
     rows = [
@@ -149,9 +133,9 @@ def gate_command(
 
 
 @command.command("gain")
-@_asking
+@asks_map
 @file_argument("candidates")
-def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def gain_command(name: str, candidates: Path, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
     """How much information each of the factors in the file CANDIDATES would bring by itself, in nats, the most first.
 
     \b
@@ -159,7 +143,7 @@ def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_
     """
     read = _read(candidates)
     factors = read.batch.factors
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         found = asked.uncertainty.ask.gain(factors, timeout_s).result()
     rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
     if as_json:
@@ -171,12 +155,12 @@ def gain_command(name: str, candidates: Path, connect: str, zenoh: str, timeout_
 
 
 @command.command("why")
-@_asking
+@asks_map
 @click.argument("what")
 @click.option("--variable", "only", flag_value="variable", help="WHAT is a variable: of a key without a letter, 7.")
 @click.option("--factor", "only", flag_value="factor", help="WHAT is the id of a factor.")
 def why_command(
-    name: str, what: str, only: str | None, connect: str, zenoh: str, timeout_s: float, as_json: bool
+    name: str, what: str, only: str | None, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
 ) -> int:
     """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
 
@@ -197,7 +181,7 @@ def why_command(
     """
     if only == "factor" and not what.isdecimal():
         raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         told = _accounts(asked, what, only)
     if as_json:
         content = {"revision": told[0].revision, "variable": {}, "factor": {}, "step": told[0].step}
@@ -244,9 +228,9 @@ def _tell(what: str, found: Any) -> None:
 
 
 @command.command("chi2")
-@_asking
+@asks_map
 @click.option("--batch", is_flag=True, help="Also of the optimum found from scratch, which takes a while.")
-def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def chi2_command(name: str, batch: bool, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
     """How well the estimate fits: χ² = Σ rᵀΩr, with --batch over that of the optimum found from scratch.
 
     That is the lowest of three: from the map's own values, from composed odometry, from averaged rotations. Where the
@@ -257,7 +241,7 @@ def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: fl
     factorbus ask chi2 warehouse
     factorbus ask chi2 warehouse --batch
     """
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         found = asked.chi2(batch, timeout_s)
     if as_json:
         content = {"revision": found.revision, "chi2": found.chi2}
@@ -281,7 +265,7 @@ def chi2_command(name: str, batch: bool, connect: str, zenoh: str, timeout_s: fl
 
 
 @command.command("repair")
-@_asking
+@asks_map
 @click.argument("factors", nargs=-1, type=int)
 @click.option("--apply", "applied", is_flag=True, help="Take what is false out of the map, and settle it.")
 @click.option("--loss", "loss", metavar="LOSS", default="", help="With --apply: keep it, with this robust loss.")
@@ -298,7 +282,7 @@ def repair_command(
     applied: bool,
     loss: str,
     probability: float,
-    connect: str,
+    endpoint: str,
     zenoh: str,
     timeout_s: float,
     as_json: bool,
@@ -312,7 +296,7 @@ def repair_command(
     """
     from factorbus.client import Changes
 
-    with _map(name, connect, zenoh, timeout_s) as asked:
+    with _map(name, endpoint, zenoh, timeout_s) as asked:
         found = asked.repair(factors or None, probability=probability, timeout_s=timeout_s)
         if applied and found.factors.size:
             changes = Changes().repair(found, (loss, 1.0) if loss else None)

@@ -11,7 +11,7 @@ from factorbus.cli.output.advice import advising_changes
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
 from factorbus.cli.output.starts import optimum_from
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, json_option, timeout_option, zenoh_option
+from factorbus.cli.process.options import Number, asks_map
 
 F = TypeVar("F", bound=Callable[..., Any])
 _COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
@@ -35,20 +35,7 @@ def command() -> None:
 
 def _changing(command: F) -> F:
     """NAME, --connect, --timeout, --settle and --json."""
-    return _asking(click.option("--settle", is_flag=True, help="Iterate until converged afterwards.")(command))
-
-
-def _asking(command: F) -> F:
-    """NAME, --connect, --timeout and --json."""
-    for option in (
-        json_option,
-        zenoh_option,
-        timeout_option(30),
-        click.option("--connect", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="The service."),
-        click.argument("name"),
-    ):
-        command = option(command)
-    return command
+    return asks_map(click.option("--settle", is_flag=True, help="Iterate until converged afterwards.")(command))
 
 
 @command.command("remove")
@@ -134,8 +121,8 @@ def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
 
 
 @command.command("adopt")
-@_asking
-def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+@asks_map
+def adopt_command(name: str, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
     """Put the map into the optimum found from scratch, if that is below its χ² by more than 1 %; and settle it.
 
     One step, as any change kept in the journal. Variables that came since the optimum was asked for go along with
@@ -151,7 +138,7 @@ def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json
     from factorbus.client import connect as open_bus
 
     with (
-        open_bus(connect, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
+        open_bus(endpoint, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):
         found = joined.chi2(batch=True, values=True, timeout_s=timeout_s)
@@ -175,9 +162,9 @@ def adopt_command(name: str, connect: str, zenoh: str, timeout_s: float, as_json
 
 
 @command.command("fork")
-@_asking
+@asks_map
 @click.argument("new")
-def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def fork_command(name: str, new: str, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
     """Make a map NEW that begins as NAME is now, on the same service: to try something out, and to drop it.
 
     Where the service keeps a journal, the new map is kept as well. Where access control is on, ask as an operator.
@@ -189,7 +176,7 @@ def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float
     """
     from factorbus.cli.process.bus import open_bus
 
-    with open_bus(connect, "change", zenoh, timeout_s) as bus:
+    with open_bus(endpoint, "change", zenoh, timeout_s) as bus:
         row = bus.fork(name, new)
     if as_json:
         document(asdict(row))
@@ -202,13 +189,13 @@ def fork_command(name: str, new: str, connect: str, zenoh: str, timeout_s: float
 command.command("merge")(_changing(merge_command))
 
 
-def _make(name: str, changes: Any, connect: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:
+def _make(name: str, changes: Any, endpoint: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:
     """Send it, and say what came of it."""
     from factorbus.cli.process.bus import open_bus
 
     with (
         advising_changes(name),
-        open_bus(connect, "change", zenoh, timeout_s) as bus,
+        open_bus(endpoint, "change", zenoh, timeout_s) as bus,
         bus.map(name, mirror=False, create=False) as joined,
     ):
         accepted = joined.change(changes, settle=settle)

@@ -35,7 +35,7 @@ from factorbus.cli.output.exits import OK
 )
 def merge_command(
     name: str, other: str, source: str | None, letters: tuple[str, ...], anchors: tuple[tuple[str, str, str], ...],
-    frame: str | None, sigmas: str | None, absolute: str, connect: str, zenoh: str, timeout_s: float, settle: bool,
+    frame: str | None, sigmas: str | None, absolute: str, endpoint: str, zenoh: str, timeout_s: float, settle: bool,
     as_json: bool,
 ) -> int:  # fmt: skip
     """Take all of map OTHER into NAME: its keys renamed, in NAME's frame, held by the anchors. OTHER stays as it is.
@@ -57,9 +57,9 @@ def merge_command(
         "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
         "absolute": absolute.replace("-", "_"),
     }
-    with open_bus(connect, "change", zenoh, timeout_s) as bus:
+    with open_bus(endpoint, "change", zenoh, timeout_s) as bus:
         with (
-            open_bus(source or connect, "change", zenoh, timeout_s) as there,
+            open_bus(source or endpoint, "change", zenoh, timeout_s) as there,
             there.map(other, mirror=False, create=False) as theirs,
         ):
             graph = theirs.graph(timeout_s)

@@ -91,6 +91,13 @@ def json_option(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")(command)
 
 
+def asks_map(command: F) -> F:
+    """NAME, --connect, --timeout, --zenoh and --json: of a command that asks a map on the bus."""
+    for option in (json_option, zenoh_option, timeout_option(30), connect_option, click.argument("name")):
+        command = option(command)
+    return command
+
+
 def file_argument(name: str) -> Callable[[F], F]:
     """A path that is checked by who reads it, so that a bad one has the exit code of a bad file."""
     return click.argument(name, type=click.Path(path_type=Path))

@@ -22,20 +22,20 @@ NARROW = 16.0  # numbers of R a scalar; where there are more, separators may be 
 
 
 @part
-def substitute(graph: Graph, tree: Tree, ids: I64, ripple: float, quiet: float, listed: I64) -> None:
+def substitute(graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, quiet: float, listed: I64) -> None:
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
     were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  A_LEFT gets
-    the largest square by which a separator that was left alone is off; ripple 0: nothing is left alone, nor what was
-    so below a clique that does not move now
+    the largest square by which a separator that was left alone is off.  wildfire_threshold 0: no separator is left
+    alone, nor one that was so below a clique that does not move now
     """
     var = graph.var
     clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
     scalars, motions = tree.scalars, tree.motions
     state, account = tree.state, tree.account
-    far, delta, weight, motion = ripple * ripple, scalars[0], scalars[1], np.empty(rg.SIZE)
-    if ripple == 0.0 and account[tl.A_LEFT] > 0.0:
+    far, delta, weight, motion = wildfire_threshold * wildfire_threshold, scalars[0], scalars[1], np.empty(rg.SIZE)
+    if wildfire_threshold == 0.0 and account[tl.A_LEFT] > 0.0:
         far = -1.0
     motion[rg.LEFT] = 0.0
     shares = np.empty(64)
@@ -66,7 +66,7 @@ def substitute(graph: Graph, tree: Tree, ids: I64, ripple: float, quiet: float, 
                 body += 1
                 child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
     rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
-    account[tl.A_LEFT] = max(account[tl.A_LEFT] if ripple > 0.0 else 0.0, motion[rg.LEFT])
+    account[tl.A_LEFT] = max(account[tl.A_LEFT] if wildfire_threshold > 0.0 else 0.0, motion[rg.LEFT])
 
 
 @inline_kernel

@@ -1,7 +1,7 @@
 """Eliminating the affected variables: fronts from the leaves to the roots.  MATH §9.5.
 
     1  sort       factors and orphans by the front that takes them in
-    2  cut        subtrees off, which several threads can eliminate, where that takes long and anybody lends a core
+    2  cut        subtrees off, which several threads can eliminate, where that takes long and worker threads are there
     3  eliminate  the subtrees, and what is above them, children first
 
 A front takes in the factors that its pivots own and the update matrices of its children, which may be fronts of this

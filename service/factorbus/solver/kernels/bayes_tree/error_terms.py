@@ -1,30 +1,29 @@
-"""How far a factor is bent between its linearization point and the estimate.  MATH §9.6.
+"""The linearization error of a factor: what its linear model misses between two points.  MATH §9.6.
 
-What a pose i sees of j at a distance d is u = Rᵢᵀ (tⱼ − tᵢ), and between factors and sightings are linear in it.  With
-a turn of i by φ, and shifts sᵢ and sⱼ in the map's frame, the linear model misses of it, to second order,
+What a pose i sees of j at a distance d is u = Rᵢᵀ (tⱼ − tᵢ), and between factors and observations of landmarks are
+linear in it.  With a turn of i by φ, and shifts sᵢ and sⱼ in the map's frame, the linear model misses, to second order,
 
-    bend = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                                     (9.4)
+    lever error = √ω (½ d φ² + φ |sⱼ − sᵢ|)                                                              (9.4)
 
 standard deviations, ω the largest diagonal entry of Ω for the translation.  Moving the linearization point of i alone
-makes it zero.  Common shifts, however far, bend nothing.  A bearing and a range bend with the shift as well,
+makes it zero.  A common shift adds no error, however long.  For a bearing and a range the shift counts as well,
 
-    bend = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d               (9.5)
+    lever error = √ω (½ d φ² + φ |sⱼ − sᵢ| + |sⱼ − sᵢ|² / d),      √ω = √ω_range + √ω_bearing / d        (9.5)
 
-and there both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted
+and both ends have to move.  A landmark never turns, so nothing above ever moves it; but where it is shifted
 against the pose, the Jacobian of the pose's turn is off by that share of d, and with it the gradient, whatever φ is:
 
-    slip = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                         (9.12)
+    shift error = (√ω |r| + √ω |sⱼ − sᵢ|) |sⱼ − sᵢ| / d                                                  (9.12)
 
-r being the residual at the linearization point.  A pose seen from another one slips as well, with the residual r(x) at
-the estimate,
+r being the residual at the linearization point.  Between two poses, with the residual r(x) at the estimate,
 
-    slip = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                           (9.13)
+    shift error = √ω |r(x)| |sⱼ − sᵢ| / √(d² + ω_θ/ω)                                                    (9.13)
 
 As a bound it counts in full.  But errors of the gradient largely cancel along a path, so for what is relinearized as
-the drive goes on LINKS of it counts.  Where the slip is more than the bend, both ends move.
+the drive goes on LINKS of it counts.  Where the shift error is more than the lever error, both ends move.
 
 Angles of the plane add up; turns in space do not.  With ψ the turn of j as seen from i since both were linearized, and
-φ that of i, the vector part of the error is off by
+φ that of i, the vector part of the residual is off by
 
     √ω_θ ψ (½ φ + ψ² / 24)                                                                               (9.26)
 
@@ -32,13 +31,12 @@ Angles of the plane add up; turns in space do not.  With ψ the turn of j as see
 turns with i, and that of the rotation alone, r_θ, with j as seen from i, by half of which the gradient is off on the
 way:
 
-    ½ φ |√Ω r(x)| + ½ ψ |√Ω_θ r_θ(x)|                                                         (9.30)
+    ½ φ |√Ω r(x)| + ½ ψ |√Ω_θ r_θ(x)|                                                                    (9.30)
 
-That counts as a bound only.  How a sight is
-bent, or a factor with a loss, which is by its weight as well, is computed: what the linear model misses of √w r, in
-standard deviations,
+That counts as a bound only.  The error of an observation of a camera, and of a factor with a loss, includes that of
+the weight w; it is computed: what the linear model misses of √w r, in standard deviations,
 
-    bend = |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                          (9.11)
+    |C (√w r(x) − √w₀ (r(x₀) + A δᵢ + B δⱼ))|,   CᵀC = Ω                                                 (9.11)
 
 and both ends move.  As a bound the force counts as well, (9.31) in `exact_error`.
 """
@@ -53,8 +51,8 @@ from factorbus.solver.kernels.model.se3 import quat_product
 from factorbus.solver.lenses.layout import FU
 
 LINKS = 0.1
-# So much of the bend counts of what sees a landmark.  With all of it Σ bend² came to 4 to 5 times what χ² was above its
-# optimum where landmarks are seen, and to 1 to 2 times between poses.
+# The share of the error of an observation of a landmark that counts.  With all of it Σ error² came to 4 to 5 times the
+# excess of χ² where landmarks are seen, and to 1 to 2 times between poses.
 SEEN = 0.45
 
 
@@ -80,28 +78,28 @@ def shift_between(planar: bool, x: int, y: int, values: F64, lin: F64) -> float:
 
 
 @inline_kernel
-def bend_of(root: float, d: float, phi: float, shift: float) -> float:
+def lever_error_of(root: float, d: float, phi: float, shift: float) -> float:
     """(9.4)"""
     return root * (0.5 * d * phi * phi + phi * shift)
 
 
 @part
 def add_sighting(
-    kind: int, bend: float, root: float, d: float, shift: float, pull: float
+    kind: int, lever_error: float, root: float, d: float, shift: float, pull: float
 ) -> tuple[float, float]:  # fmt: skip
-    """The bend, with what (9.5) has beside (9.4), and the slip (9.12) of what sees a landmark, √ω |r| as |Ω r| / √ω;
-    pull is |Ω r|.  Of all other kinds the bend, and 0.
+    """The lever error, with what (9.5) has beside (9.4), and the shift error (9.12) of an observation of a landmark,
+    with √ω |r| as |Ω r| / √ω; pull is |Ω r|.  Of all other kinds the lever error, and 0.
     """
     if d > 0.0:
         if kind == at.BEARING_RANGE_SE2:
-            return bend + root * shift * shift / d, 0.0
+            return lever_error + root * shift * shift / d, 0.0
         if kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3:
-            return bend, (pull / root + root * shift) * shift / d
-    return bend, 0.0
+            return lever_error, (pull / root + root * shift) * shift / d
+    return lever_error, 0.0
 
 
 @inline_kernel
-def slip_weight(root: float, d: float, stiff_turn: float) -> float:
+def shift_error_weight(root: float, d: float, stiff_turn: float) -> float:
     """√ω / √(d² + ω_θ/ω) of poses: times |r(x)| and |sⱼ − sᵢ| it is (9.13)."""
     return root / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
 

@@ -29,7 +29,7 @@ def exact_error(
     evaluate_apart(f, var, fac, lin, payload, r, A, B)
     kind = fac[f, at.F_KIND]
     dim, p = residual_dim(kind), fac[f, at.F_AT] + information_at(kind)
-    # It has fallen asleep, or woken.
+    # It has become inactive, or active again.
     switched = is_camera(kind) and (r[at.R_STATUS] != GOOD) != (now[at.R_STATUS] != GOOD)
     add_slope(fac[f, at.F_I], dim, var, delta, A, r)
     if fac[f, at.F_J] >= 0:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, slip_weight
+from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_round
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
@@ -42,7 +42,7 @@ def hessian_size(di: int, dj: int) -> int:
 
 @part
 def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
-    """Write the Hessian of factor f at the linearization points, and what its slip depends on there."""
+    """Write the Hessian of factor f at the linearization points, and what its shift error depends on there."""
     kind, hessian, stiff, h = graph.fac[f, at.F_KIND], tree.hessian, tree.stiff, tree.link[f, tl.L_AT]
     more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
     # Sizes as constants, so that each call becomes straight code.
@@ -61,7 +61,7 @@ def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None
     else:
         _write_other(graph, tree, f, more, scratch)
         if is_camera(kind):
-            note_sleep(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
+            note_inactive(f, scratch.r[at.R_STATUS] != GOOD, tree.link, tree.state)
 
 
 @inline_kernel
@@ -74,11 +74,11 @@ def gradient_norm(count: int, g: int, hessian: F64) -> float:
 
 
 @inline_kernel
-def note_sleep(f: int, asleep: bool, link: I64, state: I64) -> None:
-    """Count a sight that has no pixel any more, or has one again."""
-    if asleep != (link[f, tl.L_KIND] == tl.ASLEEP):
-        state[tl.S_ASLEEP] += 1 if asleep else -1
-        link[f, tl.L_KIND] = tl.ASLEEP if asleep else tl.EXACT
+def note_inactive(f: int, inactive: bool, link: I64, state: I64) -> None:
+    """Count an observation that has no pixel any more, or has one again."""
+    if inactive != (link[f, tl.L_KIND] == tl.ASLEEP):
+        state[tl.S_ASLEEP] += 1 if inactive else -1
+        link[f, tl.L_KIND] = tl.ASLEEP if inactive else tl.EXACT
 
 
 @part
@@ -178,7 +178,7 @@ def _gradient(dr: int, d: int, WA: F64, r: F64, h: int, out: F64) -> int:
 
 @part
 def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
-    """Add a factor that was just linearized to what measures δ: the diagonal sums, and how it bends.
+    """Add a factor that was just linearized to what measures δ: the diagonal sums, and terms of its error.
 
     scratch.W holds its information, as `linearize_factor` left it.
     """
@@ -202,5 +202,5 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
                 scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
     stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        stiff[f, tl.B_PULL] = slip_weight(root, distance, stiff[f, tl.B_TURN])
+        stiff[f, tl.B_PULL] = shift_error_weight(root, distance, stiff[f, tl.B_TURN])
     stiff[f, tl.B_ROUND] = 1.0 if is_round(kind, fac[f, at.F_AT], payload) else 0.0

@@ -45,7 +45,8 @@ L_STAMP = 4  # the last sweep that linearized it
 L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
 L_WIDTH = 8  # a cache line
 
-# In L_KIND: how far a sight, or a factor with a loss, is bent is computed (9.11); a sight without a pixel.
+# In L_KIND: the linearization error of an observation, or of a factor with a loss, is computed (9.11); an inactive
+# observation.
 EXACT, ASLEEP = 1000, 1001
 
 # Columns of `clique`, a cache line each: what back-substitution reads of a clique,
@@ -119,7 +120,7 @@ S_ROOTS = 36
 S_BEGUN = 37  # 1: a step is under way; the arenas lacked room
 S_CHECKED = 38  # 1: that everything is held has been made sure of otherwise
 S_CHANGED_BEFORE = 39  # S_CHANGED of the step before, for when this one fails
-S_EXACT = 40  # factors whose bend is computed exactly
+S_EXACT = 40  # factors whose linearization error is computed
 S_WAITING = 41  # the step since when any variable waits to be relinearized
 S_DUE = 42  # 1: what waits is relinearized in the next step
 S_OLD = 43  # variables before the step
@@ -151,8 +152,8 @@ WORSE, ROSE, RAISED = 1, 2, 4
 
 # Settings of a step.
 P_WILDFIRE_THRESHOLD = 0  # in units of (9.17): how far a separator moves before its clique is solved again
-P_RELINEARIZE_THRESHOLD = 1  # what is bent by more waits to be relinearized
-P_SAME_STEP_SHARE = 2  # it is so at once, where all that is bent adds more than this share to χ²
+P_RELINEARIZE_THRESHOLD = 1  # a variable with a linearization error of more than this waits to be relinearized
+P_SAME_STEP_SHARE = 2  # in the same step, where all errors add more than this share to χ²
 P_SPLIT_MIN_PIVOTS = 3  # larger cliques, in pivot scalars,
 P_SPLIT_MAX_AFFECTED = 4  # of which no more than this share is touched, keep their leading frontals
 P_CONVERGED = (
@@ -164,7 +165,7 @@ P_MAX_ROUNDS = 8  # eliminations in a step, at most
 P_INITIALIZE = 9  # how many new variables, at most, are first put where their own factors want them
 P_NEXT_STEP_SHARE = 10  # and in the next step where it adds more than this share,
 P_MAX_WAIT = 11  # has waited for so many steps,
-P_MAX_ERROR = 12  # or something is bent by more than this
+P_MAX_ERROR = 12  # or the error of one factor is more than this
 P_REROOT_MIN_FLOPS = 13  # an elimination of more flops brings what is near to the root,
 P_REROOT_PERIOD = 14  # when with it this share has been spent of what that took the last time
 P_REROOT_SIZE_LINEAR = 15  # so many scalars, times the cube root of the flops

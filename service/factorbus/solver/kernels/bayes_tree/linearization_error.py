@@ -14,7 +14,7 @@ from factorbus.solver.kernels.bayes_tree.error_terms import (
     LINKS,
     SEEN,
     add_sighting,
-    bend_of,
+    lever_error_of,
     shift_between,
     turn_between,
     turn_error,
@@ -65,7 +65,7 @@ def measure(graph: Graph, tree: Tree, settings: F64) -> float:
 
 
 @part
-def evaluate_moved(graph: Graph, tree: Tree, bent: float) -> float:
+def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
     """χ² and linearization error of every factor of what `moved`, which is empty then; gives the largest error.
 
     Factors are gone through in the order of their ids where many variables moved, else variable by variable.
@@ -84,7 +84,7 @@ def evaluate_moved(graph: Graph, tree: Tree, bent: float) -> float:
                 if v != last:
                     c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
                     last = v
-                error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, bent)
+                error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, threshold)
                 most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                 full, counted = full + more_full, counted + more_counted
     else:
@@ -100,7 +100,9 @@ def evaluate_moved(graph: Graph, tree: Tree, bent: float) -> float:
                     if v != u:
                         c, s = heading_of(v, var[v, at.V_KIND] == at.SE2, var, delta, values, turns)
                     how = moved_ends(node[v, tl.N_LISTED], fac[f, at.F_J], node)
-                    error, more, size, more_full, more_counted = evaluate_factor(graph, tree, f, v, c, s, how, bent)
+                    error, more, size, more_full, more_counted = evaluate_factor(
+                        graph, tree, f, v, c, s, how, threshold
+                    )
                     most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                     full, counted = full + more_full, counted + more_counted
                 slot = next_incidence(slot, link)
@@ -123,7 +125,7 @@ def moved_ends(first: int, second: int, node: I64) -> int:
 
 @inline_kernel
 def evaluate_factor(
-    graph: Graph, tree: Tree, f: int, v: int, c: float, s: float, how: int, bent: float
+    graph: Graph, tree: Tree, f: int, v: int, c: float, s: float, how: int, threshold: float
 ) -> tuple[float, float, float, float, float]:
     """χ² of factor f, whose first variable is v, and its linearization error, where more of it than its place moved.
 
@@ -142,17 +144,17 @@ def evaluate_factor(
             error = min(error, MOST_ERROR)
             full = min(error + force, MOST_ERROR)
             full = ROBUST * full if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else full
-            if error > bent:
+            if error > threshold:
                 await_ends(f, fac, var, node, pending, state)
     else:
         chi2, gap, turned = factor_chi2(graph, tree, f, kind, c, s)
         if second >= 0 and how == MODEL:
-            error, full = error_of(graph, tree, f, v, bent, gap, chi2, turned)
+            error, full = error_of(graph, tree, f, v, threshold, gap, chi2, turned)
     was = stiff[f, tl.B_CHI2]
     stiff[f, tl.B_CHI2] = chi2
     if how < MODEL:
         return error, chi2 - was, chi2 + was, 0.0, 0.0
-    full, counted = full * full, error * error if error > bent else 0.0
+    full, counted = full * full, error * error if error > threshold else 0.0
     full_before, counted_before = stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED]
     stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED] = full, counted
     size = chi2 + was + full + full_before
@@ -161,7 +163,7 @@ def evaluate_factor(
 
 @inline_kernel
 def error_of(
-    graph: Graph, tree: Tree, f: int, v: int, bent: float, gap: float, chi2: float, turned: float
+    graph: Graph, tree: Tree, f: int, v: int, threshold: float, gap: float, chi2: float, turned: float
 ) -> tuple[float, float]:
     """How far factor f, whose first variable is v, is from its linear model, as it counts and in full.  Where
     that is more than `relinearize_threshold`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
@@ -172,20 +174,23 @@ def error_of(
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
     phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
     d, root, shift = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], shift_between(planar, x, y, values, lin)
-    bend = bend_of(root, d, phi, shift)
+    lever_error = lever_error_of(root, d, phi, shift)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        slip, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
+        shift_error, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
         if kind == at.BETWEEN_SE3:
             psi = turn_between(x, y, values, lin)
-            bend += turn_error(phi, psi, stiff[f, tl.B_TURN])
+            lever_error += turn_error(phi, psi, stiff[f, tl.B_TURN])
             force = FORCE * (phi * math.sqrt(chi2) + psi * math.sqrt(max(turned, 0.0)))
-        full, error = min(bend + slip + force, MOST_ERROR), min(bend + LINKS * slip, MOST_ERROR)
-        both = LINKS * slip > bend
+        full, error = (
+            min(lever_error + shift_error + force, MOST_ERROR),
+            min(lever_error + LINKS * shift_error, MOST_ERROR),
+        )
+        both = LINKS * shift_error > lever_error
     else:
-        bend, slip = add_sighting(kind, bend, root, d, shift, stiff[f, tl.B_PULL])
-        full = error = min(SEEN * (bend + slip), MOST_ERROR)
-        both = kind == at.BEARING_RANGE_SE2 or slip > bend
-    if error > bent:
+        lever_error, shift_error = add_sighting(kind, lever_error, root, d, shift, stiff[f, tl.B_PULL])
+        full = error = min(SEEN * (lever_error + shift_error), MOST_ERROR)
+        both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
+    if error > threshold:
         if free:
             await_move(v, node, pending, state)
         if (both or not free) and var[second, at.V_COLUMN] >= 0:

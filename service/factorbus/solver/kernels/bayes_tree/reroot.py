@@ -58,7 +58,10 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
     var, fac = graph.var, graph.fac
     node, link, clique, state = tree.node, tree.link, tree.clique, tree.state
     stamp, queue, put, taken = state[tl.S_STAMP], np.empty(room, np.int64), 0, 0
-    detour, wider = settings[tl.P_REROOT_MAX_EXTRA] * flops_of(marked[:count], clique), settings[tl.P_REROOT_RING_RATIO]
+    max_extra, wider = (
+        settings[tl.P_REROOT_MAX_EXTRA] * flops_of(marked[:count], clique),
+        settings[tl.P_REROOT_RING_RATIO],
+    )
     ring, within, scalars = 0, float(room), 0
     while within >= wider * INNERMOST and ring < MOST_RINGS:
         ring, within = ring + 1, within / wider
@@ -69,9 +72,9 @@ def touch_near(graph: Graph, tree: Tree, room: int, f1: int, settings: F64, mark
         v = queue[taken]
         taken += 1
         flops = flops_above(node[v, tl.N_CLIQUE], clique, stamp)
-        if flops > detour:
+        if flops > max_extra:
             continue
-        detour -= flops
+        max_extra -= flops
         room -= dim_of_variable(var, v)
         scalars += dim_of_variable(var, v)
         while ring > 0 and scalars > within:

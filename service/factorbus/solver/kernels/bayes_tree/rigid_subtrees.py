@@ -241,7 +241,7 @@ def list_subtree(top: int, body: int, clique: I64, motions: F64, motion: F64, li
 def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64, before: F64, motion: F64) -> None:
     """The variables of the listed cliques move with their bodies, in the order in which they lie in memory.
 
-    Where turns since it was solved bend, (9.21), by no more than `quiet`, linearization errors stay what they were.
+    Where the error (9.21) of turns since it was solved is at most `quiet`, linearization errors stay what they were.
     """
     var = graph.var
     node, clique, lists, lin, turns = tree.node, tree.clique, tree.lists, tree.lin[0], tree.turns
@@ -264,5 +264,5 @@ def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64,
         for a in range(dim_of_variable(var, v)):
             put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
         move_variable(graph, tree, v, delta, lin, before)
-        bend = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
-        list_moved(MODEL if bend > quiet else PLACE, v, node, moved, state)
+        lever_error = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
+        list_moved(MODEL if lever_error > quiet else PLACE, v, node, moved, state)

@@ -1,7 +1,7 @@
 """One step of the incremental solver, in one call.  MATH §9.
 
 1  take in        new variables, at good places if they are few, and new factors, linearized
-2  relinearize    variables whose factors have bent since they were linearized
+2  relinearize    variables whose factors have linearization errors above their threshold
 3  touch, detach  the cliques that new factors change, and where that is much those around the robot;
                   what hangs from them are orphans
    renew          what is below these and only has relinearized factors is eliminated again as it is
@@ -51,7 +51,7 @@ from factorbus.solver.kernels.bayes_tree.refactor_in_place import (
 )
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
 from factorbus.solver.kernels.bayes_tree.reroot import account_for, count_near, touch_near
-from factorbus.solver.kernels.bayes_tree.worker_thread import lend
+from factorbus.solver.kernels.bayes_tree.worker_thread import run_tasks
 from factorbus.solver.kernels.jit.bit_sets import MOST
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.cycle_counter import cycles
@@ -62,7 +62,7 @@ from factorbus.solver.kernels.sparse.task_queue import NOBODY
 FREE = 0
 LEAST_CHI2 = 1e-2
 LIGHT = 10**7  # flops of a step that has time to spare
-QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn that bends by less is not counted
+QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
 LARGE_GAIN = 0.05  # of χ², in one round or all,
@@ -71,17 +71,17 @@ PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to fact
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
-def tree_step(graph_table: I64, tree_table: I64, board: I64, lender: int) -> int:
+def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int:
     """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); board: where
-    cores are lent (`task_queue`); lender: NOBODY, or this is no step, but a thread that lends its core (`lend`).
+    cores are lent (`task_queue`); worker: NOBODY, or this is a worker thread (`run_tasks`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
     or FAILED: the pivot of S_FAILED was not positive; or INFINITE: the χ² of a new factor is beyond numbers.  After
     the last two the tree is as it was before the step.
     """
-    if lender != NOBODY:
-        lend(board, lender)
+    if worker != NOBODY:
+        run_tasks(board, worker)
         return tl.DONE
     began = cycles()
     graph, tree = graph_at(graph_table), tree_at(tree_table)
@@ -259,7 +259,7 @@ def await_bound(
 
 @inline_kernel
 def reluctance(settings: F64, state: I64) -> float:
-    """How many times as much has to be bent, so soon after the last relinearization.  (9.19)"""
+    """The factor on both shares so soon after the last relinearization.  (9.19)"""
     dear = settings[tl.P_COOLDOWN_FLOPS]
     rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
     return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(dear))

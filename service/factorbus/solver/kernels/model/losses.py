@@ -17,7 +17,7 @@ from factorbus.solver.kernels.model.sizes import information_at, residual_dim, s
 def soften(kind: int, loss: int, p: int, payload: F64, more: float, r: F64, A: F64, B: F64) -> float:
     """Multiply r, A and B by √w; gives ρ(s) − w rᵀ Ω r, which is what they lack in χ².
 
-    p: where the factor's payload starts; more: what s has beside rᵀ Ω r (a sight that is asleep)
+    p: where the factor's payload starts; more: what s has beside rᵀ Ω r (an inactive observation)
     """
     dim, q = residual_dim(kind), p + information_at(kind)
     own = 0.0

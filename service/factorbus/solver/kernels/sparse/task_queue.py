@@ -1,11 +1,11 @@
 """Other cores for large fronts and for subtrees: a board with one task at a time, cut into chunks.  MATH §9.5.
 
-    1  take     the board, if nobody has it and anybody lends a core
+    1  take     the board, if nobody has it and a worker thread is there
     2  post     what the task is, then how many chunks it has; who sleeps is woken
-    3  make     chunk after chunk, as long as there are any that nobody took; whoever lends a core does the same
+    3  make     chunk after chunk, as long as there are any that nobody took; the worker threads do the same
     4  wait     for the chunks that others are at; the board is free again
 
-Nobody waits for a thread that has not taken a chunk: who lends a core may come late, or be gone.  What a task is may be
+No thread waits for one that has not taken a chunk: a worker thread may come late, or be gone.  What a task is may be
 read once a chunk of it is taken, and until that is done.
 """
 
@@ -33,16 +33,16 @@ PANEL, SUBTREES = 0, 1
 
 @inline_kernel
 def count_lenders(board: I64) -> int:
-    """How many threads lend their cores."""
+    """The number of worker threads."""
     count = 0
-    for lender in range(LENDERS, WORDS, 8):
-        count += int(board[lender] == LENDS)
+    for worker in range(LENDERS, WORDS, 8):
+        count += int(board[worker] == LENDS)
     return count
 
 
 @inline_kernel
 def take_board(board: I64) -> bool:
-    """Have the board for a task.  False: nobody lends a core, or another task is there."""
+    """Have the board for a task.  False: there is no worker thread, or another task is there."""
     return count_lenders(board) > 0 and exchange(board, TAKEN, 1) == 0
 
 
@@ -51,9 +51,9 @@ def post(board: I64, task: int, chunks: int) -> None:
     """Let others take chunks of the task, of which all else is on the board."""
     board[TASK], board[CHUNKS], board[DONE] = task, chunks, 0
     exchange(board, LEFT, chunks)
-    for lender in range(LENDERS, WORDS, 8):
-        if board[lender] == LENDS:
-            wake(board, lender + ASLEEP)
+    for worker in range(LENDERS, WORDS, 8):
+        if board[worker] == LENDS:
+            wake(board, worker + ASLEEP)
 
 
 @inline_kernel
@@ -78,13 +78,13 @@ def wait_and_leave(board: I64) -> None:
 
 
 @inline_kernel
-def lends(board: I64, lender: int) -> bool:
-    """Whether the thread that has the word `lender` goes on lending its core, after it has slept until it is woken."""
-    sleep(board, lender + ASLEEP)
-    return fetch_add(board, lender, 0) == LENDS
+def goes_on_working(board: I64, worker: int) -> bool:
+    """Whether the thread that has the word `worker` goes on, after it has slept until it is woken."""
+    sleep(board, worker + ASLEEP)
+    return fetch_add(board, worker, 0) == LENDS
 
 
 @inline_kernel
-def scratch_of(lender: int) -> int:
+def scratch_of(worker: int) -> int:
     """Where this thread has its scratch in an arena; the one that posted the task has it at 0."""
-    return SCRATCH_OF_ONE * (1 + (lender - LENDERS) // 8)
+    return SCRATCH_OF_ONE * (1 + (worker - LENDERS) // 8)
