@@ -22,7 +22,6 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, take_in_factors, take_in_variables, take_out
 from factorbus.solver.kernels.bayes_tree.affected import detach, gather_factors, touch
-from factorbus.solver.kernels.bayes_tree.allocator import write_ahead
 from factorbus.solver.kernels.bayes_tree.assemble import give_back_updates, update_orphans
 from factorbus.solver.kernels.bayes_tree.back_substitute import substitute
 from factorbus.solver.kernels.bayes_tree.begin_step import begin
@@ -61,7 +60,6 @@ from factorbus.solver.kernels.sparse.task_queue import NOBODY
 
 FREE = 0
 LEAST_CHI2 = 1e-2
-LIGHT = 10**7  # flops of a step that has time to spare
 QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not counted
 MOST_ROUNDS = 10  # of a step that has not converged
 FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
@@ -86,7 +84,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
     began = cycles()
     graph, tree = graph_at(graph_table), tree_at(tree_table)
     counts, var, fac, values, settings = graph.counts, graph.var, graph.fac, graph.values, tree.settings
-    node, clique, numbers, lin, stiff = tree.node, tree.clique, tree.numbers, tree.lin, tree.stiff
+    node, clique, lin, stiff = tree.node, tree.clique, tree.lin, tree.stiff
     scalars, turns, pending, changed, marked = tree.scalars, tree.turns, tree.pending, tree.changed, tree.marked
     state, account = tree.state, tree.account
     v1, f1 = counts[at.VARIABLES], counts[at.FACTORS]
@@ -156,8 +154,6 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
     state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed[: state[tl.S_CHANGED]], var, lin, values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
     note_after(settings, state, account)
-    if state[tl.S_FLOPS] < LIGHT:
-        write_ahead(numbers, state)
     return tl.DONE
 
 
