@@ -14,7 +14,8 @@ from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.step import FINISHED, LEAST_CHI2
+from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
+from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2

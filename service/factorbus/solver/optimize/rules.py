@@ -1,6 +1,6 @@
 """When the minimization of a step stops, by the solver's options and what the step is for.  MATH §6."""
 
-from factorbus.solver.kernels.bayes_tree.step import FINISHED
+from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
 from factorbus.solver.optimize.gauss_newton import Rule
 from factorbus.solver.options import Options
 
