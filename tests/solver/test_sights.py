@@ -19,7 +19,7 @@ from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import ASLEEP
+from factorbus.solver.kernels.model.camera import INACTIVE_CHI2
 from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
@@ -55,7 +55,7 @@ def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, 
     """r, A, B, whole."""
     graph = solver._graph
     r, A, B, W = (np.zeros((1, *shape)) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
-    evaluate_factors(factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    evaluate_factors(np.array([factor]), graph.places, graph.values, r, A, B, W)
     return r[0], A[0], B[0]
 
 
@@ -227,11 +227,11 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     weak, strong = np.array([0.0, 0, 2]), BEHIND
     place = (weak + 1e6 * strong) / (1e6 + 1)
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
-    assert solver.chi2() == pytest.approx(ASLEEP + 16.0, rel=1e-3)
+    assert solver.chi2() == pytest.approx(INACTIVE_CHI2 + 16.0, rel=1e-3)
     accounts = why_variable(Blocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False).factors
     assert [account.inactive for account in accounts] == ["", why, ""]
-    assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, ASLEEP)
-    assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], ASLEEP)
+    assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
+    assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
 
 
 @pytest.mark.parametrize("loss", LOSSES)

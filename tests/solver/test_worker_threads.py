@@ -96,8 +96,8 @@ def factorized(p: int, m: int) -> bytes:
     rows = arena[fr.SCRATCH : start].reshape(p, ld)[:, lead : lead + p + m]
     rows[:] = rng.normal(size=(p, p + m))
     rows[:, :p] = np.triu(rows[:, :p] @ rows[:, :p].T + (p + m) * np.eye(p))
-    at = fr.SCRATCH + lead
-    assert factor_front(arena, at, ld, p, m, start, width, np.zeros(p), 0, 0, TASK_QUEUE) == -1
+    front = fr.Front(fr.SCRATCH + lead, ld, p, m, start, width)
+    assert factor_front(arena, front, np.zeros(p), 0, TASK_QUEUE) == -1
     return arena[fr.SCRATCH :].tobytes()
 
 

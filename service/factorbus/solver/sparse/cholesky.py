@@ -27,7 +27,7 @@ class Cholesky:
 
     def __init__(self) -> None:
         self._symbolic: Symbolic | None = None
-        self._arena, self._floors, self._x, self._room = (np.empty(0) for _ in range(4))
+        self._arena, self._room = np.empty(0), np.empty(0)
 
     @property
     def arena(self) -> F64:
@@ -46,9 +46,8 @@ class Cholesky:
         _check_blocks(symbolic, data, offsets)
         self._reserve(symbolic)
         failed = factorize(
-            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors,
-            TASK_QUEUE,
-        )  # fmt: skip
+            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, TASK_QUEUE
+        )
         if failed >= 0:
             return symbolic.variable_at(failed)
         self._symbolic = symbolic
@@ -109,7 +108,6 @@ class Cholesky:
     def _reserve(self, symbolic: Symbolic) -> None:
         """Arenas at least as large as needed; they grow by doubling and never shrink."""
         self._arena = _grown(self._arena, symbolic.arena)
-        self._floors = _grown(self._floors, symbolic.size)
         self._room = _grown(self._room, symbolic.widest)
 
 

@@ -5,12 +5,13 @@ import math
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_bounded
+from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 

@@ -15,12 +15,13 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_bounded
+from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph, graph_at
 
 # Columns of the log of links that were changed: which one, of what, and the factor or incidence that it was.

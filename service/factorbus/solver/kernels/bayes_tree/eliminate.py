@@ -14,7 +14,14 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import separators_of
-from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
+from factorbus.solver.kernels.bayes_tree.assemble import (
+    add_hessian,
+    extend_add,
+    front_of_clique,
+    list_runs,
+    number_columns,
+    variable_at,
+)
 from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_relative
 from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, int_rows, ints, put_place
@@ -224,9 +231,9 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
     flops = 0
     for f in range(begin, end):
         row = clique[ids[f]]
-        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+        p, m, front = row[tl.C_PIVOTS], row[tl.C_BORDER], front_of_clique(row)
         number_columns(row, noise, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
+        clear_front(numbers, front)
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
             anchored |= int(not is_relative(factor_of[q], var, fac))
@@ -248,10 +255,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
             anchored |= clique[orphans[e], tl.C_ANCHORED]
             e = next_orphan[e]
         row[tl.C_ANCHORED] = anchored
-        failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0, t,
-            board,
-        )  # fmt: skip
+        failed = factor_front(numbers, front, floors, t, board)
         if failed >= 0:
             return variable_at(failed, row, var, lists), flops
         if failed == RAISED:

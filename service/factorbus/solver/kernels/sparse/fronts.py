@@ -10,7 +10,9 @@ Of an update matrix GROUP rows at a time begin with the same column, the first t
 rows of a group have a common stride and little is kept below the diagonal.
 """
 
-from factorbus.solver.kernels.jit.compile import inline_kernel, vector_lanes
+from typing import NamedTuple
+
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, vector_lanes
 
 COLUMN = 0  # first pivot scalar, in elimination order
 PIVOTS = 1  # p
@@ -45,6 +47,24 @@ SCRATCH = SCRATCH_OF_ONE * (1 + LENDERS)
 
 LANES = vector_lanes()
 GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time
+
+
+class Front(NamedTuple):
+    """Where a front is in its arena: its `pivots` rows of R begin at `rows`, `ld` apart, over `pivots` + `border`
+    columns; its update matrix begins at `update`, the first rows `width` wide."""
+
+    rows: int
+    ld: int
+    pivots: int
+    border: int
+    update: int
+    width: int
+
+
+@inline_kernel
+def front_of(record: I64) -> Front:
+    """The front of a record."""
+    return Front(record[ROWS], record[LD_ROWS], record[PIVOTS], record[BORDER], record[UPDATE], record[WIDTH_UPDATE])
 
 
 @inline_kernel

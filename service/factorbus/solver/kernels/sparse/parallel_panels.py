@@ -2,6 +2,7 @@
 
 from factorbus.solver.kernels.jit.array_table import address_of, floats, put_place
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.sparse.fronts import Front
 from factorbus.solver.kernels.sparse.panels import take_panel_off
 from factorbus.solver.kernels.sparse.task_queue import (
     AT,
@@ -27,16 +28,14 @@ def is_large(depth: int, behind: int) -> bool:
 
 
 @part
-def take_panel_off_together(
-    board: I64, a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, top: int, end: int
-) -> bool:
+def take_panel_off_together(board: I64, a: F64, front: Front, top: int, end: int) -> bool:
     """As `take_panel_off`, from all rows behind the panel.  False: there is nobody to do it with; nothing is done."""
     if not take_board(board):
         return False
     put_place(board, AT, address_of(a), a.size, 1)
-    board[R], board[LD], board[P], board[M] = r, ld, p, m
-    board[U], board[WIDTH], board[TOP], board[END] = u, width, top, end
-    post(board, PANEL, _chunks(p - end) + _chunks(m))
+    board[R], board[LD], board[P], board[M], board[U], board[WIDTH] = front
+    board[TOP], board[END] = top, end
+    post(board, PANEL, _chunks(front.pivots - end) + _chunks(front.border))
     chunk = take_chunk(board)
     while chunk >= 0:
         make_panel_chunk(board, chunk)
@@ -58,7 +57,8 @@ def make_panel_chunk(board: I64, chunk: int) -> None:
         low = p + (chunk - in_r) * CHUNK
         high = min(low + CHUNK, p + m)
     a = floats(board, AT)
-    take_panel_off(a, board[R], board[LD], p, m, board[U], board[WIDTH], board[TOP], end, low, high)
+    front = Front(board[R], board[LD], p, m, board[U], board[WIDTH])
+    take_panel_off(a, front, board[TOP], end, low, high)
 
 
 @inline_kernel
