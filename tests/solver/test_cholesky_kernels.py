@@ -9,7 +9,7 @@ from naive.elimination import partial_cholesky
 from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.kernels.jit import simd_plain
 from factorbus.solver.kernels.jit.simd import LANES, Block, Panel, add_run, six, solve_tile, tile, zero
-from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, Front, padded, update_row, update_size
+from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, Front, padded_size, update_row, update_size
 from factorbus.solver.kernels.sparse.panels import DEPTH
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
@@ -102,7 +102,7 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
     """Put a front into an arena as `fronts` says, everything around it NaN, and factorize it."""
     n = len(front)
     m, lead = n - p, -p % LANES
-    ld, width = lead + p + m + -m % LANES, padded(m)
+    ld, width = lead + p + m + -m % LANES, padded_size(m)
     start, size = SCRATCH + p * ld, update_size(m, width)
     arena = np.full(start + size + 8, np.nan)
     rows = arena[SCRATCH:start].reshape(p, ld)

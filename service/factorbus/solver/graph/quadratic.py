@@ -65,7 +65,7 @@ def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F6
     """Of factors of one kind the Jacobian of each end (n, dim, d), Ω (n, dim, dim) and r (n, dim)."""
     n = rows.size
     r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, 6, 6)) for _ in range(3))
-    evaluate_factors(rows, graph.places, graph.values, r, A, B, W)
+    evaluate_factors(rows, graph.array_table, graph.values, r, A, B, W)
     d = kind.dim
     blocks = [J[:, :d, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
     return blocks, W[:, :d, :d], r[:, :d]

@@ -21,10 +21,10 @@ from factorbus.solver.kernels.inc_l.block_rows import (
 from factorbus.solver.kernels.inc_l.dense_update import MOST_BLOCKS, dense_omega_update
 from factorbus.solver.kernels.inc_l.lambda_update import lambda_update
 from factorbus.solver.kernels.inc_l.omega_update import MOST_ROWS, omega_update
-from factorbus.solver.kernels.inc_l.records import Rows
+from factorbus.solver.kernels.inc_l.records import BlockRows
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.symbolic import Symbolic
 
 _NEW_NUMBERS = 6 * 12  # doubles a new row takes at most
@@ -46,8 +46,8 @@ class Reach:
 class BlockFactor(Arenas):
     """RᵀR = PΛPᵀ and d = R⁻ᵀPη."""
 
-    ARENAS = Rows._fields
-    NOT_KEPT = ("_room", "places")
+    ARENAS = BlockRows._fields
+    NOT_KEPT = ("_room", "array_table")
 
     def __init__(self) -> None:
         self.rec: I64 = np.empty((16, br.RECORD), np.int64)
@@ -69,7 +69,7 @@ class BlockFactor(Arenas):
         if self.index.size < symbolic.stored:
             self.index = np.empty(self.numbers.size, np.int64)
         take_fronts(
-            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.border, arena, self.places
+            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.border, arena, self.array_table
         )
         self.d[: symbolic.size] = d
 
@@ -80,13 +80,13 @@ class BlockFactor(Arenas):
             return
         self._reserve(v1 - v0, int(graph.counts[at.SCALARS]))
         self._make_room((v1 - v0) * _NEW_INDEX, (v1 - v0) * _NEW_NUMBERS)
-        append_rows(v0, v1, graph.places, self.places)
+        append_rows(v0, v1, graph.array_table, self.array_table)
 
     def reach(self, graph: Graph, f0: int) -> Reach:
         """What the factors from id `f0` on reach; their variables have rows."""
         seen = np.zeros(1, np.int64)
         f1 = int(graph.counts[at.FACTORS])
-        count = reach_rows(f0, f1, graph.places, self.places, self._mark, self._found, seen)
+        count = reach_rows(f0, f1, graph.array_table, self.array_table, self._mark, self._found, seen)
         rows = self._found[:count]
         return Reach(rows, int(seen[0]), int(self.counts[br.POSITIONS] - rows[0]) if count else 0)
 
@@ -98,25 +98,25 @@ class BlockFactor(Arenas):
         f1 = int(graph.counts[at.FACTORS])
         self._make_room_to_grow(reach)
         if reach.rows.size <= MOST_BLOCKS:
-            return dense_omega_update(f0, f1, reach.rows, graph.places, self.places) < 0
+            return dense_omega_update(f0, f1, reach.rows, graph.array_table, self.array_table) < 0
         if self._room.size < MOST_ROWS * reach.scalars:
             self._room = np.empty(2 * MOST_ROWS * reach.scalars)
-        return omega_update(f0, f1, graph.places, self.places, reach.scalars, self._room) < 0
+        return omega_update(f0, f1, graph.array_table, self.array_table, reach.scalars, self._room) < 0
 
-    def lambda_update(self, blocks: Blocks, reach: Reach) -> bool:
+    def lambda_update(self, blocks: HessianBlocks, reach: Reach) -> bool:
         """R₂₂ := chol(Λ₂₂ − R₁₂ᵀR₁₂); d with it.  False: a pivot failed, and R is of no use any more."""
         self._make_room_to_grow(reach)
         count = int(blocks.fill[0])
-        return lambda_update(reach.rows, count, blocks.pattern, blocks.data, blocks.eta, self.places) < 0
+        return lambda_update(reach.rows, count, blocks.pattern, blocks.data, blocks.eta, self.array_table) < 0
 
     def forward(self, eta: F64, d: F64) -> float:
         """d = R⁻ᵀPη in elimination order, from η in insertion order; gives dᵀd."""
-        return float(solve_block_rows_transposed(self.places, eta, d))
+        return float(solve_block_rows_transposed(self.array_table, eta, d))
 
     def back(self, d: F64) -> F64:
         """δ = PᵀR⁻¹d, in insertion order."""
         x, delta = np.empty(d.size), np.empty(d.size)
-        solve_block_rows(self.places, d, x, delta)
+        solve_block_rows(self.array_table, d, x, delta)
         return delta
 
     def memory_bytes(self) -> int:
@@ -152,5 +152,5 @@ class BlockFactor(Arenas):
         live, listed = int((rec[:, br.DIM] * rec[:, br.LD]).sum()), int(rec[:, br.ROOM].sum())
         index = np.empty(max(self.index.size, 2 * (listed + positions)), np.int64)
         fresh = np.empty(max(self.numbers.size, 2 * (live + numbers)))
-        compact_rows(self.places, index, fresh)
+        compact_rows(self.array_table, index, fresh)
         self.index, self.numbers = index, fresh

@@ -11,8 +11,8 @@ from factorbus.solver.kernels.sparse.multifrontal import factorize
 from factorbus.solver.kernels.sparse.triangular_solve import (
     into_elimination_order,
     into_insertion_order,
-    solve_lower,
-    solve_upper,
+    solve_fronts,
+    solve_fronts_transposed,
 )
 from factorbus.solver.sparse.ordering import integers
 from factorbus.solver.sparse.symbolic import Symbolic
@@ -69,13 +69,13 @@ class Cholesky:
         """d = R⁻ᵀPη, in elimination order."""
         symbolic, d = self._of(eta), np.empty(len(eta))
         into_elimination_order(symbolic.place, symbolic.starts, symbolic.dims, np.array(eta, float), d)
-        solve_lower(symbolic.fronts, symbolic.border, self._arena, d, self._room)
+        solve_fronts_transposed(symbolic.fronts, symbolic.border, self._arena, d, self._room)
         return d
 
     def back(self, d: F64) -> F64:
         """δ = PᵀR⁻¹d: from elimination order back to insertion order."""
         symbolic, x, delta = self._of(d), np.array(d, float), np.empty(len(d))
-        solve_upper(symbolic.fronts, symbolic.border, self._arena, x, self._room)
+        solve_fronts(symbolic.fronts, symbolic.border, self._arena, x, self._room)
         into_insertion_order(symbolic.place, symbolic.starts, symbolic.dims, x, delta)
         return delta
 

@@ -124,7 +124,7 @@ def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: 
 
 
 @part
-def list_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
+def list_column_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
     """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
 
     A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.

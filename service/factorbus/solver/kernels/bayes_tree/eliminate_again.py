@@ -35,7 +35,7 @@ QUIET = 0.05  # of P_RELINEARIZE_THRESHOLD: a turn with a smaller error is not c
 
 @part
 def eliminate_again(
-    graph: Graph, tree: Tree, new: NewRows, moving: I64, settings: F64, board: I64
+    graph: Graph, tree: Tree, new: NewRows, moving: I64, settings: F64, queue: I64
 ) -> tuple[float, int]:
     """Steps 3 to 9; gives Σ error² as `measure` does, and the status."""
     node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
@@ -51,7 +51,7 @@ def eliminate_again(
     old = np.empty((renewed.size, OLD), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
-        status = renew(graph, tree, renewed, variables.size, account[tl.A_STIFFEST], old, board)
+        status = renew(graph, tree, renewed, variables.size, account[tl.A_STIFFEST], old, queue)
         if status != tl.DONE:
             return 0.0, status
     now = lap(now, tl.ELIMINATE, state)
@@ -73,7 +73,7 @@ def eliminate_again(
     now = lap(now, tl.SYMBOLIC, state)
     # 6
     flops = state[tl.S_FLOPS]
-    failed = eliminate_fronts(graph, tree, ids, fronts, affected, lowest, update, board)
+    failed = eliminate_fronts(graph, tree, ids, fronts, affected, lowest, update, queue)
     if failed < 0 and state[tl.S_EDITED] != 0 and state[tl.S_RAISED] != 0:
         failed = find_loose_end(graph.var, tree.moved, state)
     if failed >= 0:

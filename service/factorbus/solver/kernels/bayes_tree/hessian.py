@@ -59,9 +59,9 @@ def gradient_norm(count: int, g: int, hessian: F64) -> float:
 @inline_kernel
 def note_inactive(f: int, inactive: bool, link: I64, state: I64) -> None:
     """Count an observation that has no pixel any more, or has one again."""
-    if inactive != (link[f, tl.L_KIND] == tl.ASLEEP):
-        state[tl.S_ASLEEP] += 1 if inactive else -1
-        link[f, tl.L_KIND] = tl.ASLEEP if inactive else tl.EXACT
+    if inactive != (link[f, tl.L_KIND] == tl.INACTIVE):
+        state[tl.S_INACTIVE] += 1 if inactive else -1
+        link[f, tl.L_KIND] = tl.INACTIVE if inactive else tl.EXACT
 
 
 @part

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.bayes_tree.assemble import (
     add_hessian,
     extend_add,
     front_of_clique,
-    list_runs,
+    list_column_runs,
     number_columns,
     variable_at,
 )
@@ -97,10 +97,10 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 
 
 @part
-def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, board: I64) -> int:
+def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, queue: I64) -> int:
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
-    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  board: see
+    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  queue: see
     `task_queue`.
     """
     var = graph.var
@@ -134,10 +134,10 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: 
         while child >= 0:
             other = clique[child]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            count = list_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
+            count = list_column_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, count, row)
             child = other[tl.C_NEXT]
-        failed = factor_front(numbers, front, floors, 0, board)
+        failed = factor_front(numbers, front, floors, 0, queue)
         if failed == RAISED:
             state[tl.S_RAISED] = 1
         if failed >= 0:

@@ -18,7 +18,7 @@ A step with nothing new goes on from 2 with what waits, and substitutes back thr
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import take_in_factors, take_in_variables, take_out
 from factorbus.solver.kernels.bayes_tree.allocator import write_ahead
-from factorbus.solver.kernels.bayes_tree.begin_step import begin
+from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
 from factorbus.solver.kernels.bayes_tree.convergence import await_bound, goes_on, note_after
 from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, lap
@@ -37,9 +37,9 @@ LIGHT = 10**7  # flops of a step that has time to spare
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
-def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int:
-    """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); board: where
-    cores are lent (`task_queue`); worker: NOBODY, or this is a worker thread (`run_tasks`).
+def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int:
+    """Take in what is new in the graph, and solve.  graph_table, tree_table: of their arrays (`records`); queue: for
+    worker threads (`task_queue`); worker: NOBODY, or this is a worker thread (`run_tasks`).
 
     Gives DONE; or NO_ROOM: `state` says what is needed, and the step goes on when it is called again; or UNSURE: only
     the numbers can tell whether all new variables are held, and the step begins when it is called with S_CHECKED set;
@@ -47,7 +47,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
     the last two the tree is as it was before the step.
     """
     if worker != NOBODY:
-        run_tasks(board, worker)
+        run_tasks(queue, worker)
         return tl.DONE
     began = cycles()
     graph, tree = graph_at(graph_table), tree_at(tree_table)
@@ -56,7 +56,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
     if state[tl.S_BEGUN] == 0:
         if len(tree.clique) > tree.marked.size:
             return tl.NO_ROOM
-        status = begin(graph, tree)
+        status = begin_step(graph, tree)
         if status != tl.DONE:
             return status
         note_before(v1, f1, state, account)
@@ -74,7 +74,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
             relinearize(graph, tree, moving)
         lap(began, tl.LINEARIZE, state)
         before = account[tl.A_CHI2]
-        pull, status = eliminate_again(graph, tree, NewRows(v0, v1, f1), moving, scaled, board)
+        pull, status = eliminate_again(graph, tree, NewRows(v0, v1, f1), moving, scaled, queue)
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
         began = cycles()
@@ -102,7 +102,7 @@ def tree_step(graph_table: I64, tree_table: I64, board: I64, worker: int) -> int
             break
         await_bound(graph, tree, scaled)
     changed = tree.changed[: state[tl.S_CHANGED]]
-    state[tl.S_TOLD] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
+    state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
     note_after(settings, state, account)
     if state[tl.S_FLOPS] < LIGHT:

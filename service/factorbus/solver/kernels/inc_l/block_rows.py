@@ -2,14 +2,14 @@
 
 Position k is the k-th block column of the elimination order.  Block row k of R holds the blocks (k, j) for the
 positions j of its list, ascending, itself first; new positions are appended behind all others.
-The arrays are those of `records.Rows`.
+The arrays are those of `records.BlockRows`.
 
 The first off-diagonal entry of a row is its parent in the elimination tree, and the rest of the row is in the parent's.
 """
 
 import numpy as np
 
-from factorbus.solver.kernels.inc_l.records import BlockList, Rows, rows_at
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
@@ -229,7 +229,7 @@ def compact_rows(rows_table: I64, new_index: I64, new_numbers: F64) -> None:
 
 
 @part
-def widen_row(k: int, wider: BlockList, rows: Rows) -> None:
+def widen_row(k: int, wider: BlockList, rows: BlockRows) -> None:
     """Give row k the blocks of the list, which include those it has; new ones are zero.
 
     The row stays where it is if there is room, else it moves to the end of the arenas and gets room to grow.

@@ -6,7 +6,7 @@ M = R₂₂ᵀ R₂₂ + Ω,  z = R₂₂ᵀ d₂ + ω;  then R̃₂₂ = chol(M
 import numpy as np
 
 from factorbus.solver.kernels.inc_l import block_rows as br
-from factorbus.solver.kernels.inc_l.records import BlockList, Rows, rows_at
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
@@ -56,7 +56,7 @@ def dense_omega_update(f0: int, f1: int, reached: I64, graph_table: I64, rows_ta
 
 
 @part
-def read_tail(reached: I64, start: I64, rows: Rows, T: F64, y: F64) -> None:
+def read_tail(reached: I64, start: I64, rows: BlockRows, T: F64, y: F64) -> None:
     """The reached rows as one dense matrix, and their part of d."""
     rec, index, numbers, d = rows.rec, rows.index, rows.numbers, rows.d
     for t in range(reached.size):
@@ -122,7 +122,7 @@ def add_omega(f0: int, f1: int, reached: I64, start: I64, graph: Graph, place: I
 
 
 @part
-def write_tail(reached: I64, start: I64, size: int, M: F64, z: F64, rows: Rows) -> None:
+def write_tail(reached: I64, start: I64, size: int, M: F64, z: F64, rows: BlockRows) -> None:
     """The rows get all reached positions from their own on, and the numbers of M and z."""
     rec, numbers, d = rows.rec, rows.numbers, rows.d
     for t in range(reached.size):

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels.inc_l import block_rows as br
-from factorbus.solver.kernels.inc_l.records import BlockList, Rows, rows_at
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
@@ -83,7 +83,7 @@ def blocks_by_row(reached: I64, is_reached: I64, blocks: int, pattern: I64, plac
 
 
 @part
-def renew_structure(reached: I64, begin: I64, block_of: I64, pattern: I64, rows: Rows) -> None:
+def renew_structure(reached: I64, begin: I64, block_of: I64, pattern: I64, rows: BlockRows) -> None:
     """Rows get the positions of the new blocks of Λ and of their children in the tree."""
     rec, index, place, n = rows.rec, rows.index, rows.place, rows.counts[br.POSITIONS]
     seen, head, after = np.full(n, NONE), np.full(n, NONE), np.full(n, NONE)
@@ -122,7 +122,7 @@ def renew_structure(reached: I64, begin: I64, block_of: I64, pattern: I64, rows:
 
 
 @inline_kernel
-def queue_row(k: int, is_reached: I64, rows: Rows, entry: I64, offset: I64, head: I64, after: I64) -> None:
+def queue_row(k: int, is_reached: I64, rows: BlockRows, entry: I64, offset: I64, head: I64, after: I64) -> None:
     """A row that stays waits for the first reached position in its list, if there is one."""
     rec, index = rows.rec, rows.index
     first, e, x = rec[k, br.LIST], rec[k, br.COUNT], rec[k, br.WIDTH]
@@ -136,7 +136,7 @@ def queue_row(k: int, is_reached: I64, rows: Rows, entry: I64, offset: I64, head
 
 
 @inline_kernel
-def advance(k: int, rows: Rows, entry: I64, offset: I64, head: I64, after: I64) -> None:
+def advance(k: int, rows: BlockRows, entry: I64, offset: I64, head: I64, after: I64) -> None:
     """Row k waits for the next position in its list."""
     rec, index = rows.rec, rows.index
     first = rec[k, br.LIST]
@@ -148,7 +148,7 @@ def advance(k: int, rows: Rows, entry: I64, offset: I64, head: I64, after: I64) 
 
 
 @part
-def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: Rows, where: I64) -> None:
+def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: BlockRows, where: I64) -> None:
     """Row j := row j of Λ and η, whose blocks are `own`; where: gets where its positions are in it."""
     rec, index, numbers, place, d = rows.rec, rows.index, rows.numbers, rows.place, rows.d
     row = rec[j]
@@ -172,7 +172,7 @@ def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: Rows, wh
 
 
 @part
-def take_product(j: int, k: int, entry: int, offset: int, rows: Rows, where: I64) -> None:
+def take_product(j: int, k: int, entry: int, offset: int, rows: BlockRows, where: I64) -> None:
     """Row j −= R_kjᵀ (row k from j on), d_j −= R_kjᵀ d_k.  Neighbours that stay neighbours go together."""
     rec, index, numbers, d = rows.rec, rows.index, rows.numbers, rows.d
     row, other = rec[j], rec[k]

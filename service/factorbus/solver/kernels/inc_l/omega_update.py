@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.solver.kernels.inc_l import block_rows as br
-from factorbus.solver.kernels.inc_l.records import BlockList, Rows, rows_at
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
@@ -109,7 +109,7 @@ def list_ends(f0: int, f1: int, graph: Graph, place: I64, out: I64) -> int:
 
 
 @part
-def whiten(f: int, k: int, graph: Graph, rows: Rows, union: I64, scratch: Scratch, whitened: WhitenedRows) -> int:
+def whiten(f: int, k: int, graph: Graph, rows: BlockRows, union: I64, scratch: Scratch, whitened: WhitenedRows) -> int:
     """Write the rows C H and −C r of factor f, CᵀC its information, from row k of W on; gives the row behind.
 
     scratch: has r and H, and gets C
@@ -158,7 +158,7 @@ def upper_factor(dim: int, p: int, payload: F64, C: F64) -> None:
 
 
 @part
-def sweep(height: int, left: Remaining, union: I64, spare: I64, whitened: WhitenedRows, rows: Rows) -> int:
+def sweep(height: int, left: Remaining, union: I64, spare: I64, whitened: WhitenedRows, rows: BlockRows) -> int:
     """Rotate the first `height` rows of W into R, from the first row they touch to the last.
 
     Gives −1, or a position whose pivot is not a positive number.
@@ -181,7 +181,7 @@ def sweep(height: int, left: Remaining, union: I64, spare: I64, whitened: Whiten
 
 @inline_kernel
 def join_lists(
-    i: int, left: Remaining, height: int, union: I64, spare: I64, whitened: WhitenedRows, rows: Rows
+    i: int, left: Remaining, height: int, union: I64, spare: I64, whitened: WhitenedRows, rows: BlockRows
 ) -> Remaining:
     """The positions that remain become their union with the list of row i, and W gets zeros there."""
     rec, index, first, count = rows.rec, rows.index, left.first, left.count
@@ -217,7 +217,7 @@ def join_lists(
 
 
 @part
-def reflect(row: I64, height: int, skip: int, whitened: WhitenedRows, rows: Rows, made: Reflections) -> bool:
+def reflect(row: I64, height: int, skip: int, whitened: WhitenedRows, rows: BlockRows, made: Reflections) -> bool:
     """The reflections that clear W under the diagonal block of a row, applied to that block and to d and rhs.
 
     Reflection a is I − scale · (v, x)(v, x)ᵀ on (row a of the block, the rows of W); it leaves the pivot positive.

@@ -6,7 +6,7 @@ from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.jit.records import Floats, IntRows, Ints, opener
 
 
-class Rows(NamedTuple):
+class BlockRows(NamedTuple):
     """R and d; `block_rows` has the columns of `rec` and the entries of `counts`.
 
     rec      (n, 10) int64    one record per position
@@ -35,4 +35,4 @@ class BlockList(NamedTuple):
     width: int
 
 
-rows_at = opener(Rows)
+rows_at = opener(BlockRows)

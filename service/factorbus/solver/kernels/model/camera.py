@@ -12,7 +12,7 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import rotation
+from factorbus.solver.kernels.model.se3 import rotation_matrix
 from factorbus.solver.lenses.layout import BEHIND, GOOD, OUTSIDE_LENS, VERTICAL
 from factorbus.solver.lenses.models import project, ray
 
@@ -36,7 +36,7 @@ def observation(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B
     INACTIVE_CHI2 is returned, which it adds to χ²; else 0.
     """
     i, j = ends
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     d0, d1, d2 = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     n, rho, a0, a1, a2 = k + 2, 1.0, d0, d1, d2
     st, ct, sp, cp = 0.0, 0.0, 0.0, 0.0
@@ -82,7 +82,7 @@ def observation(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B
 def place_idp(x: F64, i: int, p: F64, k: int, j: int) -> int:
     """The y with which its first observation has no residual, into x from j on; gives GOOD or why not.  MATH (3.18)"""
     status, a, b, c, _, _, _, _, _, _ = ray(int(p[k + 3]), p[k + 4 :], p[k], p[k + 1])
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     hx, hy, hz = q[0] * a + q[1] * b + q[2] * c, q[3] * a + q[4] * b + q[5] * c, q[6] * a + q[7] * b + q[8] * c
     s2 = hx * hx + hz * hz
     x[j], x[j + 1], x[j + 2] = x[i], x[i + 1], x[i + 2]

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import quat_product, rotation, turn_slope
+from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix, turn_slope
 from factorbus.solver.kernels.model.sizes import dim_of, kinds_of_ends, residual_dim, size_of
 
 
@@ -73,7 +73,7 @@ def add_se2(rows: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> None:
 @part
 def add_se3(rows: int, x: F64, y: F64, H: F64, r: F64, J: F64) -> None:
     """r += H (x ⊟ y),  J = H [ R_yᵀ R | 0 ; 0 | w I + ⌊v⌋ ]."""
-    z, q = rotation(y, 3), rotation(x, 3)
+    z, q = rotation_matrix(y, 3), rotation_matrix(x, 3)
     d0, d1, d2 = x[0] - y[0], x[1] - y[1], x[2] - y[2]
     e0, e1, e2 = z[0] * d0 + z[3] * d1 + z[6] * d2, z[1] * d0 + z[4] * d1 + z[7] * d2, z[2] * d0 + z[5] * d1 + z[8] * d2
     vx, vy, vz, w = quat_product(-y[3], -y[4], -y[5], y[6], x[3], x[4], x[5], x[6])

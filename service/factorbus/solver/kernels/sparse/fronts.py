@@ -41,9 +41,9 @@ BLOCK = 5
 STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 
 # The first doubles of an arena: room for a 4 x 4 triangle, for each thread that may be at it.
-LENDERS = 7  # threads besides the one whose arena it is
+MOST_WORKERS = 7  # threads besides the one whose arena it is
 SCRATCH_OF_ONE = 16
-SCRATCH = SCRATCH_OF_ONE * (1 + LENDERS)
+SCRATCH = SCRATCH_OF_ONE * (1 + MOST_WORKERS)
 
 LANES = vector_lanes()
 GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time
@@ -68,7 +68,7 @@ def front_of(record: I64) -> Front:
 
 
 @inline_kernel
-def padded(count: int) -> int:
+def padded_size(count: int) -> int:
     """The next multiple of LANES."""
     return (count + LANES - 1) & ~(LANES - 1)
 
@@ -76,7 +76,7 @@ def padded(count: int) -> int:
 @inline_kernel
 def row_stride(count: int) -> int:
     """Padded, and not a multiple of a large power of two, whose rows would share a few sets of the cache."""
-    stride = padded(count)
+    stride = padded_size(count)
     return stride + 8 if stride >= 128 and stride % 16 == 0 else stride
 
 

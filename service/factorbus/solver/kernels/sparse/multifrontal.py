@@ -10,11 +10,11 @@ from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE, fa
 
 @kernel("int64(int64[:,::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1], float64, float64[::1], int64[::1])")
 def factorize(
-    fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, board: I64
+    fronts: I64, runs: I64, blocks: I64, values: F64, offsets: I64, damping: float, arena: F64, queue: I64
 ) -> int:
     """Factorize Λ with its diagonal multiplied by 1 + damping.  Gives the scalar whose pivot failed, or -1.
 
-    in   values: blocks of Λ, block b row-major at offsets[b]   board: where cores are lent, see `task_queue`
+    in   values: blocks of Λ, block b row-major at offsets[b]   queue: for worker threads, see `task_queue`
     out  arena: rows of R;  scalars count in elimination order
     """
     most = 0
@@ -36,7 +36,7 @@ def factorize(
             child = fronts[c]
             add_update(arena, fr.front_of(child), runs, child[fr.RUNS], child[fr.RUNS_END], front)
             c = child[fr.SIBLING]
-        failed = factor_front(arena, front, floors, 0, board)
+        failed = factor_front(arena, front, floors, 0, queue)
         if failed >= 0:
             return record[fr.COLUMN] + failed
     return -1
@@ -45,7 +45,7 @@ def factorize(
 @inline_kernel
 def clear_front(a: F64, front: fr.Front) -> None:
     """Zero the rows of R, their padding too, and the update matrix."""
-    zero(a, front.rows - (fr.padded(front.pivots) - front.pivots), front.pivots * front.ld)
+    zero(a, front.rows - (fr.padded_size(front.pivots) - front.pivots), front.pivots * front.ld)
     zero(a, front.update, fr.update_size(front.border, front.width))
 
 

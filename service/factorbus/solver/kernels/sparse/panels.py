@@ -2,7 +2,7 @@
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, Block, Panel, tile
-from factorbus.solver.kernels.sparse.fronts import Front, padded, update_row, update_stride
+from factorbus.solver.kernels.sparse.fronts import Front, padded_size, update_row, update_stride
 
 DEPTH = 128  # rows of a panel: with WIDTH columns they fit the second level cache
 WIDTH = 192
@@ -15,7 +15,7 @@ def take_panel_off(a: F64, front: Front, top: int, end: int, low: int, high: int
     low: `end` or behind it by a multiple of TILE_ROWS; in U, p + i with i such a multiple.
     """
     r, ld, p, m, u, width = front
-    lead, above = padded(p) - p, r + top * ld
+    lead, above = padded_size(p) - p, r + top * ld
     for i in range(low, min(high, p), TILE_ROWS):
         take_off(a, min(TILE_ROWS, p - i), Block(r + i * ld, ld), Panel(above, ld, end - top), i, i, p + m, lead)
     first, last = max(low - p, 0), high - p

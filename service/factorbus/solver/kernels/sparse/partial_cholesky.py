@@ -11,7 +11,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, Block, Panel, at, put, solve_tile
-from factorbus.solver.kernels.sparse.fronts import Front, padded
+from factorbus.solver.kernels.sparse.fronts import Front, padded_size
 from factorbus.solver.kernels.sparse.panels import DEPTH, take_off, take_panel_off
 from factorbus.solver.kernels.sparse.parallel_panels import is_large, take_panel_off_together
 
@@ -28,16 +28,16 @@ RAISED = -2  # what `factor_front` gives where it raised a pivot
 
 
 @part
-def factor_front(a: F64, front: Front, floors: F64, t: int, board: I64) -> int:
+def factor_front(a: F64, front: Front, floors: F64, t: int, queue: I64) -> int:
     """Factorize a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1; or RAISED.
 
     in   floors[i]: pivot i must exceed it, or, where it is negative, is raised to its size if it does not
          t: scratch of this thread
-         board: where cores are lent, see `task_queue`
+         queue: for worker threads, see `task_queue`
     out  rows: R and S   update matrix: U
     """
     r, ld, p, m = front.rows, front.ld, front.pivots, front.border
-    raised, lead = False, padded(p) - p
+    raised, lead = False, padded_size(p) - p
     for top in range(0, p, DEPTH):
         end = min(top + DEPTH, p)
         for i in range(top, end, TILE_ROWS):
@@ -48,9 +48,9 @@ def factor_front(a: F64, front: Front, floors: F64, t: int, board: I64) -> int:
                 return i + failed
             raised |= failed == RAISED
             first = i - (lead + i) % LANES
-            solve_tile(a, rows, (padded(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, t)
+            solve_tile(a, rows, (padded_size(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, t)
         large = is_large(end - top, p + m - end)
-        if not (large and take_panel_off_together(board, a, front, top, end)):
+        if not (large and take_panel_off_together(queue, a, front, top, end)):
             take_panel_off(a, front, top, end, end, p + m)
     return RAISED if raised else -1
 

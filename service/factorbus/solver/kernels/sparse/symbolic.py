@@ -219,8 +219,8 @@ def _place(records: I64) -> I64:
     for f in range(fronts):
         front = records[f]
         p, m = front[fr.PIVOTS], front[fr.BORDER]
-        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded(p) + m), fr.padded(m)
-        front[fr.ROWS] = end + fr.padded(p) - p
+        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded_size(p) + m), fr.padded_size(m)
+        front[fr.ROWS] = end + fr.padded_size(p) - p
         end += p * front[fr.LD_ROWS]
         if front[fr.CHILD] != NONE:
             top[1 - depth[f]] = records[front[fr.CHILD], fr.UPDATE]
