@@ -36,7 +36,7 @@ SCRIPT = """
 import numpy as np
 from kernels import caller
 from kernels.jit import compile as _jit
-print(caller.four_times(np.ones(3)), _jit.compiled_seconds() > 0.0, _jit.cache_folder().name)
+print(caller.four_times(np.ones(3)), _jit.compile_seconds() > 0.0, _jit.cache_folder().name)
 """
 
 
@@ -251,7 +251,7 @@ def test_kernels_of_another_folder_have_a_cache_of_their_own_and_exact_ones_roun
         "from factorbus.solver.kernels.jit import compile as _jit\n"
         "import others.sums\n"
         "a = np.array([3.0, 1e17, -1e17, 1.0])\n"
-        "print(others.sums.total(a), _jit.compiled_seconds() > 0.0, others.sums.FOLDER.path().name)\n"
+        "print(others.sums.total(a), _jit.compile_seconds() > 0.0, others.sums.FOLDER.path().name)\n"
     )
     text = (
         "from pathlib import Path\n"

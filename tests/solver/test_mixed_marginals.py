@@ -17,6 +17,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import Blocks
 from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.kernels.model import layout as at
@@ -49,7 +50,7 @@ def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:
-    return solver.with_changes([Change("marginalize", keys=np.array(keys))], settle=True)[0]
+    return with_changes(solver, [Change("marginalize", keys=np.array(keys))], settle=True)[0]
 
 
 def assert_same(solver: Solver, after: Solver, gone: list[int], settled: float = 1e-9) -> None:
@@ -178,7 +179,7 @@ class Window:
         for tree in [tree for tree, last in self.seen.items() if last < self.first]:
             gone.append(self.names.pop(tree))
             del self.seen[tree]
-        self.solver = self.solver.with_changes([Change("marginalize", keys=np.array(gone))])[0]
+        self.solver = with_changes(self.solver, [Change("marginalize", keys=np.array(gone))])[0]
         self.sizes.append(self.solver.memory_bytes())
         self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(self.solver._graph)), 0)
 

@@ -13,6 +13,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changing import with_changes, with_converted
 from factorbus.solver.graph.packing import Packing
 from factorbus.solver.kernels.model import layout as at
 
@@ -167,7 +168,7 @@ def test_removed_and_back_with_another_or_none(stamp: int | None) -> None:
     solver, last = fed(line()), symbol("x", 5)
     wanted = {key: each for key, each in kept(solver).items() if key != last}
     removed = [Change("remove_variables", keys=np.array([last]))]
-    changed, *_ = solver.with_changes(removed, Batch((pose(5, stamp),), (edge(4, 5),)))
+    changed, *_ = with_changes(solver, removed, Batch((pose(5, stamp),), (edge(4, 5),)))
     assert kept(changed) == wanted | ({} if stamp is None else {last: stamp})
 
 
@@ -176,7 +177,7 @@ def test_what_goes_takes_its_stamp(change: str) -> None:
     solver = fed(line())
     gone = np.array([symbol("x", 2), symbol("x", 3)])
     held = [Change("fix", keys=np.array([symbol("x", 4)]))] if change == "remove_variables" else []
-    changed, *_ = solver.with_changes([Change(change, keys=gone), *held])
+    changed, *_ = with_changes(solver, [Change(change, keys=gone), *held])
     left = {symbol("x", n): T0 + n for n in (0, 1, 4, 5)}
     assert kept(changed) == left
     changed.stage(Batch((pose(2, -2),), (edge(1, 2),)))
@@ -195,7 +196,7 @@ def test_what_goes_takes_its_stamp(change: str) -> None:
 )
 def test_what_is_changed_keeps_its_stamp(change: Change) -> None:
     solver = fed([*line(), Batch((), (edge(0, 5), edge(0, 2)))])
-    changed, *_ = solver.with_changes([change])
+    changed, *_ = with_changes(solver, [change])
     assert kept(changed) == kept(solver)
 
 
@@ -206,7 +207,7 @@ def test_a_feature_that_becomes_a_point_keeps_it() -> None:
         solver.stage(batch._replace(variables=own))
         solver.step()
     features = np.concatenate([group.keys for group in solver.estimate() if group.kind == "idp"])
-    points, _ = solver.with_points(features)
+    points, _ = with_converted(solver, features)
     assert kept(points) == kept(solver)
 
 

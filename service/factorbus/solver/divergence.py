@@ -24,7 +24,8 @@ from factorbus.solver.solver import Solver
 
 def is_sound(changed: I64, graph: Graph, report: StepReport) -> bool:
     """Whether the last step, which `changed` these variables, left them and χ² within bounds."""
-    return find_escaped(changed, graph.places) < 0 and math.isfinite(report.chi2) and math.isfinite(report.chi2_before)
+    is_within = find_escaped(changed, graph.array_table) < 0
+    return is_within and math.isfinite(report.chi2) and math.isfinite(report.chi2_before)
 
 
 def check_step(solver: Solver, report: StepReport) -> None:
@@ -32,7 +33,7 @@ def check_step(solver: Solver, report: StepReport) -> None:
     changed, graph = solver.pick_changed()
     if is_sound(changed, graph, report):
         return
-    v = find_escaped(changed, graph.places)
+    v = find_escaped(changed, graph.array_table)
     if v < 0:
         raise errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
     kind, start, key = (
@@ -47,7 +48,7 @@ def check_step(solver: Solver, report: StepReport) -> None:
 
 def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:
     """Whether all numbers are of usual sizes, but for those of the first so many variables and factors."""
-    return bool(are_usual(variables, factors, solver._graph.places))
+    return bool(are_usual(variables, factors, solver._graph.array_table))
 
 
 def unstage(solver: Solver) -> None:

@@ -1,22 +1,20 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.changes.convert_to_points import find_convertible, pick_features, with_points
+from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
-from factorbus.solver.changes.in_place import try_in_place
-from factorbus.solver.changes.requested import ChangeLike, Edits, collect, unchanged
+from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
 from factorbus.solver.graph import observations
-from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import Graph
-from factorbus.solver.graph.groups import Addition, BatchLike, FactorGroup, Group
-from factorbus.solver.graph.joints import check_joints, find_apart
+from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
+from factorbus.solver.graph.joints import find_apart
 from factorbus.solver.graph.staging import Staging
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
@@ -95,7 +93,7 @@ class Solver:
         return self._graph.variables(self._stepper.changed())
 
     def pick_changed(self) -> tuple[I64, Graph]:
-        """What `changed` tells of as indices of variables, ascending, and the arenas to look them up in, to be read."""
+        """What `changed` lists, as indices of variables, ascending, and the arenas to look them up in, to be read."""
         return self._stepper.changed(), self._graph
 
     def chi2(self) -> float:
@@ -114,52 +112,6 @@ class Solver:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
         return self._graph.keys[find_convertible(self._graph, below)]
 
-    def with_points(self, keys: I64) -> tuple["Solver", StepReport]:
-        """A solver in which these features are points, under their keys, and its first step; this one stays as it is.
-
-        Later sights of them may still be sent as `idp_seen`.  Raises UnknownVariable, KindMismatch, and as `step` does.
-        """
-        made = self._taken_over(with_points(self._graph, pick_features(self._graph, keys)))
-        return made, made._stepper.resume(False)
-
-    def with_changes(
-        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
-    ) -> tuple["Solver", int, StepReport, dict[str, int]]:
-        """A solver of the same map with `changes` made, in their order, and then `batch` added; this one stays.
-
-        Gives it, the id of the first factor of `batch`, the report of its first step, and what was changed.  That step
-        relinearizes everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
-        Raises as `changes.collect`, `stage` and `step` do.
-        """
-        edits = collect(self._graph, changes)
-        made = self._taken_over(edited(self._graph, edits))
-        check_joints(made._graph)
-        if edits.added:
-            admit(made._graph, Addition((), edits.added))
-        before = made.variable_count, made.factor_count
-        first = made._graph.next_id if batch is None else made.stage(batch)
-        new = made.variable_count - before[0], made.factor_count - before[1]
-        report = made._stepper.resume(settle)._replace(new_variables=new[0], new_factors=new[1])
-        return made, first, report, edits.counted
-
-    def try_change(
-        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
-    ) -> tuple[int, StepReport, dict[str, int]] | None:
-        """Make `changes` of factors, add `batch`, and step, in this solver: it eliminates what they touch, no more.
-
-        Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
-        it is where they remove, fix, free, place or marginalize variables, where linear factors are among them, where
-        something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.
-        Raises as `changes.collect` and `stage` do.
-        """
-        if settle:
-            return None
-        edits: Edits = collect(self._graph, changes)
-        came = try_in_place(
-            self._graph, self._stepper, edits, lambda: self._graph.next_id if batch is None else self.stage(batch)
-        )
-        return None if came is None else (*came, edits.counted)
-
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
         """Take over the first so many variables and factors of `other`, as they are; the first step of a new solver."""
         edits = unchanged(other._graph)
@@ -169,7 +121,7 @@ class Solver:
         return self._stepper.resume(False)
 
     def inactive(self) -> list[tuple[int, str, str]]:
-        """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
+        """(factor id, the factor, why) of every observation that has no pixel at the estimate, and so no weight."""
         return observations.inactive(self._graph)
 
     def memory_bytes(self) -> int:

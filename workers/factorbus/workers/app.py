@@ -41,14 +41,14 @@ def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event)
     """
     checked(config)
     keep_freed_memory()
-    from factorbus.solver import compiled_seconds, warm, why_stock_numba
+    from factorbus.solver import compile_seconds, warm, why_stock_numba
 
     if why := why_stock_numba():
         log.warning("kernels are compiled by Numba as it is, which takes longer, and take longer themselves: %s", why)
     if config.warm:
         from factorbus.idp import warm as warm_idp
 
-        seconds = sum(make(lambda name: _announce(name, compiled_seconds())) for make in (warm, warm_idp))
+        seconds = sum(make(lambda name: _announce(name, compile_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
     sys.setswitchinterval(0.0005)
     session = _open(config, stop)

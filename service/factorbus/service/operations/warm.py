@@ -52,7 +52,7 @@ def warm(progress: Callable[[str], None] | None = None) -> float:
 
 def compiled_seconds() -> float:
     """Seconds that this process spent compiling kernels, or waiting for those that did it for it."""
-    return solver.compiled_seconds() + sum(_apart)
+    return solver.compile_seconds() + sum(_apart)
 
 
 def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:

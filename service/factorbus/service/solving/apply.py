@@ -7,7 +7,7 @@
     4  a step that left anything that is not finite, or beyond its bounds, has failed as well (`divergence`)
 
 An insert that changes what the map has, rather than only adding to it, is a step by itself.  Changes of factors are a
-step of the solver as it is, if it can make them (`Solver.try_change`); for all others another solver is made with the
+step of the solver as it is, if it can make them (`try_change`); for all others another solver is made with the
 change in it, and takes the place of the old one if all went well.  The delta of that has the whole estimate.
 
 Where the map is not at its optimum and nothing waits, a further step goes on, with nothing staged.
@@ -34,6 +34,7 @@ from factorbus.service.core.events import Applied, Arrived, Outcome, ParsedInser
 from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.service.kernels.write import write_messages
 from factorbus.service.solving.holding import Broken, Holding
+from factorbus.solver.changing import try_change, with_changes, with_converted
 from factorbus.solver.divergence import check_step, copied, is_sound, is_usual, unstage
 from factorbus.solver.errors import Diverged, SolverError
 
@@ -179,7 +180,7 @@ class MapSolver(Holding):
                 raise Broken(self._broken)
             self._check_room(insert.size, content.batch)
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
-            came = None if self._wary else self._solver.try_change(content.changes, content.batch, content.settle)
+            came = None if self._wary else try_change(self._solver, content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:
             yield Verdict((Outcome(insert, problem),))
             return
@@ -199,8 +200,8 @@ class MapSolver(Holding):
         """The same in a new solver."""
         content = cast(Insert, insert.content)
         try:
-            solver, first_factor, report, counted = self._solver.with_changes(
-                content.changes, content.batch, content.settle
+            solver, first_factor, report, counted = with_changes(
+                self._solver, content.changes, content.batch, content.settle
             )
             check_step(solver, report)
         except (Problem, SolverError) as problem:
@@ -431,7 +432,7 @@ class MapSolver(Holding):
         if not keys.size:
             return
         try:
-            solver, report = self._solver.with_points(keys)
+            solver, report = with_converted(self._solver, keys)
             check_step(solver, report)
         except SolverError as problem:
             log.warning("%d features stay features: as points %s", keys.size, problem)

@@ -28,7 +28,7 @@ from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
-from factorbus.solver.optimize.gauss_newton import Rule, minimize
+from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
@@ -178,7 +178,7 @@ class _Problem:
         self._system.begin(_NONE, Stopwatch(None))
         self._system.anew()
         chi2 = float(sum_chi2(0, int(g.counts[at.FACTORS]), g.var, g.fac, g.values, g.payload))
-        minimize(self._system, chi2, 0.0, Rule(tolerance, 1e-12, limit))
+        minimize(self._system, chi2, 0.0, StoppingRule(tolerance, 1e-12, limit))
 
 
 def _graduate(problem: _Problem, begin: F64) -> tuple[F64, int]:

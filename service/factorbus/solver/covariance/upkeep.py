@@ -145,7 +145,7 @@ class Upkeep:
             return False
         n = len(fac)
         r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
-        evaluate_factors(first, self._factors, graph.var, graph.fac, tree.lin[0], graph.payload, r, A, B, W)
+        evaluate_factors(np.arange(first, self._factors), graph.array_table, tree.lin[0], r, A, B, W)
         found = work_in(
             loops, np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1]), sizes, A, B, W, _LEAST_SHARE, _NEGLIGIBLE, step,
             self._stirred[:count], self._scalar[:count], tree.node, tree.clique, tree.lists, tree.numbers,

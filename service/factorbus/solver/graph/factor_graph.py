@@ -24,7 +24,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
 from factorbus.solver.kernels.model.kinds import CAMERA
-from factorbus.solver.kernels.model.retract import gather, label_of
+from factorbus.solver.kernels.model.retract import gather_values, label_of
 
 Mark: TypeAlias = tuple[int, ...]
 
@@ -36,7 +36,7 @@ class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
-    NOT_KEPT = ("_rows", "places")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "array_table")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -177,7 +177,7 @@ class Graph(Arenas):
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
             keys, values, stamps = self.keys, self.values, self.stamps if self.counts.item(at.STAMPED) else None
             return [span.group(keys, values, stamps) if span.together else self._scattered(span) for span in spans]
-        if (label := label_of(picked, self.places)) >= 0:
+        if (label := label_of(picked, self.array_table)) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
@@ -185,7 +185,7 @@ class Graph(Arenas):
 
     def _scattered(self, span: Span) -> Group:
         values, rows = np.empty((span.count, span.size)), span.rows()
-        gather(rows, self.places, _NO_KEYS, values)
+        gather_values(rows, self.array_table, _NO_KEYS, values)
         values.flags.writeable = not span.fixed  # as where they are together
         stamps = self.stamps_of(rows)
         if stamps is not None:
@@ -195,7 +195,7 @@ class Graph(Arenas):
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
         keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
-        gather(rows, self.places, keys, values)
+        gather_values(rows, self.array_table, keys, values)
         return Group(kind.name, keys, values, bool(label % 2), self.stamps_of(rows))
 
     def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:

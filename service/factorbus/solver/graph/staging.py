@@ -32,8 +32,8 @@ class Staging:
 
     def try_stage(self, raw: bytes, groups: I64) -> int | None:
         """As `Solver.try_stage`."""
-        first = admit_bytes(raw, groups, self._graph.places)
+        first = admit_bytes(raw, groups, self._graph.array_table)
         if first == at.NO_ROOM:
             self._graph.make_room(groups)
-            first = admit_bytes(raw, groups, self._graph.places)
+            first = admit_bytes(raw, groups, self._graph.array_table)
         return None if first < 0 else first + self._graph.id_shift

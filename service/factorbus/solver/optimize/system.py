@@ -12,7 +12,7 @@ from factorbus.solver.kernels.model.retract import differing, move
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_loose
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 R = TypeVar("R", bound=Factor)
 
@@ -28,7 +28,7 @@ class System(Generic[R]):
 
     def __init__(self, graph: Graph, factor: R) -> None:
         self.graph = graph
-        self.blocks = Blocks()
+        self.blocks = HessianBlocks()
         self.factor = factor
         self._before: F64 = np.zeros(0)
         self._kept: F64 = np.zeros(0)

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import hold
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
 _LOOSE = 1e12
@@ -48,7 +48,7 @@ def find_unanchored(graph: Graph, since: Mark) -> int:
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 
 
-def find_loose(graph: Graph, blocks: Blocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
+def find_loose(graph: Graph, blocks: HessianBlocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
     """The suspect that Λ leaves free to move, or −1.
 
     `solve` gives Λ⁻¹ b.  With D = diag Λ and signs s on the suspects, y = D½ Λ⁻¹ D½ s is of the size of the inverse of

@@ -14,7 +14,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import linearize
 
 
-class Blocks:
+class HessianBlocks:
     """The normal equations Λ δ = η of a graph's free variables, linearized at given values."""
 
     NOT_KEPT = ("_spare_data", "_spare_eta")

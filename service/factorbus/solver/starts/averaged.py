@@ -14,7 +14,7 @@ from factorbus.solver.starts.relations import MAP, PLANE, SPACE, Directions, Rel
 from factorbus.solver.starts.rotation_matrices import nearest_rotations, quaternions_of
 from factorbus.solver.starts.rotations import averaged_rotations
 from factorbus.solver.starts.together import rotations_with_places
-from factorbus.solver.starts.translations import distances, placed
+from factorbus.solver.starts.translations import distances, solve_positions
 
 # More components than these that nothing holds are not brought to each other: each takes a while.
 _MOST = 100
@@ -155,7 +155,7 @@ def _place(relations: Relations, nodes: Nodes, R: F64, inside: np.ndarray) -> F6
     label = components_of(used, nodes.fixed)
     known = nodes.fixed | ~inside
     known[_firsts(label)] = True
-    return placed(used, R, nodes.t, known)
+    return solve_positions(used, R, nodes.t, known)
 
 
 def _write(graph: Graph, space: Space, nodes: Nodes, R: F64, t: F64, values: F64) -> None:

@@ -15,7 +15,7 @@ HESSIAN = 6 * 6 * 3 + 13
 
 
 @part
-def begin(graph: Graph, tree: Tree) -> int:
+def begin_step(graph: Graph, tree: Tree) -> int:
     """Gives DONE: the step can begin; NO_ROOM: the arenas by variable and factor are short; UNSURE: see `step`."""
     var, fac, values, payload, counts = graph.var, graph.fac, graph.values, graph.payload, graph.counts
     settings, node, link, hessian, lin = tree.settings, tree.node, tree.link, tree.hessian, tree.lin
@@ -42,7 +42,7 @@ def begin(graph: Graph, tree: Tree) -> int:
         ):
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
-    state[tl.S_TOLD : tl.S_TOLD_TO] = 0
+    state[tl.S_DIFFERING : tl.S_REPORT_END] = 0
     state[tl.S_FAILED] = -1
     state[tl.S_STEP] += 1
     state[tl.S_BEGUN] = 1

@@ -107,6 +107,6 @@ else:
 
 
 @inline_kernel
-def put_place(table: Any, entry: int, address: int, rows: int, columns: int) -> None:
-    """Have the table tell of an array, for as long as that is there."""
+def put_entry(table: Any, entry: int, address: int, rows: int, columns: int) -> None:
+    """Enter an array in the table, which is valid for as long as the array exists."""
     table[WIDTH * entry], table[WIDTH * entry + 1], table[WIDTH * entry + 2] = address, rows, columns

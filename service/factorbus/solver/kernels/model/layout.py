@@ -77,7 +77,7 @@ LINEAR_PAIR_SE3 = FACTOR_CODES["linear_pair_se3"]
 NO_LOSS = 0
 LOSS_CODES = {name: 1 + code for code, name in enumerate(LOSSES)}
 
-# Scratch for a residual: six numbers at most, then what became of a sight (`factorbus.solver.lenses.layout`).
+# Scratch for a residual: six numbers at most, then what became of an observation's pixel (`lenses.layout`).
 R_STATUS = 6
 R_SIZE = 7
 

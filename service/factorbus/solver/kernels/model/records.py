@@ -30,4 +30,11 @@ class Graph(NamedTuple):
     stamps: Ints
 
 
+class Ends(NamedTuple):
+    """Where the values of a factor's variables begin; j means nothing where it has one variable."""
+
+    i: int
+    j: int
+
+
 graph_at = opener(Graph)
