@@ -32,8 +32,8 @@ from bench.replays.problems import ALL, Problem, load
 
 from factorbus.proto.messages import Factors
 from factorbus.solver import Options, Solver, warm
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.kernels.model import layout as at
 
 _CANDIDATES = 10_000
@@ -94,16 +94,16 @@ def _large(problem: Problem) -> dict[str, Any]:
     """One map at its end: blocks, gates, and what they are held against."""
     solver = Solver(Options(mode="bayes-tree"))
     steps_ms = [_ms(lambda batch=batch: (solver.stage(batch), solver.step())) for batch in load(problem)]
-    copy_ms = _best(lambda: Blocks(solver.covariances.factored()))
-    fresh = [Blocks(solver.covariances.factored()) for _ in range(_REPEAT)]
+    copy_ms = _best(lambda: CovarianceBlocks(solver.covariances.factored()))
+    fresh = [CovarianceBlocks(solver.covariances.factored()) for _ in range(_REPEAT)]
     diagonal_ms = min(_ms(blocks.diagonal) for blocks in fresh)
     candidates = _candidates(solver)
     gate_ms = np.inf
     for _ in range(2 * _REPEAT):  # one after the other, as a service makes them: where there is memory already
-        blocks = Blocks(solver.covariances.factored())
-        gate_ms = min(gate_ms, _ms(lambda blocks=blocks: judge_candidates(blocks, [candidates])))
-    known_ms = _best(lambda: judge_candidates(blocks, [candidates]))
-    random_ms = _ms(lambda: judge_candidates(blocks, [_candidates(solver, spread=True)]))
+        blocks = CovarianceBlocks(solver.covariances.factored())
+        gate_ms = min(gate_ms, _ms(lambda blocks=blocks: evaluate_candidates(blocks, [candidates])))
+    known_ms = _best(lambda: evaluate_candidates(blocks, [candidates]))
+    random_ms = _ms(lambda: evaluate_candidates(blocks, [_candidates(solver, spread=True)]))
     batch = Solver(Options(mode="all-batch", max_iterations=0))
     batch.stage(_Whole(*solver.graph()))
     batch.step()
@@ -140,7 +140,7 @@ def _every_step(problem: Problem) -> dict[str, Any]:
             last_ms.append(_ms(lambda last=last: solver.covariances.try_joint(last)))
             upkeep_ms.append(_ms(upkeep.update))
         if k % 50 == 49:
-            wanted = Blocks(solver.covariances.factored()).diagonal()
+            wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
             worst = max(worst, _worst(upkeep.diagonal()[:, : wanted.shape[1], : wanted.shape[1]], wanted))
     return {
         "name": problem.label,

@@ -10,7 +10,7 @@ from bench import ask
 from bench.replays.problems import SIMULATED, Problem
 
 from factorbus.solver import Options, Solver, solve_batch
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 
 def test_rows_and_targets(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +36,7 @@ def test_blocks_are_gtsam_s_at_the_end_of_a_data_set(datasets: Path, name: str) 
         graph.stage(batch)
     graph.step(settle=True)
     assert solve_batch(*graph.graph()).chi2 == pytest.approx(graph.chi2(), rel=1e-9)
-    _, worst = ask._gtsam(graph, Blocks(graph.covariances.factored()).diagonal(), _between)
+    _, worst = ask._gtsam(graph, CovarianceBlocks(graph.covariances.factored()).diagonal(), _between)
     assert worst < 1e-7
     assert np.isfinite(worst)
 

@@ -17,7 +17,7 @@ from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import BadInformation, BadLoss, BadShape, BadSymbol, Problem
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 SIGMAS = (0.1, 0.2, 0.3, 0.01, 0.02, 0.05)
@@ -55,7 +55,7 @@ def test_the_covariance_of_a_prior_is_that_of_its_sigmas_in_radians() -> None:
     solver = Solver(Options())
     solver.stage(Draft().se3("x0", IDENTITY).prior_se3("x0", IDENTITY, sigmas=SIGMAS).batch())
     solver.step(settle=True)
-    found = Blocks(solver.covariances.factored()).of(np.array([0]))[0]
+    found = CovarianceBlocks(solver.covariances.factored()).of(np.array([0]))[0]
     np.testing.assert_allclose(found, np.diag(SIGMAS) ** 2, rtol=1e-9, atol=1e-15)
 
 
@@ -80,7 +80,7 @@ def test_covariances_of_poses_in_space_are_those_of_gtsam_and_of_a_dense_inverse
     dense = DenseGraph()
     dense.add(Batch((Variables("se3", estimate.keys, estimate.values),), batch.factors))
     dense.put([estimate])
-    exact, blocks = DenseCovariance(dense), Blocks(solver.covariances.factored())
+    exact, blocks = DenseCovariance(dense), CovarianceBlocks(solver.covariances.factored())
     for i in range(5):
         place = solver.covariances.factored().graph.keys.tolist().index(symbol("x", i))
         found = blocks.of(np.array([place]))[0]

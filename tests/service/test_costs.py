@@ -16,7 +16,7 @@ from factorbus.service.questions.answers import QuestionCopies, answer, parse, s
 from factorbus.service.questions.question_memory import COPIES, Room
 from factorbus.service.questions.uncertainty import Uncertain
 from factorbus.solver import Options, Solver
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.source import CovarianceSource
 
 POSES = 400
@@ -144,7 +144,10 @@ def test_the_cost_is_not_below_the_answer() -> None:
     made = Solver(Options())
     made.stage(Batch((Variables("se2", np.arange(9), np.zeros((9, 3)), fixed=True),), ()))
     made.step()
-    blocks, here = Blocks(made.covariances.factored()), Uncertain(made.covariances.factoring(), 7, 1, True, {})
+    blocks, here = (
+        CovarianceBlocks(made.covariances.factored()),
+        Uncertain(made.covariances.factoring(), 7, 1, True, {}),
+    )
     rows, columns = np.arange(9), np.arange(4)
     asked: list[tuple[AskCovariance, costs.Cost]] = [
         (AskCovariance("joint", rows), costs.of_matrix(blocks, rows, rows)),

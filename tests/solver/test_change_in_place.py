@@ -17,7 +17,7 @@ from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.changing import try_change, with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -92,7 +92,9 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     last = int(np.flatnonzero(graph.var[: solver.variable_count, at.V_SCALAR] >= 0)[-1])
     wanted = whole[graph.var[last, at.V_SCALAR] :, graph.var[last, at.V_SCALAR] :]
     tell = max(1e-8, 1e-13 * float(np.linalg.cond(unit))) * np.abs(wanted).max()
-    np.testing.assert_allclose(Blocks(solver.covariances.factored()).joint(np.array([last])), wanted, rtol=0, atol=tell)
+    np.testing.assert_allclose(
+        CovarianceBlocks(solver.covariances.factored()).joint(np.array([last])), wanted, rtol=0, atol=tell
+    )
 
 
 def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
@@ -352,9 +354,9 @@ def test_a_changed_solver_goes_on_from_its_state_with_the_same_bits() -> None:
         assert came is not None
     assert bits(solver) == bits(again)
     assert rows_of(solver) == rows_of(again)
-    assert why_factor(Blocks(solver.covariances.factored()), int(ids[6])).factor == int(ids[6])
+    assert why_factor(CovarianceBlocks(solver.covariances.factored()), int(ids[6])).factor == int(ids[6])
     with pytest.raises(errors.UnknownFactor, match="has been removed"):
-        why_factor(Blocks(solver.covariances.factored()), int(ids[0]))
+        why_factor(CovarianceBlocks(solver.covariances.factored()), int(ids[0]))
 
 
 def test_diagonal_blocks_are_kept_up_over_changes() -> None:
@@ -366,7 +368,7 @@ def test_diagonal_blocks_are_kept_up_over_changes() -> None:
         what = [Change("remove_factors", np.array([each])), Change("weigh", np.array([each]), weight=np.array([0.1]))]
         assert try_change(solver, what[n % 2 : n % 2 + 1]) is not None
         upkeep.update()
-        wanted = Blocks(solver.covariances.factored()).diagonal()
+        wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
         np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)
     assert upkeep.whole < upkeep.anew
 

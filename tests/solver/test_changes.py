@@ -15,7 +15,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.requested import CHANGES
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
 
 MODES = ["bayes-tree", "inc-l", "all-batch", "inc-l-b10"]
@@ -158,9 +158,9 @@ def test_ids_stay_with_their_factors_and_are_not_used_again() -> None:
     graph = solver._graph
     assert graph.ids_of(np.arange(6)).tolist() == [0, 1, 2, 3, 6, 7]
     assert graph.rows_of(np.arange(-1, 9)).tolist() == [-1, 0, 1, 2, 3, -1, -1, 4, 5, -1]
-    assert why_factor(Blocks(solver.covariances.factored()), 6).keys == (symbol("x", 0), symbol("x", 3))
+    assert why_factor(CovarianceBlocks(solver.covariances.factored()), 6).keys == (symbol("x", 0), symbol("x", 3))
     with pytest.raises(errors.UnknownFactor, match="has been removed"):
-        why_factor(Blocks(solver.covariances.factored()), 5)
+        why_factor(CovarianceBlocks(solver.covariances.factored()), 5)
 
 
 def test_a_solver_with_changes_is_dumped_and_loaded_with_its_ids() -> None:

@@ -11,8 +11,8 @@ from naive.tree_records import tree_of
 
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.errors import UnknownFactor
@@ -63,7 +63,7 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float = 1e-8) -> None:
 @given(seed=st.integers(0, 2**32 - 1), mode=st.sampled_from(MODES))
 def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
     solver = solved(seed, mode)
-    twin, blocks = dense(solver), Blocks(solver.covariances.factored())
+    twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     keys = solver._graph.keys[: solver.variable_count].tolist()
     for v, found in enumerate(blocks.diagonal()):
         d = DIM[twin.graph.kinds[keys[v]]]
@@ -85,8 +85,8 @@ def test_one_matrix_by_columns_is_that_of_the_joint_covariance(seed: int) -> Non
     """Of many variables columns are made: 1,900 of a map of 10,000 poses took 88 s of a core without."""
     solver, rng = solved(seed, "bayes-tree", steps=12), np.random.default_rng(seed)
     joint, columns, n = (
-        Blocks(solver.covariances.factored()),
-        Blocks(solver.covariances.factored()),
+        CovarianceBlocks(solver.covariances.factored()),
+        CovarianceBlocks(solver.covariances.factored()),
         solver.variable_count,
     )
     joint.prefers_columns = lambda *_: False  # type: ignore[method-assign]
@@ -104,7 +104,7 @@ def test_one_matrix_by_columns_is_that_of_the_joint_covariance(seed: int) -> Non
     assert (every == every.T).all()
     for rows, others in ((np.empty(0, np.int64), np.arange(n)), (np.arange(n), np.empty(0, np.int64))):
         shape = int(joint.factored.dims[rows].sum()), int(joint.factored.dims[others].sum())
-        assert Blocks(solver.covariances.factored()).between(rows, others).shape == shape
+        assert CovarianceBlocks(solver.covariances.factored()).between(rows, others).shape == shape
 
 
 def test_columns_are_made_for_many_variables_and_not_for_few() -> None:
@@ -112,7 +112,7 @@ def test_columns_are_made_for_many_variables_and_not_for_few() -> None:
     for step in manhattan(400, 4):
         solver.stage(step.batch)
         solver.step()
-    blocks, every = Blocks(solver.covariances.factored()), np.arange(400)
+    blocks, every = CovarianceBlocks(solver.covariances.factored()), np.arange(400)
     assert blocks.prefers_columns(every, every)
     assert blocks.prefers_columns(every[:2], every)
     assert blocks.prefers_columns(every, every[:2])
@@ -123,7 +123,7 @@ def test_columns_are_made_for_many_variables_and_not_for_few() -> None:
 @pytest.mark.parametrize("ends", [(5, 1), (1, 5)])
 def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, int]) -> None:
     solver = solved(3, "bayes-tree")
-    blocks, n = Blocks(solver.covariances.factored()), solver.variable_count
+    blocks, n = CovarianceBlocks(solver.covariances.factored()), solver.variable_count
     first, second = np.arange(0, 10) % min(ends[0], n), np.arange(0, 10) % min(ends[1], n)
     dims = blocks.factored.dims
     for a, b, found in zip(first, second, blocks.pairs(first, second), strict=True):
@@ -135,10 +135,10 @@ def test_pairs_are_the_right_way_round_whichever_end_repeats(ends: tuple[int, in
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
     solver = solved(seed, "bayes-tree", steps=12)
-    alone, every = Blocks(solver.covariances.factored()), np.arange(solver.variable_count)
+    alone, every = CovarianceBlocks(solver.covariances.factored()), np.arange(solver.variable_count)
     diagonal = alone.diagonal()
     for hub in every[:: max(1, len(every) // 4)]:
-        blocks, here = Blocks(solver.covariances.factored()), np.full(len(every), hub)
+        blocks, here = CovarianceBlocks(solver.covariances.factored()), np.full(len(every), hub)
         np.testing.assert_array_equal(blocks.diagonal(int(hub)), diagonal)
         wanted = alone._single_pairs(here, every)
         scale = np.sqrt(np.abs(diagonal[hub]).max() * np.abs(diagonal).max()) + 1e-12
@@ -154,7 +154,7 @@ def test_in_place_is_what_the_copy_says() -> None:
         last = solver.variable_count - 1
         if last > 2:
             some = np.array([last, last // 2 + 1])
-            found, blocks = solver.covariances.try_joint(some), Blocks(solver.covariances.factored())
+            found, blocks = solver.covariances.try_joint(some), CovarianceBlocks(solver.covariances.factored())
             assert found is not None
             np.testing.assert_allclose(found, blocks.joint(some), rtol=1e-12, atol=0)
             np.testing.assert_allclose(found[:3, :3], blocks.diagonal()[last, :3, :3], rtol=1e-9, atol=0)
@@ -167,8 +167,8 @@ def test_a_copy_stays_as_it_is_while_the_map_goes_on() -> None:
     for batch in steps[:100]:
         solver.stage(batch)
         solver.step()
-    early = Blocks(solver.covariances.factored())
-    before = Blocks(solver.covariances.factored()).diagonal().copy()
+    early = CovarianceBlocks(solver.covariances.factored())
+    before = CovarianceBlocks(solver.covariances.factored()).diagonal().copy()
     for batch in steps[100:]:
         solver.stage(batch)
         solver.step()
@@ -209,10 +209,10 @@ def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
 @given(seed=st.integers(0, 2**32 - 1))
 def test_candidates_of_every_kind(seed: int) -> None:
     solver = solved(seed, "all-batch")
-    twin, blocks = dense(solver), Blocks(solver.covariances.factored())
+    twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     groups, k = candidates(solver, seed), 0
     marks = blocks.factored.graph.mark()
-    found = judge_candidates(blocks, groups)
+    found = evaluate_candidates(blocks, groups)
     assert blocks.factored.graph.mark() == marks
     for group in groups:
         for keys, z, upper in zip(group.keys.tolist(), group.measured, group.information, strict=True):
@@ -229,16 +229,16 @@ def test_candidates_of_every_kind(seed: int) -> None:
 
 def test_candidates_that_no_insert_could_bring_are_refused() -> None:
     solver = solved(1, "bayes-tree")
-    blocks = Blocks(solver.covariances.factored())
+    blocks = CovarianceBlocks(solver.covariances.factored())
     group = candidates(solver, 1)[4]
     marks = blocks.factored.graph.mark()
     unknown = FactorGroup(group.kind, group.keys + 1000, group.measured, group.information)
     with pytest.raises(errors.UnknownVariable):
-        judge_candidates(blocks, [group, unknown])
+        evaluate_candidates(blocks, [group, unknown])
     with pytest.raises(errors.NotPositiveDefinite):
-        judge_candidates(blocks, [FactorGroup(group.kind, group.keys, group.measured, -group.information)])
+        evaluate_candidates(blocks, [FactorGroup(group.kind, group.keys, group.measured, -group.information)])
     assert blocks.factored.graph.mark() == marks
-    assert judge_candidates(blocks, []).distance.size == 0
+    assert evaluate_candidates(blocks, []).distance.size == 0
 
 
 @settings(max_examples=15, deadline=None)
@@ -248,7 +248,7 @@ def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
     from naive.dense_factors import boxplus, pose_matrix, pose_vector
 
     solver = solved(seed, "all-batch")
-    twin, blocks = dense(solver), Blocks(solver.covariances.factored())
+    twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     rng = np.random.default_rng(seed)
     keys, kinds = solver._graph.keys[: solver.variable_count].tolist(), twin.graph.kinds
     poses = [v for v, key in enumerate(keys) if kinds[key] in ("se2", "se3")]
@@ -294,7 +294,7 @@ def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
 
 def test_relative_to_a_point_is_refused() -> None:
     solver = solved(2, "bayes-tree")
-    blocks, graph = Blocks(solver.covariances.factored()), solver._graph
+    blocks, graph = CovarianceBlocks(solver.covariances.factored()), solver._graph
     point = next(v for v in range(solver.variable_count) if graph.var[v, at.V_KIND] == at.POINT2)
     with pytest.raises(errors.KindMismatch):
         relative(blocks, np.array([point]), np.array([0]))
@@ -308,7 +308,7 @@ def test_relative_to_a_point_is_refused() -> None:
 def test_why_a_factor(seed: int) -> None:
     """χ² without a factor, and how much of it is known from it, by solving without it."""
     solver = solved(seed, "all-batch", steps=4)
-    twin, blocks = dense(solver), Blocks(solver.covariances.factored())
+    twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     influence = 0.0
     for factor in range(solver.factor_count):
         account = why_factor(blocks, factor)
@@ -329,7 +329,7 @@ def test_why_a_factor(seed: int) -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_why_a_variable(mode: str) -> None:
     solver = solved(7, mode, steps=8)
-    twin, blocks = dense(solver), Blocks(solver.covariances.factored())
+    twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     for v in range(solver.variable_count):
         account = why_variable(blocks, v, keeps_steps=mode == "bayes-tree")
         assert account.fixed == (solver._graph.var[v, at.V_COLUMN] < 0)
@@ -353,7 +353,7 @@ def kept_up(solver: Solver, batches) -> float:
         solver.stage(batch)
         solver.step()
         upkeep.update()
-        wanted = Blocks(solver.covariances.factored()).diagonal()
+        wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
         width = wanted.shape[1]
         scale = np.abs(wanted).max(axis=(1, 2), initial=1e-300)[:, None, None]
         worst = max(worst, float((np.abs(upkeep.diagonal()[:, :width, :width] - wanted) / scale).max()))
@@ -381,5 +381,5 @@ def test_blocks_are_kept_up_over_steps_that_were_missed_or_refused() -> None:
                 solver.step()
         if n % 3 == 0:
             upkeep.update()
-            wanted = Blocks(solver.covariances.factored()).diagonal()
+            wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
             np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)

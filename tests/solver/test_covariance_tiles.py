@@ -20,9 +20,9 @@ def turn(a: F64, rows: int, columns: int, source: int, step: int, target: int, l
         tiles.transpose(a, rows, columns, source, step, target, ld)
 
 
-@kernel("void(float64[::1], int64, int64, int64, int64, int64, int64[::1], int64, int64)")
-def move(a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64, first: int, count: int) -> None:
-    tiles.copy_runs(a, rows, target, ldt, source, lds, runs, first, count)
+@kernel("void(float64[::1], int64, int64, int64, int64, int64, int64[::1])")
+def move(a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64) -> None:
+    tiles.copy_runs(a, rows, target, ldt, source, lds, runs)
 
 
 def up(count: int, multiple: int) -> int:
@@ -51,6 +51,6 @@ def test_runs_of_some_rows(rows: int, count: int, seed: int) -> None:
     a = rng.normal(size=4 * (lds + ldt))
     runs = np.column_stack([rng.integers(0, lds - 4, count + 1), rng.integers(0, ldt - 4, count + 1)]).reshape(-1)
     wanted = a.copy()
-    tiles_plain.copy_runs(wanted, rows, 4 * lds, ldt, 0, lds, runs, 2, count)
-    move(a, rows, 4 * lds, ldt, 0, lds, runs, 2, count)
+    tiles_plain.copy_runs(wanted, rows, 4 * lds, ldt, 0, lds, runs[2:])
+    move(a, rows, 4 * lds, ldt, 0, lds, runs[2:])
     np.testing.assert_array_equal(a, wanted)

@@ -16,8 +16,8 @@ from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.repair import find_loops, repair
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_variable
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.joints import find_joints, negative_rows
@@ -92,7 +92,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def covariance(solver: Solver, *names: int) -> np.ndarray:
-    return Blocks(solver.covariances.factored()).joint(
+    return CovarianceBlocks(solver.covariances.factored()).joint(
         np.array([solver._graph.find(key) for key in x(*names).tolist()])
     )
 
@@ -307,7 +307,7 @@ def test_pieces_stay_together_or_go_together() -> None:
 
 def test_what_asks_about_pieces_gets_an_answer() -> None:
     solver, ids = window()
-    graph, blocks = solver._graph, Blocks(solver.covariances.factored())
+    graph, blocks = solver._graph, CovarianceBlocks(solver.covariances.factored())
     total = 0.0
     for v in range(solver.variable_count):
         account = why_variable(blocks, v, True)
@@ -325,8 +325,8 @@ def test_what_asks_about_pieces_gets_an_answer() -> None:
     row = graph.factors()[0]
     negative = next(g for g in graph.factors() if g.kind == "linear_se2" and (g.information[:, 0] < 0).any())
     with pytest.raises(errors.NotPositiveDefinite):
-        judge_candidates(blocks, [negative])
-    assert judge_candidates(blocks, [row]).distance.size == len(row.keys)
+        evaluate_candidates(blocks, [negative])
+    assert evaluate_candidates(blocks, [row]).distance.size == len(row.keys)
 
 
 def test_the_kept_up_covariance_is_that_from_scratch() -> None:
@@ -342,7 +342,7 @@ def test_the_kept_up_covariance_is_that_from_scratch() -> None:
         upkeep.update()
         np.testing.assert_allclose(
             upkeep.diagonal()[:, :3, :3],
-            Blocks(solver.covariances.factored()).diagonal(),
+            CovarianceBlocks(solver.covariances.factored()).diagonal(),
             rtol=0,
             atol=1e-8 * upkeep.diagonal().max(),
         )

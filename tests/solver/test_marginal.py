@@ -8,7 +8,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 SPACES = {"se2": (3, 3), "se3": (7, 6)}
 
@@ -71,7 +71,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 def covariance(solver: Solver, *names: int) -> np.ndarray:
     """The joint covariance of some poses."""
-    blocks = Blocks(solver.covariances.factored())
+    blocks = CovarianceBlocks(solver.covariances.factored())
     return blocks.joint(np.array([solver._graph.find(symbol("x", n)) for n in names]))
 
 

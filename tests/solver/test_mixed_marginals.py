@@ -18,7 +18,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.kernels.model import layout as at
 
@@ -46,7 +46,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
-    return Blocks(solver.covariances.factored()).joint(np.array([solver._graph.find(key) for key in keys]))
+    return CovarianceBlocks(solver.covariances.factored()).joint(np.array([solver._graph.find(key) for key in keys]))
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:

@@ -38,7 +38,7 @@ from factorbus.proto import codec
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Estimate, Graph, Insert, Variables
 from factorbus.solver import Options, Solver
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
 
 assert len(FACTOR_KINDS) == int(sys.argv[1]) + 1
@@ -52,7 +52,7 @@ solver.step(settle=True)
 (group,) = solver.estimate()
 # Two measurements of one number: their mean by weight.
 assert abs(group.values[0, 2] - (pose[2] + 100.0 / 101.0)) < 1e-9
-blocks = Blocks(solver.covariances.factored())
+blocks = CovarianceBlocks(solver.covariances.factored())
 covariance = blocks.joint(np.array([0]))
 end = group.values[0]
 (J,) = jacobians("depth_se3", ["se3"], [end], np.array([pose[2] + 1.0]))

@@ -16,7 +16,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes, with_converted
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.kernels.model import layout as at
@@ -229,7 +229,9 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     place = (weak + 1e6 * strong) / (1e6 + 1)
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
     assert solver.chi2() == pytest.approx(INACTIVE_CHI2 + 16.0, rel=1e-3)
-    accounts = why_variable(Blocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False).factors
+    accounts = why_variable(
+        CovarianceBlocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False
+    ).factors
     assert [account.inactive for account in accounts] == ["", why, ""]
     assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
     assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
@@ -249,15 +251,15 @@ def test_why_says_what_a_loss_leaves_of_a_factor(loss: str) -> None:
         solver.stage(Batch((Variables("point3", np.array([P]), places[:1]),), (first, soft)))
         solver.step(settle=True)
         s = float(np.sum((solver.estimate()[0].values[0] - places[1]) ** 2))
-        account = why_factor(Blocks(solver.covariances.factored()), 1)
+        account = why_factor(CovarianceBlocks(solver.covariances.factored()), 1)
         assert (account.loss, account.inactive) == (loss, "")
         assert account.weight == pytest.approx(weight(loss, 2.0, s), rel=1e-6)
         assert account.chi2 == pytest.approx(s, rel=1e-6)
         np.testing.assert_allclose(account.residual, solver.estimate()[0].values[0] - places[1], rtol=1e-6)
-        assert account.rho + float(why_factor(Blocks(solver.covariances.factored()), 0).chi2) == pytest.approx(
-            solver.chi2()
-        )
-        plain = why_factor(Blocks(solver.covariances.factored()), 0)
+        assert account.rho + float(
+            why_factor(CovarianceBlocks(solver.covariances.factored()), 0).chi2
+        ) == pytest.approx(solver.chi2())
+        plain = why_factor(CovarianceBlocks(solver.covariances.factored()), 0)
         assert (plain.loss, plain.weight) == ("", 1.0)
 
 

@@ -7,7 +7,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Solver
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import FactorAccount, why_factor
 
 # ρ of an outlier ten standard deviations off, k = 1, and what the map falls by without it (the others hold 1e4 times as
@@ -40,7 +40,7 @@ def fall(solver: Solver, factor: int) -> float:
 
 
 def account_of(solver: Solver, factor: int) -> FactorAccount:
-    return why_factor(Blocks(solver.covariances.factored()), factor)
+    return why_factor(CovarianceBlocks(solver.covariances.factored()), factor)
 
 
 @pytest.mark.parametrize("loss", OUTLIER)

@@ -15,8 +15,8 @@ from factorbus.client import Draft, Map, Refused, aio, connect
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import evaluate_candidates
 
 pytestmark = pytest.mark.timeout(400)  # the first service on a machine compiles its kernels
 SIGMAS = (0.1, 0.1, 0.02)
@@ -70,7 +70,7 @@ def index(twin: Solver, *names: str) -> np.ndarray:
 
 def test_covariances_are_those_of_the_solver(square: tuple[Map, Solver]) -> None:
     joined, twin = square
-    blocks, revision = Blocks(twin.covariances.factored()), joined.stats()["revision"]
+    blocks, revision = CovarianceBlocks(twin.covariances.factored()), joined.stats()["revision"]
     every = joined.uncertainty.covariance()
     assert every.revision == revision
     assert sum(len(group.keys) for group in every.groups) == twin.variable_count
@@ -99,7 +99,7 @@ def test_candidates_are_gated_and_weighed(square: tuple[Map, Solver]) -> None:
     found, gain = joined.uncertainty.gate(draft), joined.uncertainty.gain(draft)
     assert found.plausible.tolist() == [True, False]
     assert found.dims.tolist() == [3, 3]
-    wanted = judge_candidates(Blocks(twin.covariances.factored()), draft.batch().factors)
+    wanted = evaluate_candidates(CovarianceBlocks(twin.covariances.factored()), draft.batch().factors)
     np.testing.assert_allclose(found.distance, wanted.distance, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(gain.gain, wanted.gain, rtol=1e-6)
     many = Batch(factors=tuple(draft.batch().factors) * 40)  # no longer between two steps

@@ -12,7 +12,7 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.solver import Options, Solver, compile_seconds, solve_batch
 from factorbus.solver.changing import with_changes
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 
 class LocalMap:
@@ -106,7 +106,7 @@ def covariances_at(graph: Batch, keys: I64) -> dict[int, F64]:
     solver = Solver(Options(mode="inc-l", max_iterations=0))
     solver.stage(graph)
     solver.step()
-    blocks = Blocks(solver.covariances.factored())
+    blocks = CovarianceBlocks(solver.covariances.factored())
     place = {key: at for at, key in enumerate(blocks.factored.graph.keys[: blocks.factored.count].tolist())}
     found = blocks.of(np.array([place[key] for key in keys.tolist()], np.int64))
     dims = blocks.factored.dims

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorbus.proto.arrays import I64
 from factorbus.service.questions.question_memory import COPIES
-from factorbus.solver.covariance.blocks import Blocks
+from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 _NUMBER = 8
 # Of a candidate beside its blocks: keys, measurement, information, row of the graph, what is told of it.
@@ -25,7 +25,7 @@ class Cost(NamedTuple):
     memory: int
 
 
-def of_matrix(blocks: Blocks, rows: I64, columns: I64) -> Cost:
+def of_matrix(blocks: CovarianceBlocks, rows: I64, columns: I64) -> Cost:
     """One matrix of the covariance, between two lists of variables."""
     dims = blocks.factored.dims
     height, width = int(dims[rows].sum()), int(dims[columns].sum())
@@ -40,7 +40,7 @@ def of_matrix(blocks: Blocks, rows: I64, columns: I64) -> Cost:
     return Cost(answer, _NUMBER * (substituted + 2 * inner * inner) + COPIES * answer)
 
 
-def of_blocks(blocks: Blocks, variables: I64) -> Cost:
+def of_blocks(blocks: CovarianceBlocks, variables: I64) -> Cost:
     """Blocks of single variables."""
     dims, width = blocks.factored.dims, blocks.width
     answer = _NUMBER * int((dims[variables] ** 2 + 1).sum())
@@ -48,7 +48,7 @@ def of_blocks(blocks: Blocks, variables: I64) -> Cost:
     return Cost(answer, _NUMBER * width * width * (whole + variables.size) + COPIES * answer)
 
 
-def of_candidates(blocks: Blocks, count: int, numbers: int) -> Cost:
+def of_candidates(blocks: CovarianceBlocks, count: int, numbers: int) -> Cost:
     """Candidate factors, with so many numbers in the answer for each."""
     square, answer = blocks.width * blocks.width, _NUMBER * numbers * count
     whole = 2 * blocks.factored.count if blocks.prefers_all(2 * count) else 0
@@ -56,7 +56,7 @@ def of_candidates(blocks: Blocks, count: int, numbers: int) -> Cost:
     return Cost(answer, memory + COPIES * answer)
 
 
-def of_joint_innovations(blocks: Blocks, variables: I64, numbers: int) -> int:
+def of_joint_innovations(blocks: CovarianceBlocks, variables: I64, numbers: int) -> int:
     """Memory for the covariance of so many numbers that candidates on `variables` measure, all together."""
     inner = int(blocks.factored.dims[variables].sum())
     substituted = (blocks.path_scalars(variables) + inner) * (inner + 16)

@@ -21,11 +21,11 @@ from factorbus.proto.symbols import format_symbol
 from factorbus.service.questions import costs
 from factorbus.service.questions.question_memory import Room, Taken
 from factorbus.solver.covariance.association import associate
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import Candidates, judge_candidates
-from factorbus.solver.covariance.factored import Factored
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import Candidates, evaluate_candidates
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
+from factorbus.solver.covariance.square_root import SquareRoot
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
@@ -97,7 +97,7 @@ class Uncertain:
 
     def __init__(
         self,
-        make: Callable[[], Factored],
+        make: Callable[[], SquareRoot],
         epoch: int,
         revision: int,
         keeps_steps: bool,
@@ -105,16 +105,16 @@ class Uncertain:
         room: Room = _UNBOUNDED,
     ) -> None:
         self._make, self._room = make, room
-        self._made: Blocks | None = None
+        self._made: CovarianceBlocks | None = None
         self._when = epoch, revision
         self._keeps_steps, self._account = keeps_steps, account
         self._turn = threading.Lock()
 
     @property
-    def _blocks(self) -> Blocks:
+    def _blocks(self) -> CovarianceBlocks:
         """Raises SolverError."""
         if self._made is None:
-            self._made = Blocks(self._make())
+            self._made = CovarianceBlocks(self._make())
         return self._made
 
     @property
@@ -206,7 +206,7 @@ class Uncertain:
         _check_size("the question", count, _MOST, "candidates")
         self._afford(costs.of_candidates(self._blocks, count, numbers), taken)
         plain = [Factors(group.kind, group.keys, group.measured, group.information) for group in factors]
-        return judge_candidates(self._blocks, plain)
+        return evaluate_candidates(self._blocks, plain)
 
     def _afford(self, cost: costs.Cost, taken: Taken) -> None:
         """Raises TooLarge, OutOfMemory."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import admitted, judge_candidates, linearized
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import admitted, evaluate_candidates, linearized
 from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.kernels.compatible import search
 from factorbus.solver.errors import KindMismatch, TooLarge, printed
@@ -39,13 +39,13 @@ class Association:
 
 
 def associate(
-    blocks: Blocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float,
+    blocks: CovarianceBlocks, kind: str, pose: int, measured: F64, information: F64, landmarks: I64, probability: float,
     weigh: Callable[[I64, int], None] = lambda *_: None,
 ) -> Association:  # fmt: skip
     """Sightings (rows of `measured` and `information`, as of a factor of `kind`) from variable `pose`.
 
-    landmarks: variables to choose from.  weigh: is told, before it is computed, between which variables the joint
-    covariance will be, and how many numbers are measured; it may raise.
+    landmarks: variables to choose from.  weigh: called before the joint covariance is computed, with its
+    variables and how many numbers are measured; it may raise.
     Raises KindMismatch, TooLarge, and what `admit` raises for bad rows.
     """
     graph, n, L = blocks.factored.graph, len(measured), landmarks.size
@@ -53,7 +53,7 @@ def associate(
     keys = np.column_stack([np.full(n * L, graph.keys[pose]), np.tile(graph.keys[landmarks], n)])
     every = FactorGroup(kind, keys, np.repeat(measured, L, axis=0), np.repeat(information, L, axis=0))
     dim = FACTOR_KINDS[kind].dim
-    found = judge_candidates(blocks, [every] if n * L else [])
+    found = evaluate_candidates(blocks, [every] if n * L else [])
     distance = found.distance.reshape(n, L)
     near = distance <= threshold(np.array([dim]), probability)[0]
     sightings, columns = np.nonzero(near)
@@ -64,7 +64,8 @@ def associate(
     weigh(np.unique(np.append(landmarks[columns], pose)), dim * sightings.size)
     chosen = sightings * L + columns
     pairs = FactorGroup(kind, every.keys[chosen], every.measured[chosen], every.information[chosen])
-    best, joint, complete = _search(blocks, pairs, dim, n, sightings, columns, L, probability)
+    begin = np.searchsorted(sightings, np.arange(n + 1))
+    best, joint, complete = _search(blocks, pairs, begin, columns, probability)
     landmark = np.full(n, -1)
     landmark[best >= 0] = landmarks[columns[best[best >= 0]]]
     dims = dim * int((best >= 0).sum())
@@ -72,25 +73,26 @@ def associate(
 
 
 def _search(
-    blocks: Blocks, pairs: FactorGroup, dim: int, n: int, sightings: I64, columns: I64, L: int, probability: float
+    blocks: CovarianceBlocks, pairs: FactorGroup, begin: I64, landmark: I64, probability: float
 ) -> tuple[I64, float, bool]:
-    """(pair of each sighting, joint d², whether it is surely the best)."""
+    """(pair of each sighting, joint d², whether it is surely the best); arguments as in `search`."""
+    n, dim = begin.size - 1, FACTOR_KINDS[pairs.kind].dim
     S, r = _joint_innovations(blocks, pairs, dim)
-    begin = np.searchsorted(sightings, np.arange(n + 1))
     gates = np.concatenate([[0.0], threshold(dim * np.arange(1, n + 1), probability)])
-    best, count = np.empty(n, np.int64), np.zeros(2, np.int64)
-    complete = search(dim, L, begin, columns, S, r, gates, _BUDGET, best, count) == 1
-    rows = (best[best >= 0, None] * dim + np.arange(dim)).reshape(-1)
-    joint = float(r[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], r[rows])) if rows.size else 0.0
+    best = np.empty(n, np.int64)
+    complete = search(begin, landmark, S, r, gates, _BUDGET, best) <= _BUDGET
+    found = best[best >= 0]
+    rows, innovation = (found[:, None] * dim + np.arange(dim)).reshape(-1), r[found].reshape(-1)
+    joint = float(innovation @ np.linalg.solve(S[np.ix_(rows, rows)], innovation)) if rows.size else 0.0
     return best, joint, complete
 
 
-def _joint_innovations(blocks: Blocks, pairs: FactorGroup, dim: int) -> tuple[F64, F64]:
+def _joint_innovations(blocks: CovarianceBlocks, pairs: FactorGroup, dim: int) -> tuple[F64, F64]:
     """Covariance and values of all pairs' innovations together: S = H Σ Hᵀ + diag Ω⁻¹."""
     graph = blocks.factored.graph
     mark, k = graph.mark(), len(pairs.keys)
     if not k:
-        return np.zeros((0, 0)), np.zeros(0)
+        return np.zeros((0, 0)), np.zeros((0, dim))
     with admitted(graph, [pairs]):
         linear = linearized(graph, mark[at.FACTORS], mark[at.FACTORS] + k)
     variables = np.unique(linear.ends)
@@ -105,10 +107,10 @@ def _joint_innovations(blocks: Blocks, pairs: FactorGroup, dim: int) -> tuple[F6
     for q in range(k):
         rows = slice(q * dim, (q + 1) * dim)
         S[rows, rows] += np.linalg.inv(linear.W[q, :dim, :dim])
-    return S, np.ascontiguousarray(linear.r[:, :dim]).reshape(-1)
+    return S, np.ascontiguousarray(linear.r[:, :dim])
 
 
-def _check(blocks: Blocks, kind: str, pose: int, landmarks: I64) -> None:
+def _check(blocks: CovarianceBlocks, kind: str, pose: int, landmarks: I64) -> None:
     graph, wanted = blocks.factored.graph, FACTOR_KINDS[kind].connects
     for variable, end in ((pose, wanted[0]), *((int(v), wanted[1]) for v in landmarks)):
         if graph.var[variable, at.V_KIND] != end.code:

@@ -7,10 +7,10 @@ Fixed variables have covariance zero.
 
 import numpy as np
 
-from factorbus.solver.covariance.factored import DIMS, Factored
 from factorbus.solver.covariance.kernels.columns import cross_blocks
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.whole import whole_blocks
+from factorbus.solver.covariance.square_root import DIMS, SquareRoot
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.jit.compile import F64, I64
 
@@ -22,13 +22,13 @@ _FEW_PAIRS = 4
 _COLUMN = 10
 
 
-class Blocks:
+class CovarianceBlocks:
     """Covariances of one factored map, computed when they are asked for.  For one thread at a time.
 
     width: d of the largest variable there is; blocks of smaller ones are in the upper left corners.
     """
 
-    def __init__(self, factored: Factored) -> None:
+    def __init__(self, factored: SquareRoot) -> None:
         self.factored = factored
         self.width = int(factored.dims.max(initial=1))
         self._diagonal: F64 | None = None
@@ -44,7 +44,7 @@ class Blocks:
             hub = hub if hub >= 0 and f.scalar[hub] >= 0 else -1
             diagonal = np.zeros((f.count, self.width, self.width))
             column = np.zeros_like(diagonal) if hub >= 0 else self._column
-            whole_blocks(f.order, hub, f.node, f.scalar, f.clique, f.lists, f.numbers, f.dims, diagonal, column)
+            whole_blocks(f.order, hub, f.tree.array_table, f.dims, f.scalar, diagonal, column)
             self._diagonal, self._hub, self._column = diagonal, hub, column
         return self._diagonal
 
@@ -70,12 +70,13 @@ class Blocks:
     def path_scalars(self, variables: I64) -> int:
         """Rows of R between `variables` and the roots: what `joint` of them goes through."""
         f, seen, rows = self.factored, set[int](), 0
+        clique = f.tree.clique
         for v in variables[f.scalar[variables] >= 0].tolist():
-            c = int(f.node[v, tl.N_CLIQUE])
+            c = int(f.tree.node[v, tl.N_CLIQUE])
             while c >= 0 and c not in seen:
                 seen.add(c)
-                rows += int(f.clique[c, tl.C_PIVOTS])
-                c = int(f.clique[c, tl.C_PARENT])
+                rows += int(clique[c, tl.C_PIVOTS])
+                c = int(clique[c, tl.C_PARENT])
         return rows
 
     def between(self, rows: I64, columns: I64) -> F64:
@@ -95,13 +96,13 @@ class Blocks:
         different = np.unique(np.concatenate([rows, columns]))
         free = different[f.scalar[different] >= 0]
         inner = np.zeros((int(f.dims[free].sum()),) * 2)
-        joint_block(free, f.graph.var, DIMS, f.node, f.clique, f.lists, f.numbers, inner)
+        joint_block(free, f.graph.var, DIMS, f.tree.array_table, inner)
         # Where the scalars of `variables` are in `inner`; the last row and column of zeros serve the fixed ones.
         starts = np.full(different.size, -1)
         starts[f.scalar[different] >= 0] = np.cumsum(f.dims[free]) - f.dims[free]
         padded = np.zeros((len(inner) + 1,) * 2)
         padded[:-1, :-1] = inner
-        down, right = (_places(starts[np.searchsorted(different, ends)], f.dims[ends]) for ends in (rows, columns))
+        down, right = (_scalars(starts[np.searchsorted(different, ends)], f.dims[ends]) for ends in (rows, columns))
         return padded[np.ix_(down, right)]
 
     def prefers_columns(self, rows: I64, columns: I64) -> bool:
@@ -111,7 +112,7 @@ class Blocks:
             return False
         every, fewer = np.unique(np.concatenate([rows, columns])), min(rows, columns, key=len)
         scalars, wide = int(f.dims[every].sum()), int(f.dims[fewer].sum())
-        return 0 < _COLUMN * f.numbers.size * wide < scalars**2 * int(f.dims.sum())
+        return 0 < _COLUMN * f.tree.numbers.size * wide < scalars**2 * int(f.dims.sum())
 
     def _by_columns(self, few: I64, many: I64) -> F64:
         """(d, e): of one of the few after the other."""
@@ -138,10 +139,8 @@ class Blocks:
         hubs, partners = (free_second, free_first) if turned else (free_first, free_second)
         order = np.argsort(hubs, kind="stable") if _changes(hubs) else np.arange(hubs.size)
         blocks = np.zeros((first.size, self.width, self.width))
-        cross_blocks(
-            np.ascontiguousarray(hubs[order]), np.ascontiguousarray(partners[order]), order, f.order, f.scalar, f.node,
-            f.clique, f.lists, f.numbers, f.dims, turned, blocks,
-        )  # fmt: skip
+        by_hub = blocks.transpose(0, 2, 1) if turned else blocks
+        cross_blocks(hubs[order], partners[order], order, f.tree.array_table, f.order, f.dims, f.scalar, by_hub)
         return blocks
 
     def _single_pairs(self, first: I64, second: I64) -> F64:
@@ -154,7 +153,7 @@ class Blocks:
         return out
 
 
-def _places(starts: I64, dims: I64) -> I64:
+def _scalars(starts: I64, dims: I64) -> I64:
     """All scalars of variables whose first ones are at `starts`; −1 where that is."""
     first = np.repeat(starts, dims)
     within = np.arange(first.size) - np.repeat(np.cumsum(dims) - dims, dims)

@@ -1,4 +1,4 @@
-"""Factors that a map has not taken in, held against it: how far off, and what they would tell.  MATH §10.3."""
+"""Factors that a map does not have: how far off they are, and how much information they would add.  MATH §10.3."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.factored import LARGEST
-from factorbus.solver.covariance.kernels.judge import judge
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.kernels.innovation import distances_and_gains, predicted_covariances
+from factorbus.solver.covariance.square_root import LARGEST
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
@@ -54,17 +54,17 @@ class _Batch:
     factors: tuple[FactorsLike, ...]
 
 
-def judge_candidates(blocks: Blocks, groups: Sequence[FactorsLike]) -> Candidates:
+def evaluate_candidates(blocks: CovarianceBlocks, groups: Sequence[FactorsLike]) -> Candidates:
     """What the map expects of `groups`.  Raises what `admission.admit` raises for factors that it would refuse."""
     graph = blocks.factored.graph
     first = int(graph.counts[at.FACTORS])
     with admitted(graph, groups):
-        return judge_rows(blocks, first, int(graph.counts[at.FACTORS]))
+        return evaluate_rows(blocks, first, int(graph.counts[at.FACTORS]))
 
 
 @contextmanager
 def admitted(graph: Graph, groups: Sequence[FactorsLike]) -> Iterator[None]:
-    """`groups` are the last factors of `graph` for a while.  Raises as `judge_candidates`."""
+    """`groups` are the last factors of `graph` for a while.  Raises as `evaluate_candidates`."""
     mark = graph.mark()
     try:
         admit(graph, _Batch((), tuple(groups)), whole=False)
@@ -73,7 +73,7 @@ def admitted(graph: Graph, groups: Sequence[FactorsLike]) -> Iterator[None]:
         graph.forget(mark)
 
 
-def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
+def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates:
     """The same for the factors first .. last−1 of the graph."""
     graph, n = blocks.factored.graph, last - first
     ends = np.ascontiguousarray(graph.fac[first:last, at.F_I : at.F_J + 1])
@@ -93,7 +93,8 @@ def judge_rows(blocks: Blocks, first: int, last: int) -> Candidates:
         stop = min(start + _CHUNK, n)
         rows = slice(start, stop)
         evaluate_factors(np.arange(first + start, first + stop), graph.array_table, graph.values, r, A, B, W)
-        judge(places[rows], sizes[rows], r, A, B, W, diagonal, cross[rows], predicted[rows], distance[rows], gain[rows])
+        predicted_covariances(places[rows], sizes[rows], A, B, diagonal, cross[rows], predicted[rows])
+        distances_and_gains(sizes[rows], r, W, predicted[rows], distance[rows], gain[rows])
     if not np.isfinite(distance).all():
         raise errors.NotFinite("the distance of a candidate")
     return Candidates(ends, dims, distance, gain, predicted)
@@ -107,7 +108,7 @@ def _hub(ends: I64) -> int:
     return -1
 
 
-def _diagonal(blocks: Blocks, ends: I64, hub: int) -> tuple[F64, I64]:
+def _diagonal(blocks: CovarianceBlocks, ends: I64, hub: int) -> tuple[F64, I64]:
     """Covariances of the variables that occur, and where those of `ends` are among them; −1 stays."""
     if blocks.prefers_all(ends.size):
         return blocks.diagonal(hub), ends
@@ -122,7 +123,7 @@ def linearized(graph: Graph, first: int, last: int) -> Linear:
     """The factors first .. last−1 at the estimate."""
     r, A, B, W = _room(last - first)
     evaluate_factors(np.arange(first, last), graph.array_table, graph.values, r, A, B, W)
-    r = np.ascontiguousarray(r[:, :LARGEST])  # without what became of a sight
+    r = np.ascontiguousarray(r[:, :LARGEST])  # without why an observation is inactive
     fac = graph.fac[first:last]
     ends = np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1])
     return Linear(ends, _SIZES[fac[:, at.F_KIND]], r, A, B, W)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
-from factorbus.solver.covariance.factored import DIMS
 from factorbus.solver.covariance.kernels.paths import joint_block
+from factorbus.solver.covariance.square_root import DIMS
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -23,5 +23,5 @@ class Live:
         for v in variables.tolist():
             size += int(DIMS[var[v, at.V_KIND]])
         out = np.empty((size, size))
-        joint_block(variables, var, DIMS, tree.node, tree.clique, tree.lists, tree.numbers, out)
+        joint_block(variables, var, DIMS, tree.array_table, out)
         return out

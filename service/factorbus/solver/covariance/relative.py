@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import judge_candidates
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.graph.groups import FactorGroup
@@ -37,7 +37,7 @@ class Relative:
     covariance: F64
 
 
-def relative(blocks: Blocks, first: I64, second: I64) -> list[Relative]:
+def relative(blocks: CovarianceBlocks, first: I64, second: I64) -> list[Relative]:
     """The pairs first[k], second[k] of variables, by kind of the second.  Raises KindMismatch, SelfLoop."""
     graph = blocks.factored.graph
     codes = np.column_stack([graph.var[first, at.V_KIND], graph.var[second, at.V_KIND]]).reshape(-1, 2)
@@ -55,13 +55,13 @@ def relative(blocks: Blocks, first: I64, second: I64) -> list[Relative]:
     return groups
 
 
-def _of_kind(blocks: Blocks, here: str, there: str, rows: I64, first: I64, second: I64) -> Relative:
+def _of_kind(blocks: CovarianceBlocks, here: str, there: str, rows: I64, first: I64, second: I64) -> Relative:
     graph, kind = blocks.factored.graph, FACTOR_KINDS[_MEASURED_BY[here, there]]
     values = _seen_from(here, there, _values(graph, here, first), _values(graph, there, second))
     # A factor that measures what is the case has the residual zero, and H of (10.5) is that of the relative value.
     unit = np.tile(np.eye(kind.dim)[np.triu_indices(kind.dim)], (rows.size, 1))
     keys = np.column_stack([graph.keys[first], graph.keys[second]])
-    covariance = judge_candidates(blocks, [FactorGroup(kind.name, keys, values, unit)]).predicted
+    covariance = evaluate_candidates(blocks, [FactorGroup(kind.name, keys, values, unit)]).predicted
     covariance = covariance[:, : kind.dim, : kind.dim].copy()
     if there == SE3.name:
         # The rotation part of a residual in space is half an angle.

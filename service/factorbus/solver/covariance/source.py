@@ -4,8 +4,13 @@ from collections.abc import Callable
 from functools import partial
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.covariance.factored import Factored, factored, factored_anew, viewed
 from factorbus.solver.covariance.live import Live
+from factorbus.solver.covariance.square_root import (
+    SquareRoot,
+    computed_square_root,
+    copied_square_root,
+    viewed_square_root,
+)
 from factorbus.solver.covariance.upkeep import Upkeep
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -20,26 +25,26 @@ class CovarianceSource:
         self._tree = stepper.tree if isinstance(stepper, TreeSteps) else None
         self._live = Live(graph, self._tree) if self._tree else None
 
-    def factored(self) -> Factored:
+    def factored(self) -> SquareRoot:
         """A copy of R and of all that it is of, for other threads.
 
         In the mode "bayes-tree" that is its R, linearized where it is; in the others one made here, at the estimate.
         """
-        return factored(self._graph, self._tree) if self._tree else factored_anew(self._graph)
+        return copied_square_root(self._graph, self._tree) if self._tree else computed_square_root(self._graph)
 
-    def factoring(self) -> Callable[[], Factored]:
+    def factoring(self) -> Callable[[], SquareRoot]:
         """What gives `factored` as of now, on any thread and later: R is copied here, or else what it is made from."""
         if self._tree:
             found = self.factored()
             return lambda: found
-        return partial(factored_anew, self._graph.copied())
+        return partial(computed_square_root, self._graph.copied())
 
-    def try_view(self) -> Factored | None:
+    def try_view(self) -> SquareRoot | None:
         """The same without a copy, for questions about a few variables: until the next step, on the thread that steps.
 
         None: this mode keeps no R that could be read in place; `factored` makes one.
         """
-        return viewed(self._graph, self._tree) if self._tree else None
+        return viewed_square_root(self._graph, self._tree) if self._tree else None
 
     def try_upkeep(self) -> Upkeep | None:
         """What keeps all diagonal blocks of the covariance up, updated after every step.  None: as for `try_view`."""

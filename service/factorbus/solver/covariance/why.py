@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.covariance.blocks import Blocks
-from factorbus.solver.covariance.candidates import Linear, judge_rows, linearized
-from factorbus.solver.graph import observations as sights
+from factorbus.solver.covariance.blocks import CovarianceBlocks
+from factorbus.solver.covariance.candidates import Linear, evaluate_rows, linearized
+from factorbus.solver.graph import observations
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
@@ -28,7 +28,7 @@ class FactorAccount:
 
     residual (d,): r   weighted (d,): Lᵀ r with Ω = L Lᵀ, in standard deviations   chi2: s = rᵀ Ω r; all as without loss
     loss: its name, or ""   weight: w = ρ'(s) of it, 1 without one   rho: ρ(s), what it counts in χ²; s without a loss
-    inactive: why a sight has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
+    inactive: why an observation has no pixel, and so no r (0) and no weight (0), and s is 900; else ""
     influence: tr(w Ω H Σ Hᵀ), of d: how much of what it measures is known from it rather than from the others
     without: by how much χ² would fall without it (10.8); None: nothing else measures what it does
     of a piece of negative weight (`joints`) Ω = −L Lᵀ: χ² and influence are not above 0, and there is no `without`
@@ -89,7 +89,7 @@ class VariableAccount:
         return plain | arrays | {"factors": [each.as_dict() for each in self.factors]}
 
 
-def why_factor(blocks: Blocks, factor: int) -> FactorAccount:
+def why_factor(blocks: CovarianceBlocks, factor: int) -> FactorAccount:
     """Of the factor with this id.  Raises UnknownFactor."""
     graph = blocks.factored.graph
     row = int(graph.rows_of(np.array([factor]))[0])
@@ -98,10 +98,10 @@ def why_factor(blocks: Blocks, factor: int) -> FactorAccount:
     return _why_row(blocks, row)
 
 
-def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAccount:
+def why_variable(blocks: CovarianceBlocks, variable: int, keeps_steps: bool) -> VariableAccount:
     """Of the variable with this index.  keeps_steps: the record is that of the map's own tree."""
     f = blocks.factored
-    graph, node = f.graph, f.node[variable]
+    graph, node = f.graph, f.tree.node[variable]
     row = graph.var[variable]
     kind = VARIABLE_KIND_OF_CODE[int(row[at.V_KIND])]
     fixed = bool(row[at.V_COLUMN] < 0)
@@ -120,23 +120,24 @@ def why_variable(blocks: Blocks, variable: int, keeps_steps: bool) -> VariableAc
     )  # fmt: skip
 
 
-def _why_row(blocks: Blocks, row: int) -> FactorAccount:
+def _why_row(blocks: CovarianceBlocks, row: int) -> FactorAccount:
     linear = linearized(blocks.factored.graph, row, row + 1)
     if linear.W[0, 0, 0] < 0.0:
         d = int(blocks.factored.dims[linear.ends[0, 0]])
         H = linear.A[0, :d, :d]  # of one pose, with a residual as large
         return _account(blocks, row, linear, H @ blocks.of(linear.ends[0, :1])[0, :d, :d] @ H.T)
-    T = judge_rows(blocks, row, row + 1).predicted[0]
+    T = evaluate_rows(blocks, row, row + 1).predicted[0]
     return _account(blocks, row, linearized(blocks.factored.graph, row, row + 1), T)
 
 
-def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, float]:
+def _pivot(blocks: CovarianceBlocks, variable: int, factors: list[int]) -> tuple[float, float]:
     """The smallest pivot of a free variable, and the smallest share of Λ's diagonal that is left in one, (10.9)."""
     f = blocks.factored
-    row = f.clique[f.node[variable, tl.N_CLIQUE]]
-    before = f.lists[row[tl.C_LIST] : row[tl.C_LIST] + f.node[variable, tl.N_PLACE]]
+    tree = f.tree
+    row = tree.clique[tree.node[variable, tl.N_CLIQUE]]
+    before = tree.lists[row[tl.C_LIST] : row[tl.C_LIST] + tree.node[variable, tl.N_PLACE]]
     first, d = int(f.dims[before].sum()), int(f.dims[variable])
-    pivots = np.array([f.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
+    pivots = np.array([tree.numbers[row[tl.C_ROWS] + i * row[tl.C_LD] + i] for i in range(first, first + d)])
     diagonal = np.zeros(d)
     for factor in factors:
         linear = linearized(f.graph, factor, factor + 1)
@@ -148,16 +149,16 @@ def _pivot(blocks: Blocks, variable: int, factors: list[int]) -> tuple[float, fl
     return float(pivots.min()), float((pivots**2 / diagonal).min())
 
 
-def _account(blocks: Blocks, place: int, linear: Linear, T: F64) -> FactorAccount:
+def _account(blocks: CovarianceBlocks, index: int, linear: Linear, T: F64) -> FactorAccount:
     """linear, T: with r and H times √w, as the solver has them."""
     graph = blocks.factored.graph
-    row, factor = graph.fac[place], int(graph.ids_of(np.array([place]))[0])
+    row, factor = graph.fac[index], int(graph.ids_of(np.array([index]))[0])
     kind = FACTOR_KIND_OF_CODE[int(row[at.F_KIND])]
     d = kind.dim
     softened, W, T = linear.r[0, :d], linear.W[0, :d, :d], T[:d, :d]
     keys = tuple(int(graph.keys[v]) for v in row[at.F_I : at.F_I + len(kind.connects)])
-    r, s = _plain(graph, place, d)
-    rho, inactive = _chi2(graph, place), sights.why_inactive(graph, place)
+    r, s = _plain(graph, index, d)
+    rho, inactive = _chi2(graph, index), observations.why_inactive(graph, index)
     sign = -1.0 if W[0, 0] < 0.0 else 1.0
     L = np.linalg.cholesky(sign * W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.

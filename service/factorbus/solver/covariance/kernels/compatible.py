@@ -10,23 +10,20 @@ import numpy as np
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel
 
 
-@kernel(
-    "int64(int64, int64, int64[::1], int64[::1], float64[:,::1], float64[::1], float64[::1], int64, int64[::1],"
-    " int64[::1])"
-)
-def search(
-    dim: int, landmarks: int, begin: I64, landmark: I64, S: F64, r: F64, gates: F64, budget: int, best: I64, count: I64
-) -> int:
+@kernel("int64(int64[::1], int64[::1], float64[:,::1], float64[:,::1], float64[::1], int64, int64[::1])")
+def search(begin: I64, landmark: I64, S: F64, r: F64, gates: F64, budget: int, best: I64) -> int:
     """The largest set of pairs that is jointly compatible; among equals that with the least joint d².
 
     in   begin (n + 1,): the pairs of sighting i are begin[i] .. begin[i + 1]−1, best first
-         landmark (pairs,): 0 .. landmarks−1   gates (n + 1,): d² allowed for so many pairs
-         S (pairs·dim, pairs·dim): joint covariance of all innovations   r (pairs·dim,)
+         landmark (pairs,): 0 or more   gates (n + 1,): d² allowed for so many pairs
+         S (pairs·dim, pairs·dim): joint covariance of all innovations   r (pairs, dim)
          budget: pairs that are tried at most
-    out  best (n,): the pair of each sighting, −1: none   count (2,): pairs in it; pairs that were tried
-         gives 1 if the budget was enough: then no set is better
+    out  best (n,): the pair of each sighting, −1: none
+         returns how many pairs were tried; unless that is above the budget, no set is better
     """
-    n = begin.size - 1
+    n, dim, landmarks = begin.size - 1, r.shape[1], 0
+    for q in range(landmark.size):
+        landmarks = max(landmarks, landmark[q] + 1)
     taken = np.zeros(landmarks, np.int64)
     chosen, position, depth_of = np.full(n, -1), np.empty(n + 1, np.int64), np.zeros(n + 1, np.int64)
     L, y, total = np.zeros((n * dim, n * dim)), np.zeros(n * dim), np.zeros(n + 1)
@@ -54,9 +51,8 @@ def search(
             if taken[landmark[q]] == 0:
                 tried += 1
                 if tried > budget:
-                    count[0], count[1] = max(most, 0), tried
-                    return 0
-                d2 = total[k] + append_pair(dim, k, q, picked, S, r, L, y)
+                    return tried
+                d2 = total[k] + append_pair(k, q, picked, S, r, L, y)
                 if d2 <= gates[k + n - t]:  # d² only grows: as large a set as can still come would be refused
                     found = True
                     picked[k], total[k + 1] = q, d2
@@ -74,14 +70,14 @@ def search(
         t += 1
         if t < n:
             position[t] = begin[t]
-    count[0], count[1] = max(most, 0), tried
-    return 1
+    return tried
 
 
 @inline_kernel
-def append_pair(dim: int, k: int, q: int, picked: I64, S: F64, r: F64, L: F64, y: F64) -> float:
-    """Rows k·dim .. of the Cholesky factor of the innovations, pair q the last; gives what d² grows by."""
-    grown = 0.0
+def append_pair(k: int, q: int, picked: I64, S: F64, r: F64, L: F64, y: F64) -> float:
+    """Rows k·dim .. of the Cholesky factor of the innovations, pair q the last; returns what d² grows by."""
+    dim = r.shape[1]
+    increase = 0.0
     for a in range(dim):
         row, source = k * dim + a, q * dim + a
         for c in range(row + 1):
@@ -91,9 +87,9 @@ def append_pair(dim: int, k: int, q: int, picked: I64, S: F64, r: F64, L: F64, y
             for e in range(c):
                 value -= L[row, e] * L[c, e]
             L[row, c] = math.sqrt(value) if c == row else value / L[c, c]
-        value = r[source]
+        value = r[q, a]
         for e in range(row):
             value -= L[row, e] * y[e]
         y[row] = value / L[row, row]
-        grown += y[row] * y[row]
-    return grown
+        increase += y[row] * y[row]
+    return float(increase)

@@ -11,22 +11,23 @@ not be visited again.
 
 import numpy as np
 
+from factorbus.solver.covariance.kernels.changed_blocks import Changes, has_changed_separator, mark_changed
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.squares import (
-    gather,
-    row_length,
-    solve_clique,
+    gather_separator,
+    put_blocks,
+    solve_square,
     square_size,
     working_size,
 )
-from factorbus.solver.covariance.kernels.substitute import fetch
+from factorbus.solver.covariance.kernels.substitute import prefetch_rows
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.jit.simd import at as load
+from factorbus.solver.kernels.bayes_tree.records import tree_at
 
 
 @kernel("int64(int64[:,::1], int64[:,::1], int64[::1])")
 def list_cliques(node: I64, clique: I64, order: I64) -> int:
-    """Cliques that hold variables, depth first from the roots; gives how many there are."""
+    """Cliques that hold variables, depth first from the roots; returns how many there are."""
     count = 0
     for v in range(len(node)):
         c = node[v, tl.N_CLIQUE]
@@ -48,8 +49,8 @@ def following(c: int, child: int, clique: I64) -> int:
 
 
 @kernel("int64(int64[:,::1], int64[:,::1], int64[::1])")
-def list_roots(node: I64, clique: I64, roots: I64) -> int:
-    """Cliques without a parent that hold variables; gives how many there are."""
+def list_root_cliques(node: I64, clique: I64, roots: I64) -> int:
+    """Cliques without a parent that hold variables; returns how many there are."""
     count = 0
     for v in range(len(node)):
         c = node[v, tl.N_CLIQUE]
@@ -59,43 +60,40 @@ def list_roots(node: I64, clique: I64, roots: I64) -> int:
     return count
 
 
-@kernel(
-    "int64(int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], int64, float64, int64, int64[::1],"
-    " float64[:,:,::1])"
-)
-def diagonal_blocks(
-    roots: I64, clique: I64, lists: I64, numbers: F64, dims: I64, since: int, negligible: float, tick: int,
-    stirred: I64, out: F64,
-) -> int:  # fmt: skip
-    """The covariance of every variable in the trees of `roots`; gives the number of cliques it was computed for.
+@kernel("int64(int64[::1], int64[::1], int64[::1], int64, int64, int64[::1], float64[:,:,::1])")
+def diagonal_blocks(roots: I64, tree_table: I64, dims: I64, since: int, step: int, changed_at: I64, out: F64) -> int:
+    """The covariance of every variable in the trees of `roots`; returns the number of cliques it was computed for.
 
     in   since: a clique that was not eliminated after that, and whose separator's blocks are as they were in `out`, is
-         left as it is, with all below; −1: none is   negligible: changes up to this share of a variance are none
-         tick: `stirred` of variables gets it where their blocks changed
+         left as it is, with all below; −1: none is
+         step: `changed_at` of variables gets it where their blocks changed
     out  (n, d, d): upper left corners
     """
+    tree, changes = tree_at(tree_table), Changes(changed_at, step)
+    clique = tree.clique
     a, used, column, runs = np.empty(1 << 14), 0, np.empty(len(dims), np.int64), np.empty(5, np.int64)
     starts = np.zeros(len(clique) + 2, np.int64)
     for root in roots:
         c, depth = int(root), 0
         while c >= 0:
             row, child = clique[c], -1
-            if since < 0 or row[tl.C_MARK] > since or is_stirred(row, lists, stirred, tick):
+            if since < 0 or row[tl.C_MARK] > since or has_changed_separator(tree, c, changes):
                 p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
                 if starts[depth] + working_size(p, m) > a.size:
-                    a = grown(a, starts[depth], 2 * (starts[depth] + working_size(p, m)))
+                    a = enlarged(a, starts[depth], 2 * (starts[depth] + working_size(p, m)))
                 if 5 * (p + m) > runs.size:
                     runs = np.empty(10 * (p + m), np.int64)
                 child = row[tl.C_CHILD]
                 after = child if child >= 0 else row[tl.C_NEXT]
                 if after >= 0:
-                    fetch(clique[after], numbers)
+                    prefetch_rows(tree, after)
                 starts[depth + 1] = starts[depth] + square_size(p, m)
                 if m > 0:
-                    above = clique[row[tl.C_PARENT]]
-                    gather(row, above, lists, dims, column, runs, a, starts[depth - 1], starts[depth])
-                solve_clique(row, numbers, a, starts[depth], child >= 0)
-                put_diagonal(row, lists, dims, a, starts[depth], since >= 0, negligible, tick, stirred, out)
+                    gather_separator(tree, c, dims, column, runs, a, starts[depth - 1], starts[depth])
+                solve_square(tree, c, a, starts[depth], child >= 0)
+                if since >= 0:
+                    mark_changed(tree, c, dims, a, starts[depth], changes, out)
+                put_blocks(tree, c, dims, a, starts[depth], out)
                 used += 1
             while child < 0 and clique[c, tl.C_PARENT] >= 0:
                 child, c, depth = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT], depth - 1
@@ -103,42 +101,10 @@ def diagonal_blocks(
     return used
 
 
-@inline_kernel
-def is_stirred(row: I64, lists: I64, stirred: I64, tick: int) -> bool:
-    """Whether a clique's separator has changed."""
-    s = row[tl.C_LIST] + row[tl.C_FRONTALS]
-    end = s + row[tl.C_SEPARATORS]
-    while s < end and stirred[lists[s]] != tick:
-        s += 1
-    return s < end
-
-
 @part
-def grown(a: F64, kept: int, size: int) -> F64:
+def enlarged(a: F64, kept: int, size: int) -> F64:
     """A copy of the first `kept` with room for `size`."""
     larger = np.empty(size)
     for k in range(kept):
         larger[k] = a[k]
     return larger
-
-
-@part
-def put_diagonal(
-    row: I64, lists: I64, dims: I64, a: F64, target: int, compare: bool, negligible: float, tick: int, stirred: I64,
-    out: F64,
-) -> None:  # fmt: skip
-    """The diagonal blocks of a clique's frontals."""
-    ld, scalar = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER]), 0
-    for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
-        v = lists[s]
-        d, block, corner = dims[v], out[v], target + scalar * ld + scalar
-        scalar += d
-        if compare:
-            for i in range(d):
-                for j in range(i, d):
-                    change, scale = load(a, corner + i * ld + j) - block[i, j], load(a, corner + i * (ld + 1))
-                    if change * change > negligible * negligible * scale * load(a, corner + j * (ld + 1)):
-                        stirred[v] = tick
-        for i in range(d):
-            for j in range(i, d):
-                block[i, j] = block[j, i] = load(a, corner + i * ld + j)

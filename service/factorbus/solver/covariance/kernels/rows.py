@@ -7,7 +7,7 @@ from factorbus.solver.kernels.jit.simd import put
 
 
 @kernel("int64(int64[::1], int64[:,::1])")
-def rows_size(order: I64, clique: I64) -> int:
+def size_of_rows(order: I64, clique: I64) -> int:
     """Doubles in the rows of the cliques `order`."""
     size = 0
     for c in order:

@@ -7,16 +7,18 @@ zero of it is at the ends of the rows, and the products stop before.
 """
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
+from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
 from factorbus.solver.covariance.kernels.tiles import (
     RUN,
     copy_runs,
-    negative,
-    solve_upper,
-    subtract,
+    negative_product,
+    solve_tile_upper,
+    subtract_product,
     transpose,
     transpose_negative,
 )
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS, put, zero
 from factorbus.solver.kernels.jit.simd import at as load
 
@@ -25,8 +27,8 @@ _TOGETHER = 3  # rows that are copied together: a variable of the plane has as m
 
 
 @inline_kernel
-def padded(count: int) -> int:
-    """The next multiple of LANES."""
+def whole_vectors(count: int) -> int:
+    """Numbers in the vectors of LANES that hold `count` of them."""
     return (count + LANES - 1) & ~(LANES - 1)
 
 
@@ -40,7 +42,7 @@ def height(p: int) -> int:
 @inline_kernel
 def row_length(p: int, m: int) -> int:
     """Doubles from one row of a square to the next."""
-    return padded(p) + padded(m)
+    return whole_vectors(p) + whole_vectors(m)
 
 
 @inline_kernel
@@ -52,35 +54,37 @@ def square_size(p: int, m: int) -> int:
 @inline_kernel
 def working_size(p: int, m: int) -> int:
     """The same with what is behind it while it is made."""
-    return (2 * p + m) * row_length(p, m) + p * padded(p + m) + LANES + RUN
+    return (2 * p + m) * row_length(p, m) + p * whole_vectors(p + m) + LANES + RUN
 
 
 @part
-def gather(
-    row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int
-) -> None:
-    """Σ_SS into the square at `target`, from that of the parent at `source`.
+def gather_separator(tree: Tree, c: int, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int) -> None:
+    """Σ_SS of clique c into its square at `target`, from that of the parent at `source`.
 
     column (n,), runs (5 w,): scratch
     """
-    count = list_runs(row, above, lists, dims, column, runs)
+    row = tree.clique[c]
+    above = tree.clique[row[tl.C_PARENT]]
+    count = list_separator_runs(row, above, tree.lists, dims, column, runs)
     p, pivots = row[tl.C_PIVOTS], above[tl.C_PIVOTS]
-    wide, gap = row_length(pivots, above[tl.C_BORDER]), padded(pivots) - pivots
-    ld, moves, first = row_length(p, row[tl.C_BORDER]), 0, 3 * count
+    wide, gap = row_length(pivots, above[tl.C_BORDER]), whole_vectors(pivots) - pivots
+    ld, end = row_length(p, row[tl.C_BORDER]), 3 * count
     for k in range(count):
         start = runs[3 * k] + gap if runs[3 * k] >= pivots else runs[3 * k]
         for n in range(0, runs[3 * k + 1], RUN):
-            runs[first + 2 * moves], runs[first + 2 * moves + 1] = start + n, runs[3 * k + 2] + n
-            moves += 1
+            runs[end], runs[end + 1] = start + n, runs[3 * k + 2] + n
+            end += 2
+    moves = runs[3 * count : end]
     for k in range(count):
         for i in range(0, runs[3 * k + 1], _TOGETHER):
-            line, into = source + (runs[3 * k] + i) * wide, target + (p + runs[3 * k + 2] + i) * ld + padded(p)
+            line = source + (runs[3 * k] + i) * wide
+            into = target + (p + runs[3 * k + 2] + i) * ld + whole_vectors(p)
             # Too much is copied at the end of a run: the next run or step overwrites it.
-            copy_runs(a, min(_TOGETHER, runs[3 * k + 1] - i), into, ld, line, wide, runs, first, moves)
+            copy_runs(a, min(_TOGETHER, runs[3 * k + 1] - i), into, ld, line, wide, moves)
 
 
 @inline_kernel
-def list_runs(row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I64) -> int:
+def list_separator_runs(row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I64) -> int:
     """Where the separator's scalars are in the parent: runs of (first there, how many, first here); how many runs."""
     scalar = 0
     for s in range(above[tl.C_LIST], above[tl.C_LIST] + above[tl.C_FRONTALS] + above[tl.C_SEPARATORS]):
@@ -98,35 +102,34 @@ def list_runs(row: I64, above: I64, lists: I64, dims: I64, column: I64, runs: I6
 
 
 @part
-def solve_clique(row: I64, numbers: F64, a: F64, target: int, whole: bool) -> None:
+def solve_square(tree: Tree, c: int, a: F64, target: int, whole: bool) -> None:
     """The square at `target` has Σ_SS and gets Σ_FS, Σ_SF and Σ_FF; unless `whole`, of that only what is near its
     diagonal and right of it.
     """
+    row = tree.clique[c]
     p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-    ld, border, wide = row_length(p, m), padded(p), padded(p + m)
+    ld, border, wide = row_length(p, m), whole_vectors(p), whole_vectors(p + m)
     high, w = height(p), target + (2 * p + m) * ld
-    solve_rows_of(row, numbers, a, w, wide)
+    solve_for_square(row, tree.numbers, a, w, wide)
     for j in range(0, m, TILE_VECTORS * LANES):
-        some = min(TILE_VECTORS, (m - j + LANES - 1) // LANES)
+        vectors, Y = min(TILE_VECTORS, (m - j + LANES - 1) // LANES), Panel(target + p * ld + border + j, ld)
         for i in range(0, p, high):
-            c, y = target + i * ld + border + j, target + p * ld + border + j
-            negative(a, min(high, p - i), some, c, ld, a, w + i * wide, wide, 1, y, ld, m)
+            C = Tile(min(high, p - i), vectors, target + i * ld + border + j, ld)
+            negative_product(a, C, a, Strided(w + i * wide, wide, 1), Y, m)
     transpose(a, p, m, target + border, ld, target + p * ld, ld)
     transpose_negative(a, p, p, w + m, wide, target + (p + m) * ld, ld)
     for j in range(0, p, TILE_VECTORS * LANES):
-        some = min(TILE_VECTORS, (p - j + LANES - 1) // LANES)
-        for i in range(0, min(p, j + some * LANES), high):
+        vectors, Y = min(TILE_VECTORS, (p - j + LANES - 1) // LANES), Panel(target + p * ld + j, ld)
+        for i in range(0, min(p, j + vectors * LANES), high):
             if whole or j < i + high + _DIMS:
-                rows, depth = min(high, p - i), m + p - max(i, j)
-                negative(
-                    a, rows, some, target + i * ld + j, ld, a, w + i * wide, wide, 1, target + p * ld + j, ld, depth
-                )
+                C = Tile(min(high, p - i), vectors, target + i * ld + j, ld)
+                negative_product(a, C, a, Strided(w + i * wide, wide, 1), Y, m + p - max(i, j))
         if whole and j > 0:
-            transpose(a, j, min(some * LANES, p - j), target + j, ld, target + j * ld, ld)
+            transpose(a, j, min(vectors * LANES, p - j), target + j, ld, target + j * ld, ld)
 
 
 @part
-def solve_rows_of(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
+def solve_for_square(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
     """[ K T ] at w from R_F [ K T ] = [ R_S I ], some rows at a time from the last."""
     p, m, start, step = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
     for i in range(p):
@@ -140,11 +143,24 @@ def solve_rows_of(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
         top = max(0, end - high)
         width = m + p - end
         if end < p:
+            X = Strided(start + top * step + end, step, 1)
             for j in range(0, width, TILE_VECTORS * LANES):
-                some = min(TILE_VECTORS, (width - j + LANES - 1) // LANES)
-                x = start + top * step + end
-                c, y = w + top * wide + j, w + end * wide + j
-                subtract(a, end - top, some, c, wide, numbers, x, step, 1, y, wide, p - end)
-        corner = start + top * step + top
-        solve_upper(a, end - top, padded(m + p - top) // LANES, w + top * wide, wide, numbers, corner, step)
+                vectors = min(TILE_VECTORS, (width - j + LANES - 1) // LANES)
+                C = Tile(end - top, vectors, w + top * wide + j, wide)
+                subtract_product(a, C, numbers, X, Panel(w + end * wide + j, wide), p - end)
+        C = Tile(end - top, whole_vectors(m + p - top) // LANES, w + top * wide, wide)
+        solve_tile_upper(a, C, numbers, start + top * step + top, step)
         end = top
+
+
+@inline_kernel
+def put_blocks(tree: Tree, c: int, dims: I64, a: F64, target: int, out: F64) -> None:
+    """The diagonal blocks of the frontals of clique c, from its square at `target`, into out (n, d, d)."""
+    row, lists = tree.clique[c], tree.lists
+    ld, corner = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER]), target
+    for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
+        block, d = out[lists[s]], dims[lists[s]]
+        for i in range(d):
+            for j in range(i, d):
+                block[i, j] = block[j, i] = load(a, corner + i * ld + j)
+        corner += d * (ld + 1)

@@ -1,99 +1,126 @@
 """Substitution with the rows of one clique, for several right-hand sides that lie side by side.
 
-Row s of a matrix x of right-hand sides is for scalar s; it has a multiple of LANES columns.  What one clique needs of
-it is collected in `local`, worked on in register tiles, and put back.
+What one clique needs of the right-hand sides is gathered in scratch, worked on in register tiles, and scattered back.
 """
 
+from typing import NamedTuple
+
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
+from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
 from factorbus.solver.covariance.kernels.tiles import (
     copy_vectors,
-    negative,
+    negative_product,
     prefetch,
-    solve_lower,
-    solve_upper,
-    subtract,
+    solve_tile_lower,
+    solve_tile_upper,
+    subtract_product,
 )
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, TILE_VECTORS
 
 GROUP = TILE_VECTORS  # vectors of columns that are worked on together, at most
 
 
-@part
-def forward(
-    row: I64, lists: I64, numbers: F64, dims: I64, scalar: I64, a: F64, x: int, ldx: int, vectors: int, local: int
-) -> None:
-    """x_F := R_F⁻ᵀ x_F,  x_S −= R_Sᵀ x_F, for `vectors` ≤ GROUP of columns.
+class ColumnLayout(NamedTuple):
+    """Where variables are in a column of numbers: variable v has dims[v] of them from row start[v] on.
 
-    scalar: the row of x where each variable starts   a: has x at `x`, rows `ldx` apart, and scratch at `local`
+    dims (n,)   start (n,): −1 where a variable is fixed
     """
-    p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
-    ld, every = vectors * LANES, row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]
-    collect(row[tl.C_LIST], every, lists, dims, scalar, a, x, ldx, vectors, local)
-    for top in range(0, p, TILE_ROWS):
-        rows, c = min(TILE_ROWS, p - top), local + top * ld
-        subtract(a, rows, vectors, c, ld, numbers, start + top, 1, step, local, ld, top)
-        solve_lower(a, rows, vectors, c, ld, numbers, start + top * step + top, step)
-    for top in range(p, width, TILE_ROWS):
-        rows = min(TILE_ROWS, width - top)
-        subtract(a, rows, vectors, local + top * ld, ld, numbers, start + top, 1, step, local, ld, p)
-    distribute(row[tl.C_LIST], every, lists, dims, scalar, a, x, ldx, vectors, local)
+
+    dims: I64
+    start: I64
+
+
+class RightSides(NamedTuple):
+    """Right-hand sides X, a column each, in an array `a`.
+
+    Row s of X is at `at + s·ld` and has `vectors` ≤ GROUP vectors of LANES numbers.  scratch: where `a` has room for
+    what a clique needs of X.
+    """
+
+    at: int
+    ld: int
+    vectors: int
+    scratch: int
+
+
+@inline_kernel
+def group_of_columns(first: int, ld: int, scratch: int) -> RightSides:
+    """The columns of X from `first` on that are worked on together, where X is at the start of its array."""
+    return RightSides(first, ld, min(GROUP, (ld - first) // LANES), scratch)
 
 
 @part
-def backward(
-    row: I64, lists: I64, numbers: F64, dims: I64, scalar: I64, a: F64, x: int, ldx: int, vectors: int, local: int,
-    fresh: bool,
-) -> None:  # fmt: skip
-    """x_F := R_F⁻¹ (x_F − R_S x_S), likewise; if `fresh` x_F is zero, whatever is there."""
+def forward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides) -> None:
+    """X_F := R_F⁻ᵀ X_F,  X_S −= R_Sᵀ X_F, with the rows of clique c."""
+    row, numbers = tree.clique[c], tree.numbers
     p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
-    ld, frontals = vectors * LANES, row[tl.C_FRONTALS]
-    first = row[tl.C_LIST]
+    ld, every = x.vectors * LANES, row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]
+    variables, solved = tree.lists[row[tl.C_LIST] : row[tl.C_LIST] + every], Panel(x.scratch, ld)
+    gather_rows(variables, layout, a, x, x.scratch)
+    for top in range(0, p, TILE_ROWS):
+        C = Tile(min(TILE_ROWS, p - top), x.vectors, x.scratch + top * ld, ld)
+        subtract_product(a, C, numbers, Strided(start + top, 1, step), solved, top)
+        solve_tile_lower(a, C, numbers, start + top * step + top, step)
+    for top in range(p, width, TILE_ROWS):
+        C = Tile(min(TILE_ROWS, width - top), x.vectors, x.scratch + top * ld, ld)
+        subtract_product(a, C, numbers, Strided(start + top, 1, step), solved, p)
+    scatter_rows(variables, layout, a, x, x.scratch)
+
+
+@part
+def backward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides, fresh: bool) -> None:
+    """X_F := R_F⁻¹ (X_F − R_S X_S), likewise; if `fresh` X_F is zero, whatever is there."""
+    row, numbers = tree.clique[c], tree.numbers
+    p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
+    ld, first = x.vectors * LANES, row[tl.C_LIST]
+    border = first + row[tl.C_FRONTALS]
+    frontals, separator = tree.lists[first:border], tree.lists[border : border + row[tl.C_SEPARATORS]]
     if not fresh:
-        collect(first, frontals, lists, dims, scalar, a, x, ldx, vectors, local)
-    collect(first + frontals, row[tl.C_SEPARATORS], lists, dims, scalar, a, x, ldx, vectors, local + p * ld)
+        gather_rows(frontals, layout, a, x, x.scratch)
+    gather_rows(separator, layout, a, x, x.scratch + p * ld)
     end = p
     while end > 0:
         top = max(0, end - TILE_ROWS)
-        c, r, y = local + top * ld, start + top * step + end, local + end * ld
+        C, solved = Tile(end - top, x.vectors, x.scratch + top * ld, ld), Panel(x.scratch + end * ld, ld)
+        right = Strided(start + top * step + end, step, 1)
         if fresh:
-            negative(a, end - top, vectors, c, ld, numbers, r, step, 1, y, ld, width - end)
+            negative_product(a, C, numbers, right, solved, width - end)
         else:
-            subtract(a, end - top, vectors, c, ld, numbers, r, step, 1, y, ld, width - end)
-        solve_upper(a, end - top, vectors, c, ld, numbers, start + top * step + top, step)
+            subtract_product(a, C, numbers, right, solved, width - end)
+        solve_tile_upper(a, C, numbers, start + top * step + top, step)
         end = top
-    distribute(first, frontals, lists, dims, scalar, a, x, ldx, vectors, local)
+    scatter_rows(frontals, layout, a, x, x.scratch)
 
 
 @inline_kernel
-def fetch(row: I64, numbers: F64) -> None:
-    """The rows of this clique will be read next."""
-    prefetch(numbers, row[tl.C_ROWS], (row[tl.C_PIVOTS] - 1) * row[tl.C_LD] + row[tl.C_PIVOTS] + row[tl.C_BORDER])
+def prefetch_rows(tree: Tree, c: int) -> None:
+    """The rows of clique c will be read next."""
+    row = tree.clique[c]
+    size = (row[tl.C_PIVOTS] - 1) * row[tl.C_LD] + row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    prefetch(tree.numbers, row[tl.C_ROWS], size)
 
 
 @inline_kernel
-def collect(
-    first: int, count: int, lists: I64, dims: I64, scalar: I64, a: F64, x: int, ldx: int, vectors: int, local: int
-) -> None:
-    """Rows of x for the variables lists[first : first+count], one behind the other."""
-    place = local
-    for s in range(first, first + count):
-        v = lists[s]
-        source = x + scalar[v] * ldx
+def gather_rows(variables: I64, layout: ColumnLayout, a: F64, x: RightSides, target: int) -> None:
+    """Copy the rows of X of these variables to `target`, one behind the other."""
+    dims, start = layout.dims, layout.start
+    for k in range(variables.size):
+        v = variables[k]
+        source = x.at + start[v] * x.ld
         for i in range(dims[v]):
-            copy_vectors(a, place, source + i * ldx, vectors)
-            place += vectors * LANES
+            copy_vectors(a, target, source + i * x.ld, x.vectors)
+            target += x.vectors * LANES
 
 
 @inline_kernel
-def distribute(
-    first: int, count: int, lists: I64, dims: I64, scalar: I64, a: F64, x: int, ldx: int, vectors: int, local: int
-) -> None:
-    """The other way."""
-    place = local
-    for s in range(first, first + count):
-        v = lists[s]
-        target = x + scalar[v] * ldx
+def scatter_rows(variables: I64, layout: ColumnLayout, a: F64, x: RightSides, source: int) -> None:
+    """Copy them back from `source`."""
+    dims, start = layout.dims, layout.start
+    for k in range(variables.size):
+        v = variables[k]
+        target = x.at + start[v] * x.ld
         for i in range(dims[v]):
-            copy_vectors(a, target + i * ldx, place, vectors)
-            place += vectors * LANES
+            copy_vectors(a, target + i * x.ld, source, x.vectors)
+            source += x.vectors * LANES

@@ -2,6 +2,7 @@
 
 from factorbus.solver.covariance.kernels import tiles_llvm
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel
+from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
 from factorbus.solver.kernels.jit.compile import vector_lanes
 
 prefetch = tiles_llvm.prefetch  # reaches nothing
@@ -10,19 +11,17 @@ _RUN = 4
 _STRIP = tiles_llvm.STRIP
 _copy_runs, _copy_vectors = tiles_llvm.copy_runs, tiles_llvm.copy_vectors
 _transpose, _transpose_negative = tiles_llvm.transpose, tiles_llvm.transpose_negative
-_subtract, _negative = tiles_llvm.subtract, tiles_llvm.negative
-_solve_upper, _solve_lower = tiles_llvm.solve_upper, tiles_llvm.solve_lower
+_subtract_product, _negative_product = tiles_llvm.subtract_product, tiles_llvm.negative_product
+_solve_tile_upper, _solve_tile_lower = tiles_llvm.solve_tile_upper, tiles_llvm.solve_tile_lower
 
 
 @inline_kernel
-def copy_runs(
-    a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64, first: int, count: int
-) -> None:
+def copy_runs(a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64) -> None:
     """See `tiles_plain`; likewise below."""
-    for k in range(first, first + 2 * count, 2):
+    for k in range(0, runs.size, 2):
         _within(a, source + runs[k], (rows - 1) * lds + _RUN)
         _within(a, target + runs[k + 1], (rows - 1) * ldt + _RUN)
-    _copy_runs(a, rows, target, ldt, source, lds, runs, first, count)
+    _copy_runs(a, rows, target, ldt, source, lds, runs)
 
 
 @inline_kernel
@@ -52,46 +51,41 @@ def copy_vectors(a: F64, target: int, source: int, count: int) -> None:
 
 
 @inline_kernel
-def subtract(
-    a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, x: int, row: int, column: int, y: int, ldy: int,
-    depth: int,
-) -> None:  # fmt: skip
-    _product_within(a, rows, vectors, c, ldc, b, x, row, column, y, ldy, depth)
-    _subtract(a, rows, vectors, c, ldc, b, x, row, column, y, ldy, depth)
+def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+    _product_within(a, C, b, X, Y, depth)
+    _subtract_product(a, C, b, X, Y, depth)
 
 
 @inline_kernel
-def negative(
-    a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, x: int, row: int, column: int, y: int, ldy: int,
-    depth: int,
-) -> None:  # fmt: skip
-    _product_within(a, rows, vectors, c, ldc, b, x, row, column, y, ldy, depth)
-    _negative(a, rows, vectors, c, ldc, b, x, row, column, y, ldy, depth)
+def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+    _product_within(a, C, b, X, Y, depth)
+    _negative_product(a, C, b, X, Y, depth)
 
 
 @inline_kernel
-def solve_upper(a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, u: int, ldu: int) -> None:
-    _within(a, c, (rows - 1) * ldc + vectors * _LANES)
-    _within(b, u, (rows - 1) * ldu + rows)
-    _solve_upper(a, rows, vectors, c, ldc, b, u, ldu)
+def solve_tile_upper(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
+    _triangle_within(a, C, b, u, ldu)
+    _solve_tile_upper(a, C, b, u, ldu)
 
 
 @inline_kernel
-def solve_lower(a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, u: int, ldu: int) -> None:
-    _within(a, c, (rows - 1) * ldc + vectors * _LANES)
-    _within(b, u, (rows - 1) * ldu + rows)
-    _solve_lower(a, rows, vectors, c, ldc, b, u, ldu)
+def solve_tile_lower(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
+    _triangle_within(a, C, b, u, ldu)
+    _solve_tile_lower(a, C, b, u, ldu)
 
 
 @inline_kernel
-def _product_within(
-    a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, x: int, row: int, column: int, y: int, ldy: int,
-    depth: int,
-) -> None:  # fmt: skip
-    _within(a, c, (rows - 1) * ldc + vectors * _LANES)
+def _product_within(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+    _within(a, C.at, (C.rows - 1) * C.ld + C.vectors * _LANES)
     if depth > 0:
-        _within(b, x, (rows - 1) * row + (depth - 1) * column + 1)
-        _within(a, y, (depth - 1) * ldy + vectors * _LANES)
+        _within(b, X.at, (C.rows - 1) * X.row + (depth - 1) * X.column + 1)
+        _within(a, Y.at, (depth - 1) * Y.ld + C.vectors * _LANES)
+
+
+@inline_kernel
+def _triangle_within(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
+    _within(a, C.at, (C.rows - 1) * C.ld + C.vectors * _LANES)
+    _within(b, u, (C.rows - 1) * ldu + C.rows)
 
 
 @inline_kernel

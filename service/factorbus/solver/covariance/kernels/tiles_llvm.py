@@ -1,6 +1,6 @@
 """The functions of `tiles` as LLVM, without range checks.  The size of a tile is chosen at run time by a switch."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from factorbus.solver.kernels.jit import simd_llvm as simd
 from factorbus.solver.kernels.jit.compile import cgutils, intrinsic, ir, types
@@ -15,21 +15,35 @@ _PRODUCTS = {m * 4 + v: (m, v) for m in (1, 2, 3, 4) for v in (1, 2, 3)}
 _HEIGHTS = {m: (m,) for m in (1, 2, 3, 4)}
 
 
+class _Product(NamedTuple):
+    """A product as LLVM's values: where C, X and Y begin and how far apart their rows, and X's columns, are."""
+
+    c: Any
+    ldc: Any
+    x: Any
+    row: Any
+    column: Any
+    y: Any
+    ldy: Any
+    depth: Any
+
+
 @intrinsic
 def copy_runs(
-    _typing: Any, a: Any, _rows: Any, _target: Any, _ldt: Any, _source: Any, _lds: Any, runs: Any, _first: Any,
-    _count: Any,
+    _typing: Any, a: Any, _rows: Any, _target: Any, _ldt: Any, _source: Any, _lds: Any, runs: Any
 ) -> Any:  # fmt: skip
     """Four doubles each, of some rows: see `tiles_plain.copy_runs`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array, rows, target, ldt, source, lds, pairs, first, count = args
+        array, rows, target, ldt, source, lds, pairs = args
         target, source = (simd._address(context, builder, signature, array, where) for where in (target, source))
-        given = [target, ldt, source, lds, _address(context, builder, runs, pairs, first), count]
+        pairs = context.make_array(runs)(context, builder, pairs)
+        count = builder.sdiv(pairs.nitems, _I64(2))
+        given = [target, ldt, source, lds, pairs.data, count]
         simd._switch(builder, rows, "factorbus_copy_runs", _HEIGHTS, given, _build_copy_runs)
         return context.get_dummy_value()
 
-    return types.void(a, *[_INT] * 5, runs, _INT, _INT), emit
+    return types.void(a, *[_INT] * 5, runs), emit
 
 
 @intrinsic
@@ -74,61 +88,59 @@ def prefetch(_typing: Any, b: Any, _first: Any, _count: Any) -> Any:
 
 
 @intrinsic
-def subtract(
-    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _x: Any, _row: Any, _column: Any,
-    _y: Any, _ldy: Any, _depth: Any,
-) -> Any:  # fmt: skip
-    """C −= X Y in registers: see `tiles_plain.subtract`"""
-    return _product(a, b, "factorbus_subtract", fresh=False)
+def subtract_product(_typing: Any, a: Any, C: Any, b: Any, X: Any, Y: Any, _depth: Any) -> Any:
+    """C −= X Y in registers: see `tiles_plain.subtract_product`"""
+    return _product(types.void(a, C, b, X, Y, _INT), "factorbus_subtract", fresh=False)
 
 
 @intrinsic
-def negative(
-    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _x: Any, _row: Any, _column: Any,
-    _y: Any, _ldy: Any, _depth: Any,
-) -> Any:  # fmt: skip
-    """C = −X Y: see `tiles_plain.negative`"""
-    return _product(a, b, "factorbus_negative", fresh=True)
+def negative_product(_typing: Any, a: Any, C: Any, b: Any, X: Any, Y: Any, _depth: Any) -> Any:
+    """C = −X Y: see `tiles_plain.negative_product`"""
+    return _product(types.void(a, C, b, X, Y, _INT), "factorbus_negative", fresh=True)
 
 
 @intrinsic
-def solve_upper(
-    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _u: Any, _ldu: Any
-) -> Any:  # fmt: skip
-    """C = U⁻¹ C: see `tiles_plain.solve_upper`"""
-    return _solution(a, b, "factorbus_solve_upper", upper=True)
+def solve_tile_upper(_typing: Any, a: Any, C: Any, b: Any, _u: Any, _ldu: Any) -> Any:
+    """C = U⁻¹ C: see `tiles_plain.solve_tile_upper`"""
+    return _solution(types.void(a, C, b, _INT, _INT), "factorbus_solve_upper", _build_upper)
 
 
 @intrinsic
-def solve_lower(
-    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, b: Any, _u: Any, _ldu: Any
-) -> Any:  # fmt: skip
-    """C = U⁻ᵀ C: see `tiles_plain.solve_lower`"""
-    return _solution(a, b, "factorbus_solve_lower", upper=False)
+def solve_tile_lower(_typing: Any, a: Any, C: Any, b: Any, _u: Any, _ldu: Any) -> Any:
+    """C = U⁻ᵀ C: see `tiles_plain.solve_tile_lower`"""
+    return _solution(types.void(a, C, b, _INT, _INT), "factorbus_solve_lower", _build_lower)
 
 
-def _product(a: Any, b: Any, name: str, fresh: bool) -> Any:
+def _product(signature: Any, name: str, fresh: bool) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array, rows, vectors, c, ldc, other, x, row, column, y, ldy, depth = args
+        array, tile, other, left, right, depth = args
+        (rows, vectors, c, ldc), (x, row, column), (y, ldy) = (_fields(builder, each) for each in (tile, left, right))
         c, y = (simd._address(context, builder, signature, array, where) for where in (c, y))
-        x = _address(context, builder, b, other, x)
+        x = _address(context, builder, signature.args[2], other, x)
         case = builder.add(builder.mul(rows, _I64(4)), vectors)
-        args = [c, ldc, x, row, column, y, ldy, depth]
-        simd._switch(builder, case, name, _PRODUCTS, args, lambda *given: _build_product(*given, fresh=fresh))
+        given = _Product(c, ldc, x, row, column, y, ldy, depth)
+        build = lambda inner, shape, *at: _build_product(inner, shape, _Product(*at), fresh)  # noqa: E731
+        simd._switch(builder, case, name, _PRODUCTS, [*given], build)
         return context.get_dummy_value()
 
-    return types.void(a, *[_INT] * 4, b, *[_INT] * 6), emit
+    return signature, emit
 
 
-def _solution(a: Any, b: Any, name: str, upper: bool) -> Any:
+def _solution(signature: Any, name: str, build: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array, rows, vectors, c, ldc, other, u, ldu = args
-        c, u = simd._address(context, builder, signature, array, c), _address(context, builder, b, other, u)
-        build = _build_upper if upper else _build_lower
+        array, tile, other, u, ldu = args
+        rows, vectors, c, ldc = _fields(builder, tile)
+        c = simd._address(context, builder, signature, array, c)
+        u = _address(context, builder, signature.args[2], other, u)
         simd._switch(builder, rows, name, _HEIGHTS, [c, ldc, u, ldu, vectors], build)
         return context.get_dummy_value()
 
-    return types.void(a, *[_INT] * 4, b, *[_INT] * 2), emit
+    return signature, emit
+
+
+def _fields(builder: Any, operand: Any) -> list[Any]:
+    """The numbers of an operand, in their order."""
+    return cgutils.unpack_tuple(builder, operand)
 
 
 def _transposed(a: Any, name: str, negative: bool) -> Any:
@@ -224,23 +236,20 @@ def _build_prefetch(builder: Any, start: Any, count: Any) -> None:
         builder.call(fetch, [builder.bitcast(builder.gep(start, [k]), byte), short(0), short(3), short(1)])
 
 
-def _build_product(
-    builder: Any, shape: tuple[int, int], c: Any, ldc: Any, x: Any, row: Any, column: Any, y: Any, ldy: Any, depth: Any,
-    fresh: bool,
-) -> None:  # fmt: skip
+def _build_product(builder: Any, shape: tuple[int, int], at: _Product, fresh: bool) -> None:
     rows, vectors = shape
     corners = [
-        builder.gep(c, [builder.add(builder.mul(ldc, _I64(i)), _I64(v * simd.LANES))])
+        builder.gep(at.c, [builder.add(builder.mul(at.ldc, _I64(i)), _I64(v * simd.LANES))])
         for i in range(rows)
         for v in range(vectors)
     ]
     nothing = ir.Constant(simd._VEC, [0.0] * simd.LANES)
     sums = [nothing if fresh else simd._load(builder, corner) for corner in corners]
-    lines = [builder.gep(x, [builder.mul(row, _I64(i))]) for i in range(rows)]
-    with simd._loop(builder, _I64(0), depth, 1, sums) as (k, carried):
-        offset, across = builder.mul(k, ldy), builder.mul(k, column)
+    lines = [builder.gep(at.x, [builder.mul(at.row, _I64(i))]) for i in range(rows)]
+    with simd._loop(builder, _I64(0), at.depth, 1, sums) as (k, carried):
+        offset, across = builder.mul(k, at.ldy), builder.mul(k, at.column)
         line = [
-            simd._load(builder, builder.gep(y, [builder.add(offset, _I64(v * simd.LANES))])) for v in range(vectors)
+            simd._load(builder, builder.gep(at.y, [builder.add(offset, _I64(v * simd.LANES))])) for v in range(vectors)
         ]
         for i in range(rows):
             factor = simd._spread(builder, builder.fneg(builder.load(builder.gep(lines[i], [across]))))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
 from factorbus.solver.kernels.jit.compile import F64, I64, vector_lanes
 
 _LANES = vector_lanes()
@@ -10,14 +11,12 @@ _RUN = 4
 _whatever_is_beyond = np.errstate(invalid="ignore", over="ignore", divide="ignore", under="ignore")
 
 
-def copy_runs(
-    a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64, first: int, count: int
-) -> None:
-    """Of some rows four doubles each, from and to where `count` pairs say:
+def copy_runs(a: F64, rows: int, target: int, ldt: int, source: int, lds: int, runs: I64) -> None:
+    """Copy four doubles of each of some rows for every pair (from, to) in `runs`, the pairs in their order:
 
-    a[target + i·ldt + runs[first+1]] .. = a[source + i·lds + runs[first]] ..,  the pairs in their order   rows ≤ 4
+    a[target + i·ldt + to] .. = a[source + i·lds + from] ..   rows ≤ 4
     """
-    for k in range(first, first + 2 * count, 2):
+    for k in range(0, runs.size, 2):
         for i in range(rows):
             start, into = source + i * lds + runs[k], target + i * ldt + runs[k + 1]
             a[into : into + _RUN] = a[start : start + _RUN].copy()
@@ -48,46 +47,42 @@ def prefetch(b: F64, first: int, count: int) -> None:
 
 
 @_whatever_is_beyond
-def subtract(
-    a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, x: int, row: int, column: int, y: int, ldy: int,
-    depth: int,
-) -> None:  # fmt: skip
-    """C −= X Y:  C (rows, vectors·LANES) at c of `a`, X (rows, depth) at x of `b`, Y (depth, vectors·LANES) at y of `a`
-
-    X's rows are `row` apart, its columns `column`.  rows ≤ 4, vectors ≤ 3
-    """
-    width = vectors * _LANES
-    for i in range(rows):
+def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+    """C −= X Y:  C in `a`, X (C.rows, depth) in `b`, Y (depth, C.vectors·LANES) in `a`"""
+    width = C.vectors * _LANES
+    for i in range(C.rows):
         for k in range(depth):
-            a[c + i * ldc : c + i * ldc + width] -= b[x + i * row + k * column] * a[y + k * ldy : y + k * ldy + width]
+            factor, y = b[X.at + i * X.row + k * X.column], Y.at + k * Y.ld
+            a[C.at + i * C.ld : C.at + i * C.ld + width] -= factor * a[y : y + width]
 
 
 @_whatever_is_beyond
-def negative(
-    a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, x: int, row: int, column: int, y: int, ldy: int,
-    depth: int,
-) -> None:  # fmt: skip
+def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
     """C = −X Y, likewise"""
-    for i in range(rows):
-        a[c + i * ldc : c + i * ldc + vectors * _LANES] = 0.0
-    subtract(a, rows, vectors, c, ldc, b, x, row, column, y, ldy, depth)
+    for line in _lines(a, C):
+        line[:] = 0.0
+    subtract_product(a, C, b, X, Y, depth)
 
 
 @_whatever_is_beyond
-def solve_upper(a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, u: int, ldu: int) -> None:
-    """C = U⁻¹ C:  C (rows, vectors·LANES) at c of `a`, U (rows, rows) upper triangular at u of `b`, rows ≤ 4"""
-    lines = [a[c + i * ldc : c + i * ldc + vectors * _LANES] for i in range(rows)]
-    for i in range(rows - 1, -1, -1):
-        for k in range(i + 1, rows):
+def solve_tile_upper(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
+    """C = U⁻¹ C:  U (C.rows, C.rows) upper triangular at u of `b`, its rows `ldu` apart"""
+    lines = _lines(a, C)
+    for i in range(C.rows - 1, -1, -1):
+        for k in range(i + 1, C.rows):
             lines[i] -= b[u + i * ldu + k] * lines[k]
         lines[i] /= b[u + i * ldu + i]
 
 
 @_whatever_is_beyond
-def solve_lower(a: F64, rows: int, vectors: int, c: int, ldc: int, b: F64, u: int, ldu: int) -> None:
+def solve_tile_lower(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
     """C = U⁻ᵀ C, likewise"""
-    lines = [a[c + i * ldc : c + i * ldc + vectors * _LANES] for i in range(rows)]
-    for i in range(rows):
+    lines = _lines(a, C)
+    for i in range(C.rows):
         for k in range(i):
             lines[i] -= b[u + k * ldu + i] * lines[k]
         lines[i] /= b[u + i * ldu + i]
+
+
+def _lines(a: F64, C: Tile) -> list[F64]:
+    return [a[C.at + i * C.ld : C.at + i * C.ld + C.vectors * _LANES] for i in range(C.rows)]

@@ -9,62 +9,60 @@ so that R is not gone through again.
 
 import numpy as np
 
-from factorbus.solver.covariance.kernels.columns import climb
-from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.covariance.kernels.columns import forward_path
+from factorbus.solver.covariance.kernels.compile import F64, I64, kernel, part
+from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
 from factorbus.solver.covariance.kernels.squares import (
-    gather,
+    gather_separator,
     height,
-    padded,
+    put_blocks,
     row_length,
-    solve_clique,
+    solve_square,
     square_size,
+    whole_vectors,
     working_size,
 )
-from factorbus.solver.covariance.kernels.substitute import collect, distribute, fetch
-from factorbus.solver.covariance.kernels.tiles import negative
+from factorbus.solver.covariance.kernels.substitute import (
+    ColumnLayout,
+    RightSides,
+    gather_rows,
+    prefetch_rows,
+    scatter_rows,
+)
+from factorbus.solver.covariance.kernels.tiles import negative_product
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.simd import LANES, put
 from factorbus.solver.kernels.jit.simd import at as load
 
 AHEAD = 3  # cliques: it takes that long for rows to come into the cache
 
 
-@kernel(
-    "void(int64[::1], int64, int64[:,::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1],"
-    " float64[:,:,::1], float64[:,:,::1])"
-)
-def whole_blocks(
-    order: I64,
-    hub: int,
-    node: I64,
-    scalar: I64,
-    clique: I64,
-    lists: I64,
-    numbers: F64,
-    dims: I64,
-    out: F64,
-    column: F64,
-) -> None:
+@kernel("void(int64[::1], int64, int64[::1], int64[::1], int64[::1], float64[:,:,::1], float64[:,:,::1])")
+def whole_blocks(order: I64, hub: int, tree_table: I64, dims: I64, start: I64, out: F64, column: F64) -> None:
     """The covariance of every free variable; and with `hub`, unless that is −1.
 
-    in   order: all cliques, depth first   scalar: where each variable starts in a column, −1: fixed
+    in   order: all cliques, depth first   dims, start: see `ColumnLayout`
     out  out (n, d, d)  column (n, d, d): rows of the hub; upper left corners, the rest stays
     """
+    tree, layout = tree_at(tree_table), ColumnLayout(dims, start)
+    clique = tree.clique
     depth, starts = np.zeros(len(clique), np.int64), np.zeros(order.size + 1, np.int64)
     scalars, widest = 0, 0
     for v in range(len(dims)):
-        if scalar[v] >= 0:
-            scalars = max(scalars, scalar[v] + dims[v])
+        if start[v] >= 0:
+            scalars = max(scalars, start[v] + dims[v])
     for c in order:
         widest = max(widest, 2 * clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
-    ldx = padded(dims[hub]) if hub >= 0 else 0
-    local = scalars * ldx
-    starts[0] = local + widest * ldx
-    a = np.empty(room(order, starts[0], clique))
+    width = dims[hub] if hub >= 0 else 0
+    ldx = whole_vectors(width)
+    x, block_rows = RightSides(0, ldx, ldx // LANES, scalars * ldx), column[:, :width]
+    starts[0] = x.scratch + widest * ldx
+    a = np.empty(squares_size(tree, order, starts[0]))
     on_path = np.zeros(len(clique), np.bool_)
     if hub >= 0:
-        climb(hub, lists, numbers, dims, scalar, node, clique, a, ldx, ldx // LANES, local)
-        c = node[hub, tl.N_CLIQUE]
+        forward_path(hub, tree, layout, a, x)
+        c = tree.node[hub, tl.N_CLIQUE]
         while c >= 0:
             on_path[c] = True
             c = clique[c, tl.C_PARENT]
@@ -76,20 +74,21 @@ def whole_blocks(
         parent = row[tl.C_PARENT]
         if parent >= 0:
             depth[c] = depth[parent] + 1
-        start = starts[depth[c]]
-        starts[depth[c] + 1] = start + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
-        fetch(clique[order[min(k + AHEAD, order.size - 1)]], numbers)
+        square = starts[depth[c]]
+        starts[depth[c] + 1] = square + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
+        prefetch_rows(tree, order[min(k + AHEAD, order.size - 1)])
         if parent >= 0:
-            gather(row, clique[parent], lists, dims, places, runs, a, starts[depth[c] - 1], start)
-        solve_clique(row, numbers, a, start, row[tl.C_CHILD] >= 0)
-        put_blocks(row, lists, dims, a, start, out)
+            gather_separator(tree, c, dims, places, runs, a, starts[depth[c] - 1], square)
+        solve_square(tree, c, a, square, row[tl.C_CHILD] >= 0)
+        put_blocks(tree, c, dims, a, square, out)
         if hub >= 0:
-            put_column(row, on_path[c], lists, dims, scalar, a, start, ldx, local, dims[hub], column)
+            put_column(tree, c, layout, a, square, x, on_path[c], block_rows)
 
 
 @part
-def room(order: I64, first: int, clique: I64) -> int:
+def squares_size(tree: Tree, order: I64, first: int) -> int:
     """Doubles for the squares of a clique and of those above it, where that is most, behind `first`."""
+    clique = tree.clique
     end, most = np.zeros(len(clique), np.int64), first
     for c in order:
         p, m, parent = clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER], clique[c, tl.C_PARENT]
@@ -99,41 +98,31 @@ def room(order: I64, first: int, clique: I64) -> int:
     return most
 
 
-@inline_kernel
-def put_blocks(row: I64, lists: I64, dims: I64, a: F64, target: int, out: F64) -> None:
-    """The diagonal blocks of a clique's frontals."""
-    ld, corner = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER]), target
-    for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
-        block, d = out[lists[s]], dims[lists[s]]
-        for i in range(d):
-            for j in range(i, d):
-                block[i, j] = block[j, i] = load(a, corner + i * ld + j)
-        corner += d * (ld + 1)
-
-
 @part
 def put_column(
-    row: I64, on_path: bool, lists: I64, dims: I64, scalar: I64, a: F64, target: int, ldx: int, local: int, d: int,
-    column: F64,
-) -> None:  # fmt: skip
-    """X_F (10.11) in place of Y_F, from the rows behind the square at `target`, and its blocks."""
-    p, m, frontals, first = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_FRONTALS], row[tl.C_LIST]
-    wide, high, vectors = padded(p + m), height(p), ldx // LANES
-    w, depth = target + (2 * p + m) * row_length(p, m), m
-    collect(first + frontals, row[tl.C_SEPARATORS], lists, dims, scalar, a, 0, ldx, vectors, local)
-    result = local + (m + p) * ldx
+    tree: Tree, c: int, layout: ColumnLayout, a: F64, square: int, x: RightSides, on_path: bool, out: F64
+) -> None:
+    """X_F (10.11) in place of Y_F, from the rows behind the square of clique c, and its blocks, out (n, d, ·)."""
+    row, ldx = tree.clique[c], x.ld
+    p, m, first = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_LIST]
+    border = first + row[tl.C_FRONTALS]
+    frontals, separator = tree.lists[first:border], tree.lists[border : border + row[tl.C_SEPARATORS]]
+    wide, high = whole_vectors(p + m), height(p)
+    w, depth, result = square + (2 * p + m) * row_length(p, m), m, x.scratch + (m + p) * ldx
+    gather_rows(separator, layout, a, x, x.scratch)
     if on_path:
         depth = m + p
-        collect(first, frontals, lists, dims, scalar, a, 0, ldx, vectors, result)
+        gather_rows(frontals, layout, a, x, result)
         for i in range(p):
             for q in range(ldx):
-                put(a, local + (m + p - 1 - i) * ldx + q, -load(a, result + i * ldx + q))
+                put(a, x.scratch + (m + p - 1 - i) * ldx + q, -load(a, result + i * ldx + q))
     for i in range(0, p, high):
-        negative(a, min(high, p - i), vectors, result + i * ldx, ldx, a, w + i * wide, wide, 1, local, ldx, depth)
-    distribute(first, frontals, lists, dims, scalar, a, 0, ldx, vectors, result)
-    for s in range(first, first + frontals):
-        block = column[lists[s]]
-        for j in range(dims[lists[s]]):
-            for i in range(d):
+        C = Tile(min(high, p - i), x.vectors, result + i * ldx, ldx)
+        negative_product(a, C, a, Strided(w + i * wide, wide, 1), Panel(x.scratch, ldx), depth)
+    scatter_rows(frontals, layout, a, x, result)
+    for s in range(frontals.size):
+        block, d = out[frontals[s]], layout.dims[frontals[s]]
+        for j in range(d):
+            for i in range(len(block)):
                 block[i, j] = load(a, result + j * ldx + i)
-        result += dims[lists[s]] * ldx
+        result += d * ldx

@@ -7,10 +7,12 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.recursion import list_cliques
-from factorbus.solver.covariance.kernels.rows import copy_rows, rows_size
+from factorbus.solver.covariance.kernels.rows import copy_rows, size_of_rows
+from factorbus.solver.graph.arenas import Arenas
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.options import Options
@@ -21,8 +23,17 @@ for _kind in VARIABLE_KINDS.values():
 LARGEST = int(DIMS.max())
 
 
+class CliqueRows(Arenas):
+    """The rows of R by cliques, copied from a tree: of its arrays those that covariances are computed from."""
+
+    ARENAS = Tree._fields
+
+    def __init__(self, node: I64, clique: I64, lists: I64, numbers: F64) -> None:
+        self.node, self.clique, self.lists, self.numbers = node, clique, lists, numbers
+
+
 @dataclass(frozen=True, slots=True)
-class Factored:
+class SquareRoot:
     """R by cliques and the graph it is of; arrays as in `kernels/bayes_tree/layout.py`.
 
     dims (n,): of every variable   scalar (n,): where it starts in a column of Σ; −1: fixed
@@ -30,10 +41,7 @@ class Factored:
     """
 
     graph: Graph
-    node: I64
-    clique: I64
-    lists: I64
-    numbers: F64
+    tree: CliqueRows | CliqueTree
     dims: I64
     scalar: I64
     order: I64
@@ -42,24 +50,22 @@ class Factored:
     @property
     def count(self) -> int:
         """Variables, fixed ones included."""
-        return len(self.node)
+        return len(self.dims)
 
 
-def factored(graph: Graph, tree: CliqueTree) -> Factored:
+def copied_square_root(graph: Graph, tree: CliqueTree) -> SquareRoot:
     """A copy of what `tree` has of `graph`, as of its last step."""
     return _copied(graph.copied(), tree)
 
 
-def viewed(graph: Graph, tree: CliqueTree) -> Factored:
+def viewed_square_root(graph: Graph, tree: CliqueTree) -> SquareRoot:
     """The same in place, until the next step: for what goes up from a few variables."""
-    count = int(graph.counts[at.VARIABLES])
-    return Factored(
-        graph, tree.node[:count], tree.clique, tree.lists, tree.numbers, dims_of(graph.var[:count]),
-        np.ascontiguousarray(graph.var[:count, at.V_SCALAR]), np.empty(0, np.int64), int(tree.state[tl.S_STAMP]),
-    )  # fmt: skip
+    var = graph.var[: graph.counts[at.VARIABLES]]
+    scalar = np.ascontiguousarray(var[:, at.V_SCALAR])
+    return SquareRoot(graph, tree, tangent_dims(var), scalar, np.empty(0, np.int64), int(tree.state[tl.S_STAMP]))
 
 
-def factored_anew(graph: Graph) -> Factored:
+def computed_square_root(graph: Graph) -> SquareRoot:
     """The same for a graph that is solved in another way: factorized here at its values.  Raises Underconstrained."""
     copy = graph.copied()
     values = copy.values.copy()
@@ -73,20 +79,18 @@ def factored_anew(graph: Graph) -> Factored:
     return _copied(copy, tree)
 
 
-def dims_of(var: I64) -> I64:
+def tangent_dims(var: I64) -> I64:
     """The dimension of the tangent space of every variable in `var`."""
     return DIMS[var[:, at.V_KIND]]
 
 
-def _copied(graph: Graph, tree: CliqueTree) -> Factored:
+def _copied(graph: Graph, tree: CliqueTree) -> SquareRoot:
     count, state = int(graph.counts[at.VARIABLES]), tree.state
     node, clique = tree.node[:count].copy(), tree.clique[: state[tl.S_CLIQUES]].copy()
     order = np.empty(int(state[tl.S_ALIVE]), np.int64)
     order = order[: list_cliques(node, clique, order)]
-    numbers = np.zeros(rows_size(order, clique))
+    numbers = np.zeros(size_of_rows(order, clique))
     copy_rows(order, clique, tree.numbers, numbers)
     scalar = np.ascontiguousarray(graph.var[:count, at.V_SCALAR])
-    lists = tree.lists[: state[tl.S_LISTS]].copy()
-    return Factored(
-        graph, node, clique, lists, numbers, dims_of(graph.var[:count]), scalar, order, int(state[tl.S_STAMP])
-    )
+    rows = CliqueRows(node, clique, tree.lists[: state[tl.S_LISTS]].copy(), numbers)
+    return SquareRoot(graph, rows, tangent_dims(graph.var[:count]), scalar, order, int(state[tl.S_STAMP]))
