@@ -26,17 +26,18 @@ TWINS = (
 STARTS = {"main"}
 LEFT = {
     # in the solver
-    "check_numbers", "collect", "hold",
+    "Blocks", "add_end", "collect", "ends_of", "extend_add", "list_moved",
+    "list_roots", "list_runs", "padded", "put_block", "solve_lower", "solve_rows", "solve_upper",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph", "Problem",
-    "Space", "TooLarge", "UnknownKind", "VariableKind", "check", "connect", "dims_of",
-    "factored", "fetch", "follow", "grown", "judge", "label_of", "load",
-    "rotation", "rows_size", "spread", "warm", "word",
+    "BadLoss", "BadOption", "BadShape", "Course", "FactorKind", "Factored", "Graph", "Problem", "Rule",
+    "Space", "TooLarge", "UnknownKind", "VariableKind", "begin", "check", "compiled_seconds", "dims_of",
+    "factor_chi2", "factored", "fetch", "follow", "gather", "grown", "is_relative", "judge", "load",
+    "machine", "note", "placed", "rotation", "rows_size", "spread", "warm",
     # in the mathematics of inverse depth, or the workers
     "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
     "product", "rays", "rays_of", "rows",
     # between packages
-    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
+    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "rotated", "seconds",
 }  # fmt: skip
 
 

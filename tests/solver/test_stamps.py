@@ -14,19 +14,11 @@ from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes, with_converted
-from factorbus.solver.graph.packing import Packing
 from factorbus.solver.kernels.model import layout as at
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 seeds = st.integers(0, 9999)
 T0 = 1_403_636_579_763_555_584
-
-
-class Never(Packing):
-    """Packs nothing: every batch goes the long way."""
-
-    def pack(self, batch: object) -> None:
-        return None
 
 
 def stamps(groups: Iterable[Any]) -> dict[int, int]:
@@ -79,11 +71,9 @@ def test_the_wire_and_the_solver_agree_on_what_none_is() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @settings(max_examples=8)
-@given(seed=seeds, packed=st.booleans())
-def test_every_answer_has_the_stamps_that_came_in(mode: str, seed: int, packed: bool) -> None:
+@given(seed=seeds)
+def test_every_answer_has_the_stamps_that_came_in(mode: str, seed: int) -> None:
     solver, wanted = Solver(Options(mode=mode)), {}
-    if not packed:
-        solver._packing = Never()
     for batch in random_steps(seed):
         wanted |= stamps(batch.variables)
         solver.stage(batch)
@@ -117,11 +107,8 @@ def test_where_no_variable_of_a_group_has_one_there_is_no_column() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.array([1, 2]), np.array([1.0]), np.array([[1]]), [1], np.array([1], np.int32)])
-@pytest.mark.parametrize("packs", [True, False])
-def test_stamps_of_another_shape_or_type_are_refused(wrong: Any, packs: bool) -> None:
+def test_stamps_of_another_shape_or_type_are_refused(wrong: Any) -> None:
     solver = fed(line())
-    if not packs:
-        solver._packing = Never()
     before = kept(solver)
     with pytest.raises(errors.BadShape, match="stamps"):
         solver.stage(Batch((pose(6)._replace(stamps=wrong),), (edge(5, 6),)))

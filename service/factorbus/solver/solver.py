@@ -12,10 +12,11 @@ from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
 from factorbus.solver.graph import observations
+from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.graph.joints import find_apart
-from factorbus.solver.graph.staging import Staging
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -37,7 +38,7 @@ class Solver:
     covariances     R of the last step, for covariances: `CovarianceSource`
     """
 
-    NOT_KEPT = ("_options", "_staging", "covariances")
+    NOT_KEPT = ("_options", "covariances")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -46,7 +47,6 @@ class Solver:
         self._graph = Graph()
         steps = TreeSteps if mode_named(self._options.mode).tree else IncrementalSteps
         self._stepper: Stepper = steps(self._graph, self._options)
-        self._staging = Staging(self._graph)
         self.covariances = CovarianceSource(self._graph, self._stepper)
 
     @property
@@ -59,19 +59,12 @@ class Solver:
         """Factors, the staged ones included."""
         return int(self._graph.counts[at.FACTORS])
 
-    def stage(self, batch: BatchLike) -> int:
+    def stage(self, batch: BatchLike | Columns) -> int:
         """Check `batch`, take it in, and give values to its variables that have none; gives the id of its first factor.
 
         The next step solves for it.  Raises the errors of `admission.admit`; nothing has changed then.
         """
-        return self._staging.stage(batch)
-
-    def try_stage(self, raw: bytes, groups: I64) -> int | None:
-        """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
-
-        groups (n, layout.G_WIDTH): where they lie, as `kernels/model/layout.py` says.  Offsets are not checked.
-        """
-        return self._staging.try_stage(raw, groups)
+        return admit(self._graph, batch)
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.

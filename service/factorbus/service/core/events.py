@@ -22,11 +22,18 @@ Asker: TypeAlias = Any
 
 
 class ParsedInsert(NamedTuple):
-    """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
+    """The content of an insert that only adds, whose columns still lie in its message; `groups` says where
+    (`kernels/read.py`).
+
+    variables, factors: how many it has.
+    """
 
     message: bytes
     groups: I64
-    settle: bool
+    settle: bool = False
+    convert_below: float = 0.0
+    variables: int = 0
+    factors: int = 0
 
 
 class Arrived(NamedTuple):

@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.account import Account, InsertDone
@@ -117,7 +116,7 @@ class MapCore:
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
-        if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content.settle)):
+        if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content)):
             self._account.received(arrived.size)
             return [run]
         effects = self._admission.expire(arrived.now)
@@ -356,9 +355,15 @@ class MapCore:
         """May the solver have more, or has the journal to write first?"""
         return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
 
-    def _try_alone(self, arrived: Arrived, settle: bool) -> InsertBatch | None:
+    def _try_alone(self, arrived: Arrived, content: ParsedInsert) -> InsertBatch | None:
         """The short InsertBatch of this insert and nothing else, if that is what `_go_on` would come to."""
-        if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
+        if (
+            content.settle
+            or content.convert_below
+            or self._running is not None
+            or self._reads
+            or not self._is_quick(arrived.size, arrived.now)
+        ):
             return None
         if self._must_reload or not self._has_room():
             return None
@@ -375,9 +380,9 @@ class MapCore:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        if inserts[0].is_change or (isinstance(content, Insert) and content.convert_below):
-            return False
-        return isinstance(content, Problem) or not content.settle
+        if isinstance(content, Problem):
+            return True
+        return not (inserts[0].is_change or content.convert_below or content.settle)
 
     def _is_quick(self, size: int, now: float) -> bool:
         return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S

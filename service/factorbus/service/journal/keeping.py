@@ -1,9 +1,8 @@
 """A map's journal at work: a thread that writes down what was applied, and says when it is safe.
 
     commit   what came of an InsertBatch is told when the disk has it: answers, deltas and estimates alike, so nobody
-    ever sees
-             what a crash could take back.  While the disk is busy the next inserts are applied; all that waits then
-             goes into one transaction (group commit)
+             ever sees what a crash could take back.  While the disk is busy the next inserts are applied; all that
+             waits then goes into one transaction (group commit)
     group    told at once, written and safe no later than `group_s` afterwards
     none     told at once, written now and then, safe when the operating system pleases
 
@@ -25,6 +24,7 @@ from factorbus.journal.records import JournalRecord
 from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import Last, Saved, Store, open_store
 from factorbus.service.core.events import Arrived, Stepped, Verdict
+from factorbus.service.journal.snapshot_plan import SnapshotPlan
 from factorbus.service.journal.writing import written
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
@@ -35,7 +35,6 @@ log = logging.getLogger(__name__)
 _NONE_S = 1.0  # durability none: how often what there is gets written
 _PAUSES_S = (0.2, 5.0)  # between tries to write again
 _KEPT_SNAPSHOTS = 2
-_SHARE = 0.05  # of the time that steps take, for copies of the solver's state
 
 Events: TypeAlias = Sequence[Verdict | Stepped]
 
@@ -84,24 +83,6 @@ class _Reloaded:
     """The solver is where the journal is."""
 
 
-class SnapshotPlan:
-    """When the solver's state is to be written next, and the thread that does.
-
-    every_s: of steps.  steps_s: of those that a restart would make again already.  differs: what is noted beside each,
-    see `Saved`.
-    """
-
-    def __init__(self, every_s: float, steps_s: float = 0.0, differs: str = "") -> None:
-        self.every_s, self.differs, self.steps_s, self.copying_s = every_s, differs, steps_s, 0.0
-        self.thread: threading.Thread | None = None
-        self.record = 0
-
-    def due(self) -> bool:
-        """Steps have taken long enough, copying takes a small share of it, and none is being written."""
-        waits = max(self.every_s, self.copying_s / _SHARE)
-        return self.steps_s >= waits and (self.thread is None or not self.thread.is_alive())
-
-
 class Keeping(Protocol):
     """What a host needs to have a journal."""
 
@@ -118,7 +99,7 @@ class Keeper:
     """One map's journal.  `hand` to `snapshot`: on the solver's thread only."""
 
     def __init__(
-        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot: "SnapshotPlan",
+        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot: SnapshotPlan,
         begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._listener = store, listener

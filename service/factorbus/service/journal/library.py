@@ -21,8 +21,9 @@ from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
 from factorbus.service.core.map_state import MapCore, Restored
-from factorbus.service.journal.keeping import Keeper, Listener, SnapshotPlan
+from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
+from factorbus.service.journal.snapshot_plan import SnapshotPlan
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
 from factorbus.solver.state import FORMAT

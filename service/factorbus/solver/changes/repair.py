@@ -11,6 +11,7 @@ however far off it is.
 """
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,10 +133,11 @@ def _beginnings(graph: Graph, rows: I64) -> Iterable[F64]:
     yield graph.values
     trusted = np.ones(int(graph.counts[at.FACTORS]), bool)
     trusted[rows] = False
-    fac, values = np.ascontiguousarray(graph.fac[: trusted.size][trusted]), graph.values.copy()
+    composed = copy(graph)
+    composed.fac, composed.values = graph.fac[: trusted.size][trusted], graph.values.copy()
     reached = (graph.var[: graph.counts[at.VARIABLES], at.V_COLUMN] < 0).astype(np.int64)
-    if reach(True, 0, 0, len(fac), graph.var, fac, values, graph.payload, reached) < 0:
-        yield values
+    if reach(True, 0, 0, len(composed.fac), composed.array_table, reached) < 0:
+        yield composed.values
 
 
 class _Problem:

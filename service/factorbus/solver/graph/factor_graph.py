@@ -19,7 +19,8 @@ from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, Fa
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
-from factorbus.solver.kernels.graph.admit import enter_keys, find_variable, remove_keys
+from factorbus.solver.kernels.graph import group_table as gt
+from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
@@ -87,12 +88,15 @@ class Graph(Arenas):
         return other
 
     def make_room(self, groups: I64) -> None:
-        """For groups of variables and factors as `kernels/model/layout.py` has them."""
-        groups = groups[: int(np.argmax(groups[:, at.G_KIND] == at.END))]
-        of_factors, rows = groups[:, at.G_FACTORS] != 0, groups[:, at.G_COUNT]
-        numbers = rows * (groups[:, at.G_SIZE] + groups[:, at.G_TRIANGLE])
-        self.reserve_variables(int(rows[~of_factors].sum()), int(numbers[~of_factors].sum()))
-        self.reserve_factors(int(rows[of_factors].sum()), int(numbers[of_factors].sum()))
+        """For groups of variables and factors as `kernels/graph/group_table.py` has them."""
+        groups = groups[: int(np.argmax(groups[:, gt.G_KIND] == gt.END))]
+        variables, factors = groups[groups[:, gt.G_FACTORS] == 0], groups[groups[:, gt.G_FACTORS] != 0]
+        kinds = [VARIABLE_KIND_OF_CODE[code] for code in variables[:, gt.G_KIND].tolist()]
+        counts = variables[:, gt.G_COUNT].tolist()
+        self.reserve_variables(sum(counts), sum(n * kind.size for n, kind in zip(counts, kinds, strict=True)))
+        widths = [FACTOR_KIND_OF_CODE[code].width for code in factors[:, gt.G_KIND].tolist()]
+        counts = factors[:, gt.G_COUNT].tolist()
+        self.reserve_factors(sum(counts), sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
 
     def reserve_variables(self, more: int, numbers: int) -> None:
         """Make room for `more` variables, whose values have so many numbers together."""
@@ -123,13 +127,6 @@ class Graph(Arenas):
         """Bytes in use of all arenas."""
         variables, factors, values, payload, columns, *_ = self.counts.tolist()
         return 8 * (variables * (at.V_WIDTH + 2) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
-
-    def stamp_last(self, count: int, stamps: I64 | None) -> None:
-        """The last `count` variables, which are new, have these time stamps; None: none."""
-        variables = int(self.counts[at.VARIABLES])
-        self.stamps[variables - count : variables] = at.NO_STAMP if stamps is None else stamps
-        if stamps is not None:
-            self.counts[at.STAMPED] += np.count_nonzero(stamps != at.NO_STAMP)
 
     def stamps_of(self, rows: I64) -> I64 | None:
         """The time stamps of the variables at these indices, NO_STAMP of one without; None: none of them has one."""
@@ -218,9 +215,9 @@ class Graph(Arenas):
         kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(fac[rows[0], at.F_FLAGS]) >> at.LOSS_SHIFT
         loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
         ends = self.keys[picked[:, at.F_I : at.F_I + len(kind.connects)]]
-        width = kind.size + kind.triangle + (1 if loss else 0)
+        width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
-        measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
+        measured, information, scale = np.hsplit(numbers, [kind.size, kind.width])
         own = scale[:, 0].copy() if loss else None
         return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
 

@@ -142,12 +142,8 @@ class IncrementalSteps:
         mark, counts = self._done.graph, self._graph.counts.tolist()
         few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
         if few and self._mode.updates:
-            epsilon = self._options.tuning.chi2_epsilon
-            graph = self._graph
-            settle_new(
-                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS], epsilon,
-                graph.var, graph.fac, graph.values, graph.payload,
-            )  # fmt: skip
+            variables, factors = (mark[at.VARIABLES], counts[at.VARIABLES]), (mark[at.FACTORS], counts[at.FACTORS])
+            settle_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
 
     def _suspects(self) -> I64:
         """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""

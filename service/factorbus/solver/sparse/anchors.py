@@ -11,7 +11,7 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.kernels.graph.initialize import join, reach
-from factorbus.solver.kernels.graph.observability import hold
+from factorbus.solver.kernels.graph.observability import mark_held
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.sparse.blocks import HessianBlocks
@@ -29,8 +29,8 @@ def find_unheld(graph: Graph, since: Mark) -> I64:
     held = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     arenas = graph.var, graph.fac, graph.values, graph.payload
-    while reach(False, first, *factors, *arenas, held) >= 0:
-        if not hold(first, *factors, *arenas, held):
+    while reach(False, first, *factors, graph.array_table, held) >= 0:
+        if not mark_held(first, *factors, *arenas, held):
             break
     else:
         return _NONE
