@@ -28,9 +28,9 @@ LEFT = {
     # in the solver
     "check_numbers", "collect", "hold",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph", "Problem",
-    "Space", "TooLarge", "UnknownKind", "VariableKind", "check", "connect", "dims_of",
-    "factored", "fetch", "follow", "grown", "judge", "label_of", "load",
+    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph",
+    "TooLarge", "UnknownKind", "VariableKind", "check", "connect", "dims_of",
+    "factored", "fetch", "follow", "grown", "judge", "load",
     "rotation", "rows_size", "spread", "warm", "word",
     # in the mathematics of inverse depth, or the workers
     "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
