@@ -150,7 +150,6 @@ class CliqueTree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            state[tl.S_FRESH] = min(int(state[tl.S_FRESH]), self.numbers.size)  # of a copy it may be more
             pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 

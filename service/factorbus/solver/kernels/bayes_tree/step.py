@@ -17,7 +17,6 @@ A step with nothing new goes on from 2 with what waits, and substitutes back thr
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import take_in_factors, take_in_variables, take_out
-from factorbus.solver.kernels.bayes_tree.allocator import write_ahead
 from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
 from factorbus.solver.kernels.bayes_tree.convergence import await_bound, goes_on, note_after
@@ -32,8 +31,6 @@ from factorbus.solver.kernels.jit.cycle_counter import cycles
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.sparse.task_queue import NOBODY
-
-LIGHT = 10**7  # flops of a step that has time to spare
 
 
 @kernel("int64(int64[::1], int64[::1], int64[::1], int64)")
@@ -105,8 +102,6 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
     note_after(settings, state, account)
-    if state[tl.S_FLOPS] < LIGHT:
-        write_ahead(tree.numbers, state)
     return tl.DONE
 
 
