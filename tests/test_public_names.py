@@ -26,18 +26,17 @@ TWINS = (
 STARTS = {"main"}
 LEFT = {
     # in the solver
-    "Blocks", "add_end", "collect", "ends_of", "extend_add", "list_moved",
-    "list_roots", "list_runs", "padded", "put_block", "solve_lower", "solve_rows", "solve_upper",
+    "check_numbers", "collect", "hold",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "Course", "FactorKind", "Factored", "Graph", "Problem", "Rule",
-    "Space", "TooLarge", "UnknownKind", "VariableKind", "begin", "check", "compiled_seconds", "dims_of",
-    "factor_chi2", "factored", "fetch", "follow", "gather", "grown", "is_relative", "judge", "load",
-    "machine", "note", "placed", "rotation", "rows_size", "spread", "warm",
+    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph",
+    "TooLarge", "UnknownKind", "VariableKind", "check", "connect", "dims_of",
+    "factored", "fetch", "follow", "grown", "judge", "load",
+    "rotation", "rows_size", "spread", "warm", "word",
     # in the mathematics of inverse depth, or the workers
     "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
     "product", "rays", "rays_of", "rows",
     # between packages
-    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "rotated", "seconds",
+    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
 }  # fmt: skip
 
 

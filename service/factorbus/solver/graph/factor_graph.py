@@ -25,7 +25,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
 from factorbus.solver.kernels.model.kinds import CAMERA
-from factorbus.solver.kernels.model.retract import gather_values, label_of
+from factorbus.solver.kernels.model.retract import common_label, gather_values
 
 Mark: TypeAlias = tuple[int, ...]
 
@@ -174,7 +174,7 @@ class Graph(Arenas):
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
             keys, values, stamps = self.keys, self.values, self.stamps if self.counts.item(at.STAMPED) else None
             return [span.group(keys, values, stamps) if span.together else self._scattered(span) for span in spans]
-        if (label := label_of(picked, self.array_table)) >= 0:
+        if (label := common_label(picked, self.array_table)) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)

@@ -19,7 +19,7 @@ _ROUNDING_FLOOR = 1e-12
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
 
-class Problem(Protocol):
+class LeastSquares(Protocol):
     """A sum of squares at a linearization point."""
 
     def factorize(self, damping: float) -> int:
@@ -51,7 +51,7 @@ class Problem(Protocol):
         ...
 
 
-class LinearProblem(Problem, Protocol):
+class LinearizedLeastSquares(LeastSquares, Protocol):
     """A problem that can stay linearized where it was."""
 
     def accept_linear(self) -> None:
@@ -99,7 +99,7 @@ class Minimization:
 
 
 def minimize(
-    problem: Problem, chi2: float, damping: float, rule: StoppingRule, have_factor: bool = False
+    problem: LeastSquares, chi2: float, damping: float, rule: StoppingRule, have_factor: bool = False
 ) -> Minimization:
     """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
 
@@ -165,7 +165,7 @@ def minimize(
     return course
 
 
-def glide(problem: LinearProblem, chi2: float, rule: StoppingRule) -> Minimization | None:
+def glide(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
     """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
     course = Minimization(chi2, 0.0, factorizations=1, converged=True)
     if problem.factorize(0.0) >= 0:
@@ -180,7 +180,7 @@ def glide(problem: LinearProblem, chi2: float, rule: StoppingRule) -> Minimizati
     return course
 
 
-def _go_over_hill(problem: Problem, course: Minimization, reached: float, most: int) -> bool:
+def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, most: int) -> bool:
     """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
     first, which led to χ² `reached`.
 
@@ -203,7 +203,7 @@ def _go_over_hill(problem: Problem, course: Minimization, reached: float, most: 
     return False
 
 
-def _polish(problem: Problem, course: Minimization, most: int) -> None:
+def _polish(problem: LeastSquares, course: Minimization, most: int) -> None:
     """Steps by the old factor, which is nearly that of the optimum: δ is exact to more digits than χ² has."""
     last = math.inf
     for _ in range(most):

@@ -22,7 +22,7 @@ _FREE_DIRECTION = (
 
 
 class System(Generic[R]):
-    """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
+    """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step."""
 
     NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
 
