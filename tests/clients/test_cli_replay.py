@@ -23,7 +23,7 @@ from factorbus.cli.process.children import service
 from factorbus.client import connect
 from factorbus.datasets import CATALOGUE, named
 from factorbus.formats import read
-from factorbus.simulate import sphere
+from factorbus.simulate import Spiral, sphere
 from factorbus.solver import solve_batch
 from factorbus.solver.starts import descent
 
@@ -279,7 +279,7 @@ def test_an_adopted_optimum_that_had_not_converged_is_called_so(
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_a_drive_over_a_sphere_of_much_noise_ends_at_the_best_of_the_starts(seed: int) -> None:
-    world = sphere(300, seed, ring=25, rings=12, sigma_rotation_rad=0.25)
+    world = sphere(300, seed, spiral=Spiral(25, 12), sigma_rotation_rad=0.25)
     target, batches = LocalMap("auto"), [step.batch for step in world]
     for batch in batches:
         target.send(batch)

@@ -12,7 +12,7 @@ from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver.starts import descent
-from factorbus.viz import Course, drive_figure, map_figure, sparsity_figure, spread_of
+from factorbus.viz import Course, MapLayers, drive_figure, map_figure, sparsity_figure, spread_of
 from factorbus.viz.ellipses import QUANTILE, outlines
 from factorbus.viz.geometry import view_of
 
@@ -118,7 +118,7 @@ def test_in_space_three_lines_go_round_each_place() -> None:
     assert lines.shape[0] == 90
     distance = (lines - np.tile(places, (3, 1))[:, None]) / [0.1, 0.2, 0.3]
     np.testing.assert_allclose(np.linalg.norm(distance, axis=2), QUANTILE[3], rtol=1e-9)
-    figure = map_figure(estimate=[points], spread=spread)
+    figure = map_figure(MapLayers([points], spread=spread))
     legend = [text.get_text() for axes in figure.axes if axes.get_legend() for text in axes.get_legend().get_texts()]
     assert "95 % of where it may be (30)" in legend
 

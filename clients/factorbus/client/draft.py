@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factorbus.client.arguments import flag, of_type
-from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
+from factorbus.client.certainty import Certainty, FeatureCertainty, carried, feature_sigmas, loss_of, triangle_of
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_pieces
@@ -103,7 +103,7 @@ class Draft:
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
         """
         if mount is not None:
-            where = self._between(first, second, "between_se2")
+            where = self._joins(first, second, "between_se2")
             measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
             certainty = carried(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
@@ -125,7 +125,7 @@ class Draft:
         mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
         """
         if mount is not None:
-            where = self._between(first, second, "between_se3")
+            where = self._joins(first, second, "between_se3")
             measured, A = transform_se3(
                 where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
             )
@@ -236,19 +236,16 @@ class Draft:
         camera: Camera,
         pixel: ArrayLike,
         rho: float,
-        *,
-        sigma_rho: float,
-        sigma_pixel: float = 1.0,
-        sigma_anchor: float = 1e-4,
-        loss: tuple[str, float] | str | None = None,
+        **certainty: Unpack[FeatureCertainty],
     ) -> Draft:
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
-        sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
+        sigma_rho=, of that guess, 1/metre; sigma_pixel=, sigma_anchor= and loss= where the usual ones do not do
+        (`factorbus.client.certainty.FeatureCertainty`).
         """
         measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
-        sigmas = [sigma_anchor] * 3 + [sigma_pixel] * 2 + [sigma_rho]
-        return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=loss)
+        sigmas = feature_sigmas(self._joins(pose, feature, "idp_first"), certainty)
+        return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
@@ -307,7 +304,7 @@ class Draft:
         all_triangles.append(triangle)
         return self
 
-    def _between(self, first: Key, second: Key, kind: str) -> str:
+    def _joins(self, first: Key, second: Key, kind: str) -> str:
         """What an error says it is about."""
         return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
 

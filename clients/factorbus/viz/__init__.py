@@ -5,13 +5,14 @@ from factorbus.viz.drive import drive_figure
 from factorbus.viz.ellipses import Spread, spread_of
 from factorbus.viz.files import BadPicture, checked_ending, save
 from factorbus.viz.odometry import Odometry, loops_of
-from factorbus.viz.picture import map_figure, save_map
+from factorbus.viz.picture import MapLayers, map_figure, save_map
 from factorbus.viz.sparsity import Pattern, sparsity_figure
 from factorbus.viz.tree import tree_figure
 
 __all__ = [
     "BadPicture",
     "Course",
+    "MapLayers",
     "Odometry",
     "Pattern",
     "Spread",

@@ -10,6 +10,7 @@ from bench.replays.problems import Problem, load
 from factorbus.datasets import CATALOGUE, Places, locate, named
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
+from factorbus.simulate import TreeSensor
 
 from . import hard
 from .motion import PLANE, SPACE
@@ -55,7 +56,7 @@ WORLDS = {
         World("manhattan", partial(_simulated, "manhattan")),
         World("city_trees", partial(_simulated, "city_trees")),
         World("sphere", partial(_simulated, "sphere")),
-        World("bearing_range", partial(_simulated, "city_trees", sensor="bearing_range_se2")),
+        World("bearing_range", partial(_simulated, "city_trees", sensor=TreeSensor("bearing_range_se2"))),
         World("outliers", hard.outliers, kind="hard"),
         World("drift", hard.drift, kind="hard"),
         World("meetings_2d", partial(hard.meetings, PLANE), 400, "hard"),

@@ -10,7 +10,7 @@ from factorbus.cli.driving.columns import merged
 from factorbus.cli.driving.drive import Compared
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Batch, Variables
-from factorbus.viz import Course, Odometry, Spread, loops_of, save_map
+from factorbus.viz import Course, MapLayers, Odometry, Spread, loops_of, save_map
 
 
 def draw(
@@ -28,17 +28,8 @@ def draw(
     spread: where some of the estimate may be.
     """
     graph = merged(batches)
-    save_map(
-        path,
-        estimate=estimate,
-        odometry=reckoned(graph),
-        truth=truth,
-        loops=loops_of(graph),
-        course=course,
-        spread=spread,
-        title=title,
-        subtitle=subtitle,
-    )
+    layers = MapLayers(estimate, reckoned(graph), truth, loops_of(graph), spread)
+    save_map(path, layers, course=course, title=title, subtitle=subtitle)
 
 
 def reckoned(graph: Batch) -> tuple[Variables, ...]:

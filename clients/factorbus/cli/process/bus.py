@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from factorbus.cli.process.options import MapAddress
+
 if TYPE_CHECKING:
     from factorbus.client import Bus, Map
 
@@ -15,6 +17,16 @@ def open_bus(endpoint: str, client: str, zenoh: str = "", timeout_s: float = 10.
     from factorbus.client import connect
 
     return connect(endpoint, client=client, zenoh=zenoh, timeout_s=timeout_s, listening_s=_LISTENING_S)
+
+
+@contextmanager
+def joined_map(address: MapAddress, client: str) -> Iterator["Map"]:
+    """The map at `address`, joined only if it is there.  Raises as `factorbus.client.connect`, and UnknownMap."""
+    with (
+        open_bus(address.endpoint, client, address.zenoh, address.timeout_s) as bus,
+        bus.map(address.name, mirror=False, create=False) as joined,
+    ):
+        yield joined
 
 
 @contextmanager
