@@ -28,7 +28,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ("job_deadline_s = inf", "job_deadline_s is inf; wanted a number below 1e"),
         ("stuck_s = nan", "stuck_s is nan"),
         ("group_s = inf", "group_s is inf"),
-        ("snapshot_s = 1e300", "snapshot_s is 1e"),
+        ("checkpoint_s = 1e300", "checkpoint_s is 1e"),
         ("[limits]\nparked_s = inf", "parked_s is inf"),
         ("[limits]\nparked_s = nan", "parked_s is nan"),
         ("lissten = []", "'lissten' is not a setting"),

@@ -11,8 +11,8 @@ import pytest
 from turned import closing, drive, optimum
 
 from factorbus.client import Draft
+from factorbus.journal.checkpoints import read_checkpoint, write_checkpoint
 from factorbus.journal.problems import JournalDiffers
-from factorbus.journal.snapshots import read_snapshot, write_snapshot
 from factorbus.journal.store import Store, create, open_store
 from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -136,7 +136,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     again, late = (folder_in(mode, max_iterations=10, max_nonmonotone_steps=20) for _ in range(2))
     assert recover(map_.store, again).same
     late.load(state)
-    assert late.unfinished, "a snapshot knows"
+    assert late.unfinished, "a checkpoint knows"
     while late.unfinished:
         late.apply_whole((), further=True)
     assert values(again) == values(map_.map_solver) == values(late)
@@ -171,9 +171,9 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
     assert [record.number for record in map_.store.records() if record.further] == [
         len(came) + n for n in (1, 2, 3, 5, 6)
     ]
-    write_snapshot(tmp_path / "s", state)
+    write_checkpoint(tmp_path / "s", state)
     late = folder_in(mode)
-    late.load(read_snapshot(tmp_path / "s"))
+    late.load(read_checkpoint(tmp_path / "s"))
     assert (late.revision, late.converged) == (at.revision, False)
     map_.converge()
     for other, made in ((again, 2), (late, 0)):

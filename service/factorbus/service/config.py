@@ -87,7 +87,7 @@ class Config:
     journal: str = ""  # folder where maps are kept; empty: they end with the service
     durability: str = "commit"  # what an answer promises of it: none, group or commit
     group_s: float = 0.05  # durability group: written no later than this after the answer
-    snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
+    checkpoint_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
     # From so much memory of a map on; before, each on its own thread alone.  10,000 poses in a plane, 2,000 in space.
     cores_from_bytes: int = 64 << 20
@@ -121,7 +121,7 @@ def checked(config: Config) -> Config:
         least = 0 if name in _MAY_BE_0 else 1e-9
         if getattr(config.limits, name) < least:
             raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
-    for name in ("job_deadline_s", "stuck_s", "group_s", "snapshot_s"):
+    for name in ("job_deadline_s", "stuck_s", "group_s", "checkpoint_s"):
         if getattr(config, name) <= 0:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
     if config.cores < 1:

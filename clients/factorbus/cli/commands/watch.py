@@ -20,7 +20,7 @@ from factorbus.cli.process.options import (
 
 
 @dataclass(frozen=True, slots=True)
-class Viewer:
+class ViewOptions:
     """Where the view goes: a recording, browsers (serving; host and ports), or a viewer on this display."""
 
     save: Path | None
@@ -31,7 +31,7 @@ class Viewer:
 
 
 @click.command()
-@grouped("viewer", Viewer)
+@grouped("viewer", ViewOptions)
 @click.argument("map_name", metavar="MAP")
 @connect_option
 @zenoh_option
@@ -50,7 +50,7 @@ def command(
     map_name: str,
     endpoint: str,
     zenoh: str,
-    viewer: Viewer,
+    viewer: ViewOptions,
     rate: float,
     ellipses: int,
     until: int | None,
@@ -101,7 +101,7 @@ def command(
     note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 
-def _open(view: Any, viewer: Viewer) -> str:
+def _open(view: Any, viewer: ViewOptions) -> str:
     """Where it is to be seen.  Raises Stopped."""
     from factorbus.cli.output.exits import Stopped
 

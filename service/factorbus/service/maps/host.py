@@ -45,7 +45,7 @@ from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
 
-# What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
+# What a core wants done; answer(reads, copies) turns copies into answers, elsewhere.
 Perform: TypeAlias = Callable[[list[Effect]], None]
 SendBoth: TypeAlias = Callable[[Asker, bytes, bytes], None]
 AnswerReads: TypeAlias = Callable[[Sequence[Read], QuestionCopies], None]
@@ -287,9 +287,9 @@ class Host:
                 effects = self.core.kept(events, time.monotonic())
             tell(effects)
         replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
-        if replaced or ((run.inserts or run.further) and keeper.wants_snapshot()):
+        if replaced or ((run.inserts or run.further) and keeper.wants_checkpoint()):
             started = time.perf_counter()
-            keeper.snapshot(self._map_solver.dump(), time.perf_counter() - started)
+            keeper.checkpoint(self._map_solver.dump(), time.perf_counter() - started)
         with self._lock:
             effects = self.core.applied(applied)
         self._perform(effects)
@@ -301,7 +301,7 @@ class Host:
             self._refuse(reads, problem)
         except Exception:
             reference = secrets.token_hex(4)
-            log.exception("fault %s: no snapshot of map %s", reference, self.core.name)
+            log.exception("fault %s: no copies of map %s", reference, self.core.name)
             self._refuse(reads, Internal(reference))
         else:
             self._answer_after(reads, taken)
