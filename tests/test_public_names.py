@@ -29,15 +29,12 @@ LEFT = {
     "Blocks", "add_end", "check_numbers", "collect", "ends_of", "extend_add", "has_room", "hold", "list_moved",
     "list_roots", "list_runs", "padded", "put_block", "solve_lower", "solve_rows", "solve_upper",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "Course", "FactorKind", "Factored", "Graph", "Problem", "Rule",
-    "Space", "TooLarge", "UnknownKind", "VariableKind", "begin", "check", "compiled_seconds", "connect", "dims_of",
-    "factor_chi2", "factored", "fetch", "follow", "gather", "grown", "is_relative", "judge", "label_of", "load",
-    "machine", "note", "placed", "rotation", "rows_size", "spread", "warm", "word",
+    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph", "Problem", "TooLarge", "UnknownKind",
+    "VariableKind", "connect", "factored", "gather", "grown", "label_of", "rotation", "spread", "warm",
     # in the mathematics of inverse depth, or the workers
-    "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
-    "product", "rays", "rays_of", "rows",
+    "BadConfig", "Config", "Parts", "covariance", "do", "jacobians", "own_block", "rays", "rows",
     # between packages
-    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
+    "read_insert",
 }  # fmt: skip
 
 

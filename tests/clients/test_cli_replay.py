@@ -21,7 +21,7 @@ from factorbus.cli.main import main
 from factorbus.cli.output.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.process.children import service
 from factorbus.client import connect
-from factorbus.datasets import CATALOGUE, named
+from factorbus.datasets import CATALOGUE, dataset_named
 from factorbus.formats import read
 from factorbus.simulate import Spiral, sphere
 from factorbus.solver import solve_batch
@@ -153,7 +153,7 @@ def test_intel_ends_at_the_reference_optimum(datasets: Path) -> None:
     ],
 )
 def test_a_data_set_over_the_bus_ends_at_the_reference_optimum(datasets: Path, name: str) -> None:
-    known = named(name, CATALOGUE)
+    known = dataset_named(name, CATALOGUE)
     found = replayed(datasets / known.file, timeout_s=1800)
     print(
         f"{name}: {found['seconds']:.0f} s, solver {found['solver_cpu_s']:.1f} s CPU, step p99 "

@@ -10,7 +10,7 @@ import pytest
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import Spiral, city_trees, manhattan, sphere
-from factorbus.viz import BadPicture, Course, MapLayers, Odometry, loops_of, map_figure, save_map
+from factorbus.viz import BadPicture, DriveHistory, MapLayers, Odometry, loops_of, map_figure, save_map
 
 pytest.importorskip("matplotlib")
 
@@ -126,27 +126,29 @@ def test_a_straight_drive_is_drawn_along_its_own_axis_and_not_as_a_sliver(axis: 
 
 
 def test_panels_show_the_course() -> None:
-    course = Course(chi2=np.linspace(0, 90, 50), step_ms=np.full(50, 2.5), optimum=np.array([[25, 40.0], [50, 88.0]]))
-    figure = map_figure(MapLayers([square()]), course=course)
+    history = DriveHistory(
+        chi2=np.linspace(0, 90, 50), step_ms=np.full(50, 2.5), optimum=np.array([[25, 40.0], [50, 88.0]])
+    )
+    figure = map_figure(MapLayers([square()]), history=history)
     chi2, times = figure.axes[2:]
-    np.testing.assert_array_equal(chi2.lines[0].get_ydata(), course.chi2)
-    np.testing.assert_array_equal(chi2.lines[1].get_xydata(), course.optimum)
+    np.testing.assert_array_equal(chi2.lines[0].get_ydata(), history.chi2)
+    np.testing.assert_array_equal(chi2.lines[1].get_xydata(), history.optimum)
     assert [text.get_text() for text in times.get_legend().get_texts()] == ["p50  2.5 ms", "p99  2.5 ms"]
     assert [text.get_text() for text in chi2.get_legend().get_texts()] == ["after the step", "batch optimum"]
     figure.canvas.draw()
-    assert len(map_figure(MapLayers([square()]), course=Course(chi2=np.ones(3))).axes) == 3
-    assert len(map_figure(MapLayers([square()]), course=Course()).axes) == 2
+    assert len(map_figure(MapLayers([square()]), history=DriveHistory(chi2=np.ones(3))).axes) == 3
+    assert len(map_figure(MapLayers([square()]), history=DriveHistory()).axes) == 2
 
 
 def test_an_optimum_that_had_not_converged_is_drawn_and_called_so() -> None:
     early = np.array([[30, 41.0]])
-    course = Course(chi2=np.linspace(0, 90, 50), optimum=np.array([[25, 40.0]]), not_converged=early)
-    chi2 = map_figure(MapLayers([square()]), course=course).axes[2]
+    history = DriveHistory(chi2=np.linspace(0, 90, 50), optimum=np.array([[25, 40.0]]), not_converged=early)
+    chi2 = map_figure(MapLayers([square()]), history=history).axes[2]
     drawn = {line.get_label(): line for line in chi2.lines}
     np.testing.assert_array_equal(drawn["batch, not converged"].get_xydata(), early)
     assert drawn["batch, not converged"].get_marker() != drawn["batch optimum"].get_marker()
     assert len(chi2.get_legend().get_texts()) == 3
-    alone = map_figure(MapLayers([square()]), course=Course(chi2=np.ones(50), not_converged=early)).axes[2]
+    alone = map_figure(MapLayers([square()]), history=DriveHistory(chi2=np.ones(50), not_converged=early)).axes[2]
     assert [text.get_text() for text in alone.get_legend().get_texts()] == ["after the step", "batch, not converged"]
 
 

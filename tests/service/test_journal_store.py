@@ -312,9 +312,9 @@ def test_the_chain_follows_values_and_time_stamps_and_not_accounts() -> None:
         rows = (Variables("se2", np.array([1]), np.array([[value, 0.0, 0.0]]), stamps=stamps),)
         return codec.encode_delta(Delta(1, 2, 1, rows, {"step_ms": ms}))
 
-    one = chain.follow(chain.START, delta(1.0, 3.0))
-    assert one == chain.follow(chain.START, delta(1.0, 4.0))
-    assert one != chain.follow(chain.START, delta(np.nextafter(1.0, 2.0), 3.0))
-    assert one != chain.follow(one, delta(1.0, 3.0))
-    assert len({one, *(chain.follow(chain.START, delta(1.0, 3.0, stamp)) for stamp in (0, 1))}) == 3
+    one = chain.extend_chain(chain.START, delta(1.0, 3.0))
+    assert one == chain.extend_chain(chain.START, delta(1.0, 4.0))
+    assert one != chain.extend_chain(chain.START, delta(np.nextafter(1.0, 2.0), 3.0))
+    assert one != chain.extend_chain(one, delta(1.0, 3.0))
+    assert len({one, *(chain.extend_chain(chain.START, delta(1.0, 3.0, stamp)) for stamp in (0, 1))}) == 3
     assert NAME == "journal.db"

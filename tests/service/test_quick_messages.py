@@ -13,7 +13,7 @@ from naive.random_graphs import random_steps
 
 from factorbus.proto import codec
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
-from factorbus.proto.limits import REQUEST_LIMITS, Limits
+from factorbus.proto.limits import REQUEST_LIMITS, MessageLimits
 from factorbus.proto.messages import Accepted, Batch, Delta, Factors, Insert, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.stamps import NO_STAMP
@@ -224,14 +224,15 @@ def test_left_to_the_codec(name: str) -> None:
 def test_the_limits_of_a_service_hold_for_both() -> None:
     message = codec.encode_insert(Insert(1, Batch((Variables("se2", np.arange(9), np.zeros((9, 3))),))))
     assert try_locate(message, REQUEST_LIMITS)
-    for limits in (Limits(len(message) - 1, 100, 100), Limits(1 << 20, 8, 100), Limits(1 << 20, 100, 0)):
+    tight = (MessageLimits(len(message) - 1, 100, 100), MessageLimits(1 << 20, 8, 100), MessageLimits(1 << 20, 100, 0))
+    for limits in tight:
         assert try_locate(message, limits) is None
 
 
 def test_an_arrival_is_the_same_either_way() -> None:
     message = codec.encode_insert(Insert(7, Batch(), True, 9))
     quick = read_insert("asker", "robot", message, REQUEST_LIMITS, 1.5)
-    usual = read_insert("asker", "robot", message, Limits(1 << 20, 0, 0), 1.5)
+    usual = read_insert("asker", "robot", message, MessageLimits(1 << 20, 0, 0), 1.5)
     assert isinstance(quick, Arrived)
     assert isinstance(usual, Arrived)
     assert isinstance(quick.content, ParsedInsert)

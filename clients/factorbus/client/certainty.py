@@ -95,7 +95,7 @@ def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F
     raise BadInformation(where, seen, "one of the two: how certain it is")
 
 
-def carried(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
+def transform_certainty(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
     """The certainty of r' where this is that of r = A r', both of a factor of `kind`."""
     W = full(triangle_of(where, dim, certainty, kind), dim)
     return {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}

@@ -11,8 +11,15 @@ from typing import TypeAlias, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorbus.client.arguments import flag, of_type
-from factorbus.client.certainty import Certainty, FeatureCertainty, carried, feature_sigmas, loss_of, triangle_of
+from factorbus.client.arguments import checked_flag, of_type
+from factorbus.client.certainty import (
+    Certainty,
+    FeatureCertainty,
+    feature_sigmas,
+    loss_of,
+    transform_certainty,
+    triangle_of,
+)
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_pieces
@@ -105,7 +112,7 @@ class Draft:
         if mount is not None:
             where = self._joins(first, second, "between_se2")
             measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = carried(where, 3, certainty, A, "between_se2")
+            certainty = transform_certainty(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -129,7 +136,7 @@ class Draft:
             measured, A = transform_se3(
                 where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
             )
-            certainty = carried(where, 6, certainty, A, "between_se3")
+            certainty = transform_certainty(where, 6, certainty, A, "between_se3")
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -273,7 +280,7 @@ class Draft:
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
         row = None if value is None else _row(where, value, size)
-        time, held = stamp_number(where, stamp), flag(f"{where}: fixed", fixed)
+        time, held = stamp_number(where, stamp), checked_flag(f"{where}: fixed", fixed)
         keys, rows, stamps = self._variables.setdefault((kind, row is not None, held), ([], [], []))
         keys.append(number)
         stamps.append(time)

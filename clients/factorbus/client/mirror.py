@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from numbers import Integral
 from typing import Any
 
-from factorbus.client.arguments import of_type, seconds
+from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.following import Following, tables_of
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
@@ -137,7 +137,7 @@ class Mirror:
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         of_type("revision", revision, Integral, "a whole number")
         self._try_wait(lambda: self._there(revision), timeout_s)
         if self._there(revision):
@@ -153,7 +153,7 @@ class Mirror:
         That is at its optimum to 1e-6 of χ², or within a thousandth where it gave up the rest (`gave_up` of its stats).
         Raises NotConverged when time is up, at once where it gave up before; Unavailable, at once, on a closed map.
         """
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         self._try_wait(lambda: self._is_at_rest, timeout_s)
         if self._is_at_rest and self.converged:
             return

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import of_type, seconds
+from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
@@ -82,7 +82,7 @@ class UncertaintyQuestions:
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         return self._sender.carry(Request(what, key, payload, decode, timeout_s)).future
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.datasets.catalogue import Dataset, named
+from factorbus.datasets.catalogue import Dataset, dataset_named
 from factorbus.datasets.checksum import sha256_of
 from factorbus.datasets.fetch import from_wheel
 from factorbus.datasets.known import CATALOGUE
@@ -43,7 +43,7 @@ def find(name: str, places: Places | None = None, catalogue: Sequence[Dataset] =
     Raises UnknownDataset; for the wheel also BadChecksum, CannotRead and CannotWrite.
     """
     places = places or Places.of_this_machine()
-    dataset = named(name, catalogue)
+    dataset = dataset_named(name, catalogue)
     place = locate(dataset, places)
     if place is None or place.where != "wheel":
         return place.path if place else None

@@ -15,7 +15,7 @@ import numpy as np
 from factorbus.client.draft import Draft
 from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
-from factorbus.ros2.certainty import Checked, checked, floored, information
+from factorbus.ros2.certainty import Checked, checked_covariance, floored, information
 from factorbus.ros2.geometry import FARTHEST_M, Transform, carried, from_pose, local
 from factorbus.ros2.messages import LATEST_S, Stamp
 from factorbus.ros2.problems import BadRosMessage
@@ -234,7 +234,7 @@ class FrontEnd:
 
     def _checked(self, topic: str, what: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
         """A covariance that can be one; what was done with it is noted.  Raises BadRosMessage."""
-        made = checked(topic, numbers, axes)
+        made = checked_covariance(topic, numbers, axes)
         if made.unknown:
             self.remarks.append((topic, f"{what}: {made.remark()}"))
         return made

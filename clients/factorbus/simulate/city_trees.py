@@ -14,7 +14,7 @@ from factorbus.simulate.manhattan import true_poses
 from factorbus.simulate.noise import diagonal_information, noisy_se2, relative_se2, seen_from, wrapped
 from factorbus.simulate.parameters import BadParameter, checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POINT, POSE, FactorBlock, PointBlock, Step, steps_of
-from factorbus.simulate.walk import Place, drive
+from factorbus.simulate.walk import GridPose, walk_streets
 
 _KERB_M = 1.0  # trees stand at least that far from the middle of the street
 
@@ -70,14 +70,14 @@ def city_trees(
     checked_sigma("sigma_theta_rad", sigma_theta_rad, 0.5)
     checked_share("tree_share", tree_share)
     checked_at_least("block_m", block_m, 3)
-    places = drive(Random(f"streets {seed}"), block_m, straight=0.5)
+    places = walk_streets(Random(f"streets {seed}"), block_m, straight=0.5)
     trees = _Trees(seed, tree_share, sensor, block_m)
     odometry = np.array([sigma_xy_m, sigma_xy_m, sigma_theta_rad])
     return islice(_blocks(places, trees, np.random.default_rng([seed, 2]), odometry, sensor), poses)
 
 
 def _blocks(
-    places: Iterator[Place], trees: "_Trees", rng: np.random.Generator, odometry: F64, sensor: TreeSensor
+    places: Iterator[GridPose], trees: "_Trees", rng: np.random.Generator, odometry: F64, sensor: TreeSensor
 ) -> Iterator[Step]:
     first, before = 0, None
     while True:
@@ -96,7 +96,7 @@ def _blocks(
 
 
 def _sightings(
-    trees: "_Trees", rng: np.random.Generator, first: int, block: list[Place], truth: F64, sensor: TreeSensor
+    trees: "_Trees", rng: np.random.Generator, first: int, block: list[GridPose], truth: F64, sensor: TreeSensor
 ) -> tuple[FactorBlock, PointBlock]:
     known = trees.count
     seen, ends, new_ends = [], [], []

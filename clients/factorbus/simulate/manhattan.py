@@ -12,7 +12,7 @@ from factorbus.proto.arrays import F64
 from factorbus.simulate.noise import diagonal_information, noisy_se2, relative_se2
 from factorbus.simulate.parameters import checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POSE, FactorBlock, Step, steps_of
-from factorbus.simulate.walk import Place, drive
+from factorbus.simulate.walk import GridPose, walk_streets
 
 _VISITS = 2  # visits a place remembers: the first, for loops over the whole drive, and the last
 
@@ -58,13 +58,13 @@ def manhattan(
     checked_sigma("sigma_xy_m", sigma_xy_m)
     checked_sigma("sigma_theta_rad", sigma_theta_rad, 0.5)
     checked_at_least("block_m", block_m, 1)
-    places = drive(Random(f"streets {seed}"), block_m, straight=0.5)
+    places = walk_streets(Random(f"streets {seed}"), block_m, straight=0.5)
     closures = _Closures(Random(f"closures {seed}"), loops)
     sigmas = np.array([sigma_xy_m, sigma_xy_m, sigma_theta_rad])
     return islice(_blocks(places, closures, np.random.default_rng([seed, 1]), sigmas), poses)
 
 
-def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Generator, sigmas: F64) -> Iterator[Step]:
+def _blocks(places: Iterator[GridPose], closures: "_Closures", rng: np.random.Generator, sigmas: F64) -> Iterator[Step]:
     first, before = 0, None
     while True:
         block = list(islice(places, BLOCK))
@@ -87,7 +87,7 @@ def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Gener
         first += len(block)
 
 
-def true_poses(places: list[Place]) -> F64:
+def true_poses(places: list[GridPose]) -> F64:
     """Poses (n, 3) of places; headings in [-π, π)."""
     table = np.array(places, float).reshape(-1, 3)
     table[:, 2] = ((table[:, 2] + 2) % 4 - 2) * (math.pi / 2)
@@ -103,10 +103,10 @@ class _Closures:
         self._around = [(dx, dy) for dx in reach for dy in reach if dx * dx + dy * dy <= radius * radius]
         self._visits: dict[tuple[int, int], list[tuple[int, int]]] = {}
 
-    def found_from(self, number: int, place: Place) -> list[tuple[int, Place]]:
+    def found_from(self, number: int, place: GridPose) -> list[tuple[int, GridPose]]:
         """Earlier poses that pose `number` recognizes, with their places; `number` is remembered from now on."""
         x, y, heading = place
-        found: list[tuple[int, Place]] = []
+        found: list[tuple[int, GridPose]] = []
         if self._chance.random() < self._loops.share:
             latest = number - self._loops.gap
             for dx, dy in self._around:
@@ -119,9 +119,9 @@ class _Closures:
         visits.append((number, heading))
         return found
 
-    def _some(self, found: list[tuple[int, Place]]) -> list[tuple[int, Place]]:
+    def _some(self, found: list[tuple[int, GridPose]]) -> list[tuple[int, GridPose]]:
         """At most `most` of those found, by chance, oldest first; no pose twice."""
-        picked: list[tuple[int, Place]] = []
+        picked: list[tuple[int, GridPose]] = []
         while found and len(picked) < self._loops.most:
             picked.append(found.pop(int(self._chance.random() * len(found))))
         return sorted(picked)

@@ -8,7 +8,7 @@ from random import Random
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
-from factorbus.simulate.noise import diagonal_information, noisy_se3, product, relative_se3
+from factorbus.simulate.noise import diagonal_information, noisy_se3, quaternion_product, relative_se3
 from factorbus.simulate.parameters import checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POSE, FactorBlock, Step, steps_of
 
@@ -111,8 +111,8 @@ class _Way:
             [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
         )
         east_north_up = np.tile([0.5, 0.5, 0.5, 0.5], (len(numbers), 1))  # at longitude 0, latitude 0: x→y→z→x
-        quat = product(_about("z", longitude), product(_about("y", -latitude), east_north_up))
-        quat = product(quat, _about("z", np.where(backwards, np.pi, 0.0)))
+        quat = quaternion_product(_about("z", longitude), quaternion_product(_about("y", -latitude), east_north_up))
+        quat = quaternion_product(quat, _about("z", np.where(backwards, np.pi, 0.0)))
         return np.concatenate([self._radius * up, np.where(quat[:, 3:] < 0, -quat, quat)], axis=1)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Variables
 from factorbus.viz import style
-from factorbus.viz.course import Course
 from factorbus.viz.ellipses import Spread, draw_outlines
 from factorbus.viz.files import BadPicture, checked_ending, save
 from factorbus.viz.geometry import Track, View, limits, line_of, points_of, segments_of, track_of, view_of
+from factorbus.viz.history import DriveHistory
 from factorbus.viz.panels import chi2_panel, time_panel
 
 if TYPE_CHECKING:
@@ -43,19 +43,21 @@ def save_map(
     path: str | os.PathLike[str],
     layers: MapLayers,
     *,
-    course: Course | None = None,
+    history: DriveHistory | None = None,
     title: str = "",
     subtitle: str = "",
 ) -> None:
     """Draw a map (see `map_figure`) into a .png, .svg or .pdf file.  Raises BadPicture, or OSError from the file."""
     checked_ending(path)
-    save(map_figure(layers, course=course, title=title, subtitle=subtitle), path, title)
+    save(map_figure(layers, history=history, title=title, subtitle=subtitle), path, title)
 
 
-def map_figure(layers: MapLayers, *, course: Course | None = None, title: str = "", subtitle: str = "") -> "Figure":
+def map_figure(
+    layers: MapLayers, *, history: DriveHistory | None = None, title: str = "", subtitle: str = ""
+) -> "Figure":
     """The map as a matplotlib figure of its own (no pyplot, no window).
 
-    course: panels below the map.  Lengths are in metres and axes equal.  Poses that fill space are drawn in space,
+    history: panels below the map.  Lengths are in metres and axes equal.  Poses that fill space are drawn in space,
     others in the plane they lie in.
     Raises BadPicture when there is no pose or no point to draw.
     """
@@ -64,24 +66,24 @@ def map_figure(layers: MapLayers, *, course: Course | None = None, title: str = 
 
     drawn = _Drawing(layers)
     with mpl.rc_context(style.SETTINGS):
-        panels = _panels(course)
+        panels = _panels(history)
         heights = [1.0, 0.05, 0.26] if panels else [1.0, 0.05]  # map, legend, panels
         figure = Figure(figsize=(9.0, 7.4 * sum(heights) + 1.0), layout="constrained")
         grid = figure.add_gridspec(len(heights), max(len(panels), 1), height_ratios=heights)
         axes = figure.add_subplot(grid[0, :], projection="3d" if drawn.view.in_space else None)
         _legend(figure.add_subplot(grid[1, :]), drawn.draw(axes))
         for column, panel in enumerate(panels):
-            panel(figure.add_subplot(grid[2, column]), course)
+            panel(figure.add_subplot(grid[2, column]), history)
         figure.suptitle(title, x=0.012, ha="left", fontsize=13)
         axes.set_title(subtitle, loc="left", fontsize=9.5, color="#555555", pad=8)
     return figure
 
 
-def _panels(course: Course | None) -> list[Any]:
+def _panels(history: DriveHistory | None) -> list[Any]:
     """The panels for which there are numbers."""
-    if course is None:
+    if history is None:
         return []
-    return [panel for panel, there in ((chi2_panel, len(course.chi2)), (time_panel, len(course.step_ms))) if there]
+    return [panel for panel, there in ((chi2_panel, len(history.chi2)), (time_panel, len(history.step_ms))) if there]
 
 
 def _legend(axes: Any, handles: list[Any]) -> None:

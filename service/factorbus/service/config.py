@@ -10,7 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.keys import checked_name
-from factorbus.proto.limits import Limits as MessageLimits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import Problem
 
 _HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
@@ -95,17 +95,17 @@ class Config:
     limits: Limits = field(default_factory=Limits)
 
 
-def load(path: str | Path, **overrides: Any) -> Config:
+def load_config(path: str | Path, **overrides: Any) -> Config:
     """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, BadEndpoint, BadName, OSError."""
     with Path(path).open("rb") as file:
         try:
             content = tomllib.load(file)
         except tomllib.TOMLDecodeError as error:
             raise BadConfig(f"{path} is not TOML: {error}") from None
-    return checked(replace(_build(Config, content, str(path)), **overrides))
+    return checked_config(replace(_build(Config, content, str(path)), **overrides))
 
 
-def checked(config: Config) -> Config:
+def checked_config(config: Config) -> Config:
     """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
     for endpoint in (*config.listen, *config.connect):
         checked_endpoint(endpoint)

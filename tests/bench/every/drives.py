@@ -7,7 +7,7 @@ from typing import Any
 
 from bench.replays.problems import Problem, load
 
-from factorbus.datasets import CATALOGUE, Places, locate, named
+from factorbus.datasets import CATALOGUE, Places, dataset_named, locate
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
 from factorbus.simulate import TreeSensor
@@ -80,4 +80,4 @@ def chosen(words: list[str]) -> list[World]:
 
 def is_here(world: World) -> bool:
     """Whether the data set of a world is on this machine."""
-    return world.is_drawn or locate(named(world.name, CATALOGUE), Places.of_this_machine()) is not None
+    return world.is_drawn or locate(dataset_named(world.name, CATALOGUE), Places.of_this_machine()) is not None

@@ -33,12 +33,12 @@ def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
         checked_endpoint(endpoint)  # before the checks of this machine, which take a while
     findings = []
     for look in CHECKS:
-        screen.note(f"looking at {look.__doc__}")
+        screen.print_note(f"looking at {look.__doc__}")
         findings.append(look())
     if endpoint:
         from factorbus.cli.doctor.service_checks import services
 
-        screen.note(f"looking at the services at {endpoint}")
+        screen.print_note(f"looking at the services at {endpoint}")
         findings += services(endpoint, zenoh)
     failed = sum(finding.state == "fail" for finding in findings)
     if as_json:

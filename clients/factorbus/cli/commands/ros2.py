@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.output.logs import begin, log_option
+from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, grouped, zenoh_option
 
@@ -113,7 +113,7 @@ def command(
     from factorbus.ros2.node import open_node
     from factorbus.ros2.settings import BridgeOptions, from_options
 
-    begin(log_form, quiet)
+    begin_logging(log_form, quiet)
     settings, ros = from_options(BridgeOptions(**given)), as_node.ros
     with (
         _switching_often(),

@@ -70,7 +70,7 @@ def command(
     if viewer.save and viewer.serving:
         raise click.UsageError("--save and --serve exclude each other")
     require("watch", "factorbus watch")
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.bus import joined_when_there, open_bus
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.viz.live import LiveView
@@ -82,7 +82,7 @@ def command(
         joined_when_there(bus, map_name, stop.wait) as joined,
     ):
         if joined is None:
-            note(f"stopped before there was a map {map_name}")
+            print_note(f"stopped before there was a map {map_name}")
             return
         view = LiveView(map_name)
         try:
@@ -98,7 +98,7 @@ def command(
             view.close()
     unconverged = ", which had not converged" if joined.estimate.converged is False else ""
     converging = unconverged or (", which was converging" if joined.estimate.converging else "")
-    note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
+    print_note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 
 def _open(view: Any, viewer: ViewOptions) -> str:

@@ -35,7 +35,7 @@ def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -
 
     Raises Refused, Unavailable.
     """
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.proto.problems import UnknownMap
 
     said = False
@@ -45,7 +45,7 @@ def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -
             break
         except UnknownMap as unknown:
             if not said:
-                note(f"{unknown.message}; waiting until there is one")
+                print_note(f"{unknown.message}; waiting until there is one")
             said = True
         if stopped(_LISTENING_S):
             yield None

@@ -45,7 +45,7 @@ def is_quick(done: JobDone) -> bool:
     return done.kind != "batch" and len(done.payload) <= _QUICK_BYTES
 
 
-def judged(job: Job, done: JobDone) -> JobDone | WrongAnswer:
+def checked_result(job: Job, done: JobDone) -> JobDone | WrongAnswer:
     """`done` if it can be the answer to `job`, else what is wrong with it."""
     try:
         _check_envelope(job, done)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from factorbus.proto.features import FEATURE, Ask, answer_size, rows_size
+from factorbus.proto.features import FEATURE, Ask, answer_size, new_rows_size
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Work:
 def work_of(ask: Ask) -> Work:
     """The work that a question is."""
     stored = ask.form == "rows" and ask.segment is not None
-    numbers = rows_size(ask.sighting.count, ask.sighting.width) if stored else answer_size(ask)
+    numbers = new_rows_size(ask.sighting.count, ask.sighting.width) if stored else answer_size(ask)
     return Work(ask.sighting.count, answer_size(ask), numbers // 8, stored)
 
 

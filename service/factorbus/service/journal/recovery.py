@@ -113,7 +113,7 @@ class _History:
                     if not isinstance(outcome.answer, bytes):
                         log.debug("refused again: %s", outcome.answer)
             else:
-                present = chain.follow(present, event.delta)
+                present = chain.extend_chain(present, event.delta)
                 self.solver_s += event.solver_ms * 1e-3
         for entry in record.entries:
             if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:

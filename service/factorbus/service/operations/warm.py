@@ -50,7 +50,7 @@ def warm(progress: Callable[[str], None] | None = None) -> float:
     return time.monotonic() - started
 
 
-def compiled_seconds() -> float:
+def seconds_compiling() -> float:
     """Seconds that this process spent compiling kernels, or waiting for those that did it for it."""
     return solver.compiled_seconds() + sum(_apart)
 

@@ -107,8 +107,8 @@ def parse(name: str, payload: bytes) -> Question:
 
 def _export(content: dict[str, Any]) -> Question:
     """The question for a file.  Raises BadMessage, BadOption."""
-    format = fields.word("question", content, "format", _FORMATS, "g2o")
-    ids = fields.word("question", content, "ids", _IDS, "auto")
+    format = fields.choice_of("question", content, "format", _FORMATS, "g2o")
+    ids = fields.choice_of("question", content, "ids", _IDS, "auto")
     robot = fields.text("question", content, "robot", "") if content.get("robot") is not None else None
     if robot is not None and (len(robot) > 1 or (robot and not (robot.isascii() and robot.isalpha()))):
         raise BadOption("question.robot", f"is {robot[:40]!r}", "one ASCII letter, or an empty string")

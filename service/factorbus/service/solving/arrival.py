@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.limits import ANSWER_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
 from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
@@ -19,7 +19,7 @@ _GROUPS = 30
 _SHAPE = (_GROUPS + 1, layout.G_WIDTH)
 
 
-def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
+def read_insert(asker: Asker, client: str, payload: bytes, limits: MessageLimits, now: float) -> Arrived | Refuse:
     """The arrival of the insert in `payload`; a refusal when not even its sequence number can be read.
 
     A message that is wrong inside still uses up its number, so that the ones after it need not wait for it; whether it
@@ -49,7 +49,7 @@ def read_again(payload: bytes) -> tuple[int, Insert | ParsedInsert | Problem]:
         return message_digest(payload), problem
 
 
-def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, ParsedInsert] | None:
+def try_locate(payload: bytes, limits: MessageLimits) -> tuple[int, int, int, ParsedInsert] | None:
     """(sequence, epoch, digest, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
     size = len(payload)
     # A key is eight bytes: without counting, no more than this can be in it.
