@@ -51,7 +51,7 @@ def test_what_was_written_is_there_when_it_is_opened_again(store: Store) -> None
         (3, [("a", 3), ("b", 2)]),
     ]
     assert again.last() == (3, 3, b"\x03" * 16)
-    assert again.at(2).chain == b"\x02" * 16
+    assert again.last_at(2).chain == b"\x02" * 16
     assert list(again.check()) == []
     assert again.counts() == {"records": 3, "inserts": 5, "clients": 2, "message_bytes": 24}
 

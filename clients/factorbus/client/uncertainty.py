@@ -146,7 +146,7 @@ class Uncertainty:
 
     def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
         """What holds a variable, or what a factor (by its id) does, and what the map's last step did and why."""
-        return self.ask.why(asked_why(key, factor), timeout_s).result()
+        return self.ask.why(why_question(key, factor), timeout_s).result()
 
 
 def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
@@ -178,7 +178,7 @@ def matrix_of(answer: Covariances) -> F64:
     return answer.covariance
 
 
-def asked_why(key: Key | None, factor: int | None) -> AskWhy:
+def why_question(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")

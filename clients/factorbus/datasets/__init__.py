@@ -9,14 +9,14 @@ from factorbus.datasets.convert import convert
 from factorbus.datasets.errors import DatasetProblem
 from factorbus.datasets.fetch import fetch_dataset
 from factorbus.datasets.known import CATALOGUE
-from factorbus.datasets.places import Place, Places, find, locate
+from factorbus.datasets.places import FoundFile, Places, find, locate
 
 __all__ = [
     "CATALOGUE",
     "ChecksumResult",
     "Dataset",
     "DatasetProblem",
-    "Place",
+    "FoundFile",
     "Places",
     "Source",
     "check_dataset",

@@ -91,7 +91,7 @@ class Store:
             row = self._db.execute("SELECT number, revision, chain FROM record ORDER BY number DESC LIMIT 1").fetchone()
         return Last(*row) if row else Last(0, 0, chain.START)
 
-    def at(self, record: int) -> Last:
+    def last_at(self, record: int) -> Last:
         """Where it was after `record`.  Raises JournalDamaged."""
         with self._reading():
             row = self._db.execute("SELECT number, revision, chain FROM record WHERE number = ?", (record,)).fetchone()

@@ -40,7 +40,7 @@ from factorbus.service.bus.zenoh_session import (
     reply,
 )
 from factorbus.service.config import BadConfig, Config, checked_config
-from factorbus.service.core.events import Asked, Asker, Refuse
+from factorbus.service.core.events import ArrivedQuestion, Asker, Refuse
 from factorbus.service.jobs.features import FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
@@ -223,7 +223,7 @@ class Shell:
         if found is None:
             self._delivery.refusals.hand(self._no_map, query, name)
         else:
-            found.host.ask(Asked(query, question, payload_of(query)))
+            found.host.ask(ArrivedQuestion(query, question, payload_of(query)))
 
     def _on_admin(self, query: Asker) -> None:
         if (waiting := self._control.waiting) < _ADMIN_WAITING:

@@ -15,7 +15,7 @@ from factorbus.cli.process.options import MapAddress, Number, asks_map, file_arg
 from factorbus.cli.process.reading import read_graph
 from factorbus.wording import counted
 
-_SHOWN = 20  # more false factors than these are told with --json only
+_SHOWN = 20  # more false factors than these are listed with --json only
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -159,10 +159,10 @@ def why_command(address: MapAddress, what: str, only: str | None, as_json: bool)
     pivots of a variable are those of the Cholesky factor R, and Λ is the information matrix: R²ᵢᵢ/Λᵢᵢ is 1 where no
     variable that was eliminated before depends on it, and near 0 where its estimate rests on those.
 
-    By how much χ² falls without a factor is told to first order, "about", and is never more than all of χ².
+    By how much χ² falls without a factor is given to first order, "about", and is never more than all of χ².
 
     A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
-    both are told, unless --variable or --factor says which is meant.
+    both are shown, unless --variable or --factor says which is meant.
 
     \b
     factorbus ask why warehouse x12

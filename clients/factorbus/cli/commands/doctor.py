@@ -18,7 +18,7 @@ _SIGNS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[red]FAIL[/]
 def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
     """Look at versions, extras, SuiteSparse and its BLAS, caches, clocks, shared memory, permissions, ports, bus.
 
-    With --connect also at the services there: are they alive, is there memory left, do versions fit, who is told to
+    With --connect also at the services there: are they alive, is there memory left, do versions fit, who has to
     wait. A warning is something that works but could be better; with a failure the exit code is 1.
 
     \b

@@ -138,17 +138,17 @@ def command(as_json: bool, **asked: Any) -> None:
         raise click.BadParameter(f"{request.out} does not end in .g2o", param_hint="--out")
     from factorbus.cli.output import console as screen
 
-    def told(result: dict[str, Any]) -> None:
+    def report(result: dict[str, Any]) -> None:
         if as_json:
             screen.document(result)
         else:
             screen.table(_rows(result), title=f"{request.file}, in {request.where}")
 
-    replay(request, told)
+    replay(request, report)
 
 
-def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
-    """Do it, with progress on standard error; returns the document, and hands it to `told` while the map is there."""
+def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
+    """Do it, with progress on standard error; returns the document, and hands it to `report` while the map is there."""
     from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.output import console as screen
@@ -177,7 +177,7 @@ def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lamb
             _draw(request.plot, request.file.name, driven, target, steps)
         result = _document(request, driven, target, steps, last, unsettled, before)
         result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
-        told(result)
+        report(result)
         if request.live:
             _stay()
     return result
@@ -273,7 +273,7 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
 
 
 def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
-    """The same steps, at most so many a second."""
+    """The same steps, at most `pace_hz` a second."""
     begun = time.monotonic()
     for number, step in enumerate(steps):
         if pace_hz is not None:

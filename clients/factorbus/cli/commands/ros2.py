@@ -60,11 +60,11 @@ class NodeOptions:
 @click.option("--letter", default="x", show_default=True, metavar="LETTER", help="Of this robot's keys: one for each.")
 @click.option(
     "--start", type=click.Choice(("odometry", "pose")), default="odometry", show_default=True,
-    help="Where the map begins: where odometry does, or with the first pose that is told.",
+    help="Where the map begins: where odometry does, or with the first pose that is received.",
 )  # fmt: skip
 @click.option(
     "--keyframe", nargs=2, type=Number(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
-    metavar="METRES RADIANS", help="A pose of the map for so much way or turn.",
+    metavar="METRES RADIANS", help="Least way or turn between two poses of the map.",
 )  # fmt: skip
 @click.option(
     "--mount",

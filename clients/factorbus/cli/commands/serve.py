@@ -31,7 +31,7 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     "--insecure",
     is_flag=True,
     default=None,
-    help="Listen to other machines even where whoever reaches the port could read and write.",
+    help="Listen to other machines even where anybody who reaches the port could read and write.",
 )
 @click.option("--journal", metavar="DIR", help="Keep maps in this folder, across restarts and crashes.")
 @click.option(

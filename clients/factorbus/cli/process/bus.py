@@ -31,7 +31,7 @@ def joined_map(address: MapAddress, client: str) -> Iterator["Map"]:
 
 @contextmanager
 def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -> Iterator["Map | None"]:
-    """Map `name`, once there is one; None if it was stopped before.  stopped: waits for so many seconds, at most.
+    """Map `name`, once there is one; None if it was stopped before.  stopped: waits for that many seconds, at most.
 
     Raises Refused, Unavailable.
     """

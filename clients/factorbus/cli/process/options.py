@@ -12,7 +12,7 @@ import click
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Where a service listens that is told nothing else, and where everybody looks for one that is told nothing else.
+# Where a service listens, and where clients look for one, without an address of their own.
 USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
@@ -156,5 +156,5 @@ def ellipses_option(count: int) -> Callable[[F], F]:
         default=count,
         show_default=True,
         metavar="N",
-        help="Show for so many poses and points where they may be, with 95 %.",
+        help="Draw 95 % ellipses of up to N poses and N points.",
     )

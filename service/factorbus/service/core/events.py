@@ -54,7 +54,7 @@ class Arrived(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ArrivedQuestion:
     """A question came in, with its bytes."""
 
     asker: Asker

@@ -1,7 +1,7 @@
 """One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
-    Asked ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
+    ArrivedQuestion ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
                                     (solver thread)     └─▶ InsertBatch       what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
@@ -24,7 +24,7 @@ from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Asker,
     Drained,
     Effect,
@@ -133,17 +133,17 @@ class MapCore:
         self._account.refused(refuse.problem)
         return [replace(refuse, following=self._admission.wanted(client))]
 
-    def ask(self, asked: Asked, now: float) -> list[Effect]:
+    def ask(self, arrived: ArrivedQuestion, now: float) -> list[Effect]:
         """A question came in."""
         try:
             if self._closing is not None:
                 raise self._closing
-            question = parse(asked.question, asked.payload)
+            question = parse(arrived.question, arrived.payload)
         except Problem as problem:
-            return [Refuse(asked.asker, problem)]
+            return [Refuse(arrived.asker, problem)]
         if question.name == "stats":
-            return [Tell(asked.asker, self.stats(now))]
-        return self.read(Read(question, asked.asker), now)
+            return [Tell(arrived.asker, self.stats(now))]
+        return self.read(Read(question, arrived.asker), now)
 
     def read(self, read: Read, now: float) -> list[Effect]:
         """A question that needs the solver's state."""

@@ -50,7 +50,7 @@ class Recovered(NamedTuple):
 def recover(store: Store, map_solver: MapSolver) -> Recovered:
     """Bring `map_solver` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
     saved, whole = _from_checkpoint(store, map_solver)
-    begin = store.at(saved.record) if saved else Last(0, 0, chain.START)
+    begin = store.last_at(saved.record) if saved else Last(0, 0, chain.START)
     history, (other, compared) = _History(store, map_solver), _other_builds(store, saved)
     last, records, differs_from = begin, 0, 0
     for record in store.records(begin.record):

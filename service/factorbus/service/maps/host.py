@@ -25,7 +25,7 @@ from factorbus.service.core.events import (
     Answer,
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Asker,
     Effect,
     InsertBatch,
@@ -122,10 +122,10 @@ class Host:
             effects = self.core.unread(client, refuse)
         self._perform(effects)
 
-    def ask(self, asked: Asked) -> None:
+    def ask(self, question: ArrivedQuestion) -> None:
         """A question came in."""
         with self._lock:
-            effects = self.core.ask(asked, time.monotonic())
+            effects = self.core.ask(question, time.monotonic())
         self._perform(effects)
 
     def read(self, read: Read) -> None:
