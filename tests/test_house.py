@@ -194,7 +194,6 @@ PARAMETERS_LEFT = {
 FILES_LEFT = {
     "service/factorbus/service/solving/apply.py",
     "service/factorbus/solver/kernels/bayes_tree/step.py",
-    "tests/bench/bus.py",
     "tests/service/test_quick_messages.py",
     "tests/solver/test_joints.py",
     "tests/solver/test_sights.py",
