@@ -35,7 +35,7 @@ def connect(
     endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
-    listening_s: give up after so long, and not `timeout_s`, where nobody listens at all; None: wait for whoever comes.
+    listening_s: give up after this, and not `timeout_s`, where nobody listens at all; None: wait for a service to come.
     Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)

@@ -30,7 +30,7 @@ _ALL_AXES = (0, 1, 2, 3, 4, 5)
 
 class FrontEnd:
     """One robot's.  `refused` collects what was not used and why, `remarks` what was taken otherwise than it came, as
-    (topic, what was done); whoever drives this empties both.
+    (topic, what was done); the bridge empties both.
 
     first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
     """
@@ -63,7 +63,7 @@ class FrontEnd:
 
     @property
     def waits_for_pose(self) -> bool:
-        """Nothing goes into the map before a pose is told."""
+        """Nothing goes into the map before a pose is received."""
         return self._wait_for_pose and self._track.keyframe is None
 
     def try_correction(self, value_of: Callable[[int], F64 | None]) -> Transform | None:

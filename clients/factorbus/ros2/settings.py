@@ -1,4 +1,4 @@
-"""What a bridge is told: topics, frames, when there is a keyframe, how certain anything may be."""
+"""The settings of a bridge: topics, frames, when there is a keyframe, how certain anything may be."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ class Floors:
 @dataclass(frozen=True, slots=True)
 class Settings:
     """space: "plane" (se2, point2) or "space" (se3, point3).  letter, landmark_letter: of the keys.
-    start: "odometry": the map begins where odometry does; "pose": with the first pose that is told.
+    start: "odometry": the map begins where odometry does; "pose": with the first pose that is received.
     keyframe_m, keyframe_rad: a keyframe when that far or that much turned since the last.
     mounts: frame of a sensor to T_base_sensor.  tolerance_s: by how much transforms are stamped ahead.
     display_s: least time between paths.

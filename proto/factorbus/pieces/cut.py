@@ -85,7 +85,7 @@ def cut(
     keys (n,), y: their values, Λ (Σ d, Σ d), positive semidefinite to rounding, η (Σ d,) in its range
     constant: c; None: such that the least value is 0
     They come in this order: a number (a factor with H = 0), those of negative weight, the others of one variable, those
-    of two.  Sent so, they are told from what is known of the same variables otherwise.
+    of two.  Sent so, they are distinguished from what is known of the same variables otherwise.
     """
     n, dims = keys.size, np.array(tangent_dims(kinds))
     start = np.cumsum(dims) - dims

@@ -75,7 +75,7 @@ def serve(
     """Keep maps until `stop` is set, then answer everything accepted and return.
 
     `on_ready` gets the endpoints that clients can connect to, once they can.  `on_look` gets the service's health,
-    several times a second: for whoever watches over it.  Raises BadConfig, Problem.
+    several times a second: for a supervisor.  Raises BadConfig, Problem.
     """
     checked_config(config)
     # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.

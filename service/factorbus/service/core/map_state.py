@@ -1,4 +1,4 @@
-"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
+"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: events bring all.
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
     ArrivedQuestion ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
@@ -259,7 +259,7 @@ class MapCore:
         self.variables, self.factors, self._solver_cpu_s = applied.variables, applied.factors, applied.solver_cpu_s
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
-        """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
+        """The map's thread ended by a fault: all that wait for anything, now or later, get that."""
         effects = self.drop(now, problem)
         for insert in self._running.inserts if self._running else ():
             if self._admission.is_open(insert):

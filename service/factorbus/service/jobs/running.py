@@ -119,7 +119,7 @@ class Jobs:
         self._perform(self._dispatch.submit(job, ahead))
 
     def tick(self) -> None:
-        """Give up what has taken too long, and try again whoever has been distrusted for long enough."""
+        """Give up what has taken too long, and try again workers that have been distrusted for long enough."""
         now = time.monotonic()
         for worker in [worker for worker, until in self._until.items() if until < now]:
             del self._until[worker]

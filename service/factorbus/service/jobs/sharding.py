@@ -46,7 +46,7 @@ def work_of(ask: Ask) -> Work:
 
 
 def seconds(work: Work, rates: Rates, shards: int = 1) -> float:
-    """What one of so many shards takes to compute: each worker looks at all features and makes its share of rows."""
+    """What one of `shards` shards takes to compute: each worker looks at all features and makes its share of rows."""
     number_s = rates.stored_s if work.stored else rates.number_s
     return rates.fixed_s + rates.feature_s * work.features + number_s * work.numbers / shards
 

@@ -61,7 +61,7 @@ class WorkerLatency:
         self._known.pop(worker, None)
 
     def look_for(self, suspects: list[str], distrusted: list[str]) -> None:
-        """Time went by: ask again whoever could not be measured, and ask suspects for a sign."""
+        """Time went by: ask again those that could not be measured, and ask suspects for a sign."""
         for worker in self._here - self._asked - set(distrusted):
             if worker in suspects:
                 self._ask(worker, (_SMALL,), {})

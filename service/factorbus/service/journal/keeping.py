@@ -7,8 +7,8 @@
     none     published at once, written now and then, safe when the operating system pleases
 
 When the disk takes nothing: with commit, what was not written did not happen; it is refused, the solver goes back to
-what the journal has, and questions are answered from there.  Else it has been told, so it is kept here and tried again.
-In any case nothing new is taken in until the disk takes something.
+what the journal has, and questions are answered from there.  Else it has been published, so it is kept here and tried
+again.  In any case nothing new is taken in until the disk takes something.
 """
 
 import logging
@@ -40,7 +40,7 @@ Events: TypeAlias = Sequence[Verdict | Stepped]
 
 
 class Listener(Protocol):
-    """Who is told what becomes of the writing; called on the journal's thread."""
+    """What is called with what becomes of the writing, on the journal's thread."""
 
     def kept(self, events: Events) -> None:
         """What came of an InsertBatch is safe."""
@@ -117,7 +117,7 @@ class Keeper:
 
     @property
     def waits(self) -> bool:
-        """Whether what is applied is told only when `Listener.kept` is called."""
+        """Whether what is applied is published only when `Listener.kept` is called."""
         return self._durability == "commit"
 
     def start(self) -> JournalFailed | None:
@@ -137,7 +137,7 @@ class Keeper:
             self._items.put(_Applied(self._number, inserts, events, further))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
-        """Do `call` when all that was handed in so far is told; `dropped` if it never will be."""
+        """Do `call` when all that was handed in so far is published; `dropped` if it never will be."""
         if self.waits:
             self._items.put(_After(call, dropped))
         else:

@@ -149,7 +149,7 @@ class Library:
             raise JournalFailed(path, str(error)) from None
 
     def say(self, text: str) -> None:
-        """Tell whoever else wants the folder who has it."""
+        """Tell other processes that want the folder who has it."""
         self._owned.say(text)
 
     def close(self) -> None:

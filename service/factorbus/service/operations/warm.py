@@ -1,8 +1,8 @@
 """Compile every kernel of the service ahead of its first use: the solver's, those of features, those of the wire.
 
 A cold start is shared out: one process for each core, and each takes one kernel after the other that nobody has
-(`compile_split.py`).  Who has what is told by files, made by whoever comes first; the kernels themselves meet on disk.
-Then this process loads them all.
+(`compile_split.py`).  Files, made by the process that comes first, show who has what; the kernels themselves meet on
+disk.  Then this process loads them all.
 
 It compiles none itself.  Code that has just been compiled and the same from disk are linked in another order, and may
 round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.

@@ -20,7 +20,7 @@ class OtherMode(Problem):
 
 
 class MovedOn(Problem):
-    """The map is not at the revision that whoever wants to drop it has in mind."""
+    """The map is not at the revision that the client who wants to drop it has in mind."""
 
     code = "moved_on"
 
