@@ -3,11 +3,11 @@
 The thread that brings an event takes the lock for the microseconds that the core needs; what the core wants done is
 done after the lock is free again.
 
-There is one InsertBatch at a time, and the thread that has it has the solver.  It goes to the map's own thread, unless it
-is short: then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small
-exchange). That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the
-inline_run): however wrong the guess was, only the client that sent the insert is not heard meanwhile.  An InsertBatch
-ends (Applied) when its messages are sent or in the outbox, so deltas leave in order.
+There is one InsertBatch at a time, and the thread that has it has the solver.  It goes to the map's own thread, unless
+it is short: then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small
+exchange).  That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps
+(the inline_run): however wrong the guess was, only the client that sent the insert is not heard meanwhile.  An
+InsertBatch ends (Applied) when its messages are sent or in the outbox, so deltas leave in order.
 """
 
 import logging
