@@ -57,7 +57,7 @@ CHECKED_TESTS := tests/solver/test_solver_steps.py tests/solver/test_tree.py tes
 	tests/solver/test_joints.py tests/solver/test_worker_threads.py tests/solver/test_columns.py tests/solver/test_renew.py \
 	tests/solver/test_room.py
 # Numba as it is, without what we change in it.
-STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
+STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_jit_arrays.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
 # Three ways, side by side: each has kernels of its own to compile, on one core.
 test-kernels: $(READY_DEV) ## the kernels again: as plain Python, with every index checked, and by Numba as it is
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target stock-kernels checked-kernels plain-kernels

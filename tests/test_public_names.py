@@ -28,15 +28,12 @@ LEFT = {
     # in the solver
     "check_numbers", "collect", "hold",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph",
-    "TooLarge", "UnknownKind", "VariableKind", "check", "connect", "dims_of",
-    "factored", "fetch", "follow", "grown", "judge", "load",
-    "rotation", "rows_size", "spread", "warm", "word",
+    "BadLoss", "BadOption", "BadShape", "FactorKind", "Factored", "Graph", "Problem", "TooLarge", "UnknownKind",
+    "VariableKind", "connect", "factored", "gather", "grown", "label_of", "rotation", "spread", "warm",
     # in the mathematics of inverse depth, or the workers
-    "BadConfig", "Config", "Parts", "checked", "covariance", "do", "jacobians", "judged", "matrices", "own_block",
-    "product", "rays", "rays_of", "rows",
+    "BadConfig", "Config", "Parts", "covariance", "do", "jacobians", "own_block", "rays", "rows",
     # between packages
-    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
+    "read_insert",
 }  # fmt: skip
 
 

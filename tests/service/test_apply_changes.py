@@ -144,7 +144,7 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
 
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
-def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
+def test_a_checkpoint_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
     map_solver = make(MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
     came(map_solver, waiting(gone(4), 6))
     again = MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
@@ -192,7 +192,7 @@ def test_a_fault_in_a_change_of_factors_has_the_solver_replaced(monkeypatch: pyt
     assert map_solver.size == (5, 4)
 
 
-def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_snapshot() -> None:
+def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_checkpoint() -> None:
     """Those that are refused among them: they leave no trace either."""
     records = [[waiting(pose(n), n + 1)] for n in range(5)]
     records += [[waiting(loop(0, 4, 3.5), 6)], [waiting(loop(1, 4, 2.5), 7)]]

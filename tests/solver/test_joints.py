@@ -12,7 +12,7 @@ from factorbus.pieces import MOST, Pieces, cut
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.simulate import manhattan
+from factorbus.simulate import LoopClosures, manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.repair import find_loops, repair
 from factorbus.solver.changing import with_changes
@@ -472,7 +472,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
 
 def _steps(poses: int, keep: int) -> Iterator[Batch]:
     """A pose a step, with the factors to those at most `keep` before it."""
-    for step in manhattan(poses=poses, seed=3, loop_gap=8, block_m=3, loop_share=0.8, sigma_theta_rad=0.005):
+    for step in manhattan(poses=poses, seed=3, loops=LoopClosures(share=0.8, gap=8), block_m=3, sigma_theta_rad=0.005):
         near = []
         for g in step.batch.factors:
             cut = np.ptp(g.keys, axis=1) <= keep

@@ -15,7 +15,7 @@ from naive.random_others import other_steps
 from factorbus.pieces import MOST
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.simulate import city_trees
+from factorbus.simulate import TreeSensor, city_trees
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
@@ -189,8 +189,8 @@ class Window:
 def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_has_it(poses: int) -> None:
     window = Window(keep=30, every=10)
     # What was linearized once and for all is off by the square of the noise, which no window can help.
-    calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sigma_sight_m=0.03)
-    for n, step in enumerate(calm(poses, seed=2, tree_share=0.6, sight_share=0.6)):
+    calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sensor=TreeSensor(sigma_m=0.03, share=0.6))
+    for n, step in enumerate(calm(poses, seed=2, tree_share=0.6)):
         window.take(n, step.batch)
     assert window.widest >= 8, "there are trees in the border"
     half = len(window.sizes) // 2

@@ -8,7 +8,7 @@ import pytest
 
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Change, Factors
-from factorbus.simulate import manhattan
+from factorbus.simulate import LoopClosures, manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.repair import find_loops, repair, weigh
 from factorbus.solver.changing import with_changes
@@ -20,7 +20,7 @@ POSES = 60 if DISABLED else 400
 def streets(seed: int, share: float, poses: int = POSES) -> Iterator[tuple[Batch, dict[int, np.ndarray], list[int]]]:
     """(batch, true values of what is new, which of its factors are false); `share` of the closures are."""
     rng = np.random.default_rng(seed)
-    for number, step in enumerate(manhattan(poses, seed, loop_gap=20)):
+    for number, step in enumerate(manhattan(poses, seed, loops=LoopClosures(gap=20))):
         truth = {k: row for g in step.truth for k, row in zip(g.keys.tolist(), g.values, strict=True)}
         groups, count = list(step.batch.factors), step.batch.factor_count
         loops = sum(int((np.abs(g.keys[:, 1] - g.keys[:, 0]) != 1).sum()) for g in groups)

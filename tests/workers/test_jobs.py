@@ -9,7 +9,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service.jobs.running import do_in_place
-from factorbus.simulate import sphere
+from factorbus.simulate import Spiral, sphere
 from factorbus.solver import SolverError
 from factorbus.solver.starts import descent
 from factorbus.workers import jobs
@@ -43,7 +43,7 @@ def test_the_service_in_place_finds_the_same_bits() -> None:
 
 def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Much noise of rotation and few loops: some 800 iterations, where 500 tries are made."""
-    world = sphere(200, 1, ring=20, rings=20, sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
+    world = sphere(200, 1, spiral=Spiral(20, 20), sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
     payload = codec.encode_graph(Graph(1, 1, merged(step.batch for step in world)))
     early = codec.decode_optimum(jobs.do("batch", payload))
     assert not early.converged

@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.idp.minimal import Parts, factored
 from factorbus.idp.sight import Seen, see
 from factorbus.proto import segments
-from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, rows_size
+from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, new_rows_size
 from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadMessage, TooLarge
@@ -45,7 +45,7 @@ def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
     n, m = ask.sighting.count, ask.sighting.width
     width, rows = m + FEATURE * n, FEATURE * (shard.last - shard.first)
     start = 8 * FEATURE * shard.first * width
-    out = segments.try_array(segment, rows_size(n, m), start, (rows, width)) if rows else None
+    out = segments.try_array(segment, new_rows_size(n, m), start, (rows, width)) if rows else None
     if out is None:
         return False
     Parts(ask.sighting, seen).rows(shard.first, shard.last, out)
@@ -54,7 +54,7 @@ def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
 
 def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
     n, m = ask.sighting.count, ask.sighting.width
-    if (size := rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
+    if (size := new_rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
         raise TooLarge("the answer, which cannot go to shared memory,", size, ANSWER_LIMITS.max_bytes, "bytes")
     rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
     Parts(ask.sighting, seen).rows(shard.first, shard.last, rows)

@@ -1,7 +1,7 @@
-"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
+"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: events bring all.
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
-    Asked ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
+    ArrivedQuestion ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
                                     (solver thread)     └─▶ InsertBatch       what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
@@ -23,7 +23,7 @@ from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Asker,
     Drained,
     Effect,
@@ -132,17 +132,17 @@ class MapCore:
         self._account.refused(refuse.problem)
         return [replace(refuse, following=self._admission.wanted(client))]
 
-    def ask(self, asked: Asked, now: float) -> list[Effect]:
+    def ask(self, arrived: ArrivedQuestion, now: float) -> list[Effect]:
         """A question came in."""
         try:
             if self._closing is not None:
                 raise self._closing
-            question = parse(asked.question, asked.payload)
+            question = parse(arrived.question, arrived.payload)
         except Problem as problem:
-            return [Refuse(asked.asker, problem)]
+            return [Refuse(arrived.asker, problem)]
         if question.name == "stats":
-            return [Tell(asked.asker, self.stats(now))]
-        return self.read(Read(question, asked.asker), now)
+            return [Tell(arrived.asker, self.stats(now))]
+        return self.read(Read(question, arrived.asker), now)
 
     def read(self, read: Read, now: float) -> list[Effect]:
         """A question that needs the solver's state."""
@@ -258,7 +258,7 @@ class MapCore:
         self.variables, self.factors, self._solver_cpu_s = applied.variables, applied.factors, applied.solver_cpu_s
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
-        """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
+        """The map's thread ended by a fault: all that wait for anything, now or later, get that."""
         effects = self.drop(now, problem)
         for insert in self._running.inserts if self._running else ():
             if self._admission.is_open(insert):

@@ -14,7 +14,7 @@ from typing import Any
 
 from factorbus.proto.features import Ask, Shard, answer_size
 from factorbus.proto.features_codec import decode_ask, encode_answer, encode_shard
-from factorbus.proto.limits import Limits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.service.core.events import Asker
@@ -66,7 +66,7 @@ class FeatureQuestions:
         latencies: WorkerLatency,
         reply: Callable[[Asker, bytes], None],
         refuse: Callable[[Asker, Any], None],
-        limits: Limits,
+        limits: MessageLimits,
         most: int,
         deadline_s: float,
         room: Room = _UNBOUNDED,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.limits import ANSWER_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
 from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
@@ -16,7 +16,7 @@ from factorbus.solver.kernels.graph import group_table as gt
 _GROUPS, _MOST_GROUPS = 30, 512
 
 
-def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
+def read_insert(asker: Asker, client: str, payload: bytes, limits: MessageLimits, now: float) -> Arrived | Refuse:
     """The arrival of the insert in `payload`; a refusal when not even its sequence number can be read.
 
     A message that is wrong inside still uses up its number, so that the ones after it need not wait for it; whether it
@@ -46,7 +46,7 @@ def read_again(payload: bytes) -> tuple[int, Insert | ParsedInsert | Problem]:
         return message_digest(payload), problem
 
 
-def try_parse(payload: bytes, limits: Limits) -> tuple[int, int, int, ParsedInsert] | None:
+def try_parse(payload: bytes, limits: MessageLimits) -> tuple[int, int, int, ParsedInsert] | None:
     """(sequence, epoch, digest, content) of an insert that only adds and that `codec.decode_insert` accepts; None: it
     has changes or fields of a later version, or there is something wrong with it, which that says."""
     if len(payload) > limits.max_bytes:

@@ -1,15 +1,15 @@
-"""When a copy of the solver's state is due: after so much of steps that a restart would make again."""
+"""When a journal's next checkpoint is due."""
 
 import threading
 
 _SHARE = 0.05  # of the time that steps take, for copies of the solver's state
 
 
-class SnapshotPlan:
+class CheckpointPlan:
     """When the solver's state is to be written next, and the thread that does.
 
     every_s: of steps.  steps_s: of those that a restart would make again already.  differs: what is noted beside each,
-    see `Saved`.
+    see `Checkpoint`.
     """
 
     def __init__(self, every_s: float, steps_s: float = 0.0, differs: str = "") -> None:
