@@ -142,6 +142,25 @@ def test_every_mode_ends_at_the_optimum_of_such_a_loop(drift_deg: float, poses: 
     assert solver.chi2() == pytest.approx(ring_optimum(drift_deg, poses), rel=1e-6)
 
 
+@pytest.mark.parametrize(("poses", "optimum"), [(5000, 60.9192), (8000, 97.7466), (20000, 245.0561)])
+def test_many_loops_that_contradict_a_long_drive_mildly_end_at_the_optimum(poses: int, optimum: float) -> None:
+    """Over several hills, or one of 33 steps.  GTSAM's Gauss-Newton from odometry: 60.920 and 245.061 with 5,000 and
+    20,000 poses, in its residual; damped steps were at 278 after 375 of them."""
+    drive = Draft().se2(X[0], (0, 0, 0), fixed=True)
+    for i in range(1, poses):
+        drive.se2(X[0] + i).between_se2(X[0] + i - 1, X[0] + i, (1, 0, 0.01), sigmas=(0.1, 0.1, 0.05))
+    loops = Draft()
+    for i in range(0, poses - 60, 40):
+        loops.between_se2(X[0] + i, X[0] + i + 50, (47, 12, 0.5), sigmas=(1, 1, 0.5))
+    solver = Solver()
+    put(solver, drive)
+    assert put(solver, loops).converged
+    finish(solver, 3)
+    assert solver.chi2() == pytest.approx(optimum, rel=1e-5)
+    innocent = put(solver, Draft().se2("q0").between_se2(X[0] + 100, "q0", (1, 0, 0), sigmas=(0.1, 0.1, 0.05)))
+    assert (innocent.strategy, innocent.converged) == ("extend", True)
+
+
 @cache
 def ring_optimum(drift_deg: float, poses: int) -> float:
     """χ² of the batch, from several starts."""

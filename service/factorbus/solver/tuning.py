@@ -46,8 +46,8 @@ class Tuning:
     All modes:
     chi2_epsilon                  a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A
                                   step whose new factors add less solves nothing, and no step goes on for less
-    max_nonmonotone_steps         where an undamped step would raise χ², at most this many in a row may, until it is
-                                  lower than before; else they are taken back, and damping follows.  0: damped at once
+    max_nonmonotone_steps         where an undamped step would raise χ², it and more may, until χ² is lower than before:
+                                  this many in all.  Else they are taken back, and damping follows.  0: damped at once
     converge_tolerance            `Options.batch_tolerance` of a step that is to converge,
     converge_max_iterations       and its `Options.max_iterations`
 
@@ -78,7 +78,7 @@ class Tuning:
     constrain_last_pose: bool = True
     constrain_recent_poses: int = 1
     chi2_epsilon: float = 1e-12
-    max_nonmonotone_steps: int = 20
+    max_nonmonotone_steps: int = 50
     converge_tolerance: float = 1e-14
     converge_max_iterations: int = 500
 

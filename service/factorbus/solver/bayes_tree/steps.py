@@ -43,6 +43,7 @@ _STILL = 0.1
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
+_STALLS = "a step with nothing new did not lower χ²: Levenberg-Marquardt to the optimum"
 _new = tuple.__new__
 
 
@@ -89,7 +90,7 @@ class TreeSteps:
             raise
         compiled = clock() if clock else 0.0
         self._held = False
-        if not settle and not tree.state.item(tl.S_AFTER):
+        if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
             return self._account(started, compiled, None, because)
         course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._account(started, compiled, course, because)
@@ -141,6 +142,14 @@ class TreeSteps:
             return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
 
+    @property
+    def _stalls(self) -> bool:
+        """Whether the tree's last step, with nothing new, left more to do and lowered χ² by less than that."""
+        if not self._tree.state.item(tl.S_CONTINUES) or not self.unfinished:
+            return False
+        chi2, before = self._tree.account.item(tl.A_CHI2), self._tree.account.item(tl.A_BEFORE)
+        return before - chi2 <= FINISHED * (max(chi2, 0.0) + LEAST_CHI2)
+
     def _is_within(self, share: float, chi2: float) -> bool:
         """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
         return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._tree.account.item(tl.A_LEAST) + LEAST_CHI2)
@@ -173,13 +182,13 @@ class TreeSteps:
         course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
         continues = self._graph.mark() == self._mark
         goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
-        if settle or worse or rises or goes_on:
+        if settle or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
             if not worse:
                 tree.exchange()
             course = self._batch(before, settle, continues)
-            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON
+            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON if goes_on else _STALLS
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
                 course.converged = True

@@ -65,8 +65,8 @@ class StoppingRule:
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
     polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
-    nonmonotone: where the first undamped step would raise χ², at most this many in a row are made all the same, until
-    χ² is lower than before them; if it never is, they are taken back.
+    nonmonotone: where an undamped step would raise χ², it is made all the same, and others after it until χ² is lower
+    than before them: at most this many in all.  If it never is, they are taken back, and damped ones follow.
     """
 
     tolerance: float
@@ -137,8 +137,9 @@ def minimize(
             if course.converged:
                 break
             if undamped and hills:
-                over, hills = _go_over_hill(problem, course, reached, hills), 0
-                if over:
+                made = _go_over_hill(problem, course, reached, hills)
+                hills = hills - made if made else 0
+                if made:
                     continue
                 if damping > 0.0:
                     course.damping = damping
@@ -180,9 +181,9 @@ def glide(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> M
     return course
 
 
-def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, most: int) -> bool:
+def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, most: int) -> int:
     """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
-    first, which led to χ² `reached`.
+    first, which led to χ² `reached`.  Gives how many were made; 0: they were taken back.
 
     What turns by much in one step is far off in the model of the second order: χ² rises in the first step, as the
     turned parts are stretched, and the next ones make them right.  Damped steps go around that hill in hundreds.
@@ -194,13 +195,13 @@ def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, m
         problem.accept()
         if reached < course.chi2:
             course.chi2, course.iterations = reached, course.iterations + made
-            return True
+            return made
         course.factorizations += 1
         if problem.factorize(0.0) >= 0 or _is_rounding(problem.decrease(), reached):
             break
         reached = problem.linearize_at(problem.step())
     problem.go_back()
-    return False
+    return 0
 
 
 def _polish(problem: LeastSquares, course: Minimization, most: int) -> None:
