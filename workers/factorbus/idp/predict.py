@@ -7,7 +7,7 @@ import numpy as np
 from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import pixels as kernels
 from factorbus.idp.kernels.compile import F64, I64
-from factorbus.idp.lenses import lens_of
+from factorbus.idp.lenses import camera_model
 from factorbus.idp.sight import contiguous
 from factorbus.proto.camera import Camera
 from factorbus.proto.features import CAMERA_STATE, FEATURE
@@ -50,10 +50,9 @@ class Points(NamedTuple):
 def predict(camera: Camera, state: F64, y: F64) -> Predicted:
     """Pixels of the features y (n, 6) from camera state (13,).  Raises BadShape."""
     _check(state, y)
-    code, lens = lens_of(camera)
     n = len(y)
     seen = Predicted(np.empty((n, 2)), np.empty((n, 2, CAMERA_STATE)), np.empty((n, 2, FEATURE)), np.empty(n, np.int64))
-    kernels.observe(code, lens, float(camera.width), float(camera.height), contiguous(state), contiguous(y), *seen)
+    kernels.observe(camera_model(camera), contiguous(state), contiguous(y), *seen)
     return seen
 
 
