@@ -25,7 +25,7 @@ def sighting() -> Sighting:
 
 
 def done(ask: Ask, first: int = 0, last: int = N) -> ShardDone:
-    return decode_shard_done(jobs.do("idp", encode_shard(Shard(encode_ask(ask), first, last))))
+    return decode_shard_done(jobs.run_job("idp", encode_shard(Shard(encode_ask(ask), first, last))))
 
 
 def whole(sighting: Sighting) -> np.ndarray:

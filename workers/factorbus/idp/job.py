@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.idp.minimal import NewRows, covariance_factors
-from factorbus.idp.sight import Seen, see
+from factorbus.idp.new_features import Seen, see
 from factorbus.proto import segments
 from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, rows_size
 from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done

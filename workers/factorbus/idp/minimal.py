@@ -7,7 +7,7 @@ import numpy as np
 from factorbus.idp.classical import Counted
 from factorbus.idp.kernels import minimal as kernels
 from factorbus.idp.kernels.compile import F64
-from factorbus.idp.sight import Seen, contiguous
+from factorbus.idp.new_features import Seen, contiguous
 from factorbus.proto.features import FEATURE, Sighting
 
 

@@ -8,7 +8,7 @@ from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import pixels as kernels
 from factorbus.idp.kernels.compile import F64, I64
 from factorbus.idp.lenses import camera_model
-from factorbus.idp.sight import contiguous
+from factorbus.idp.new_features import contiguous
 from factorbus.proto.camera import Camera
 from factorbus.proto.features import CAMERA_STATE, FEATURE
 from factorbus.proto.problems import BadShape
@@ -57,7 +57,7 @@ def predict(camera: Camera, state: F64, y: F64) -> Predicted:
 
 
 def to_points(state: F64, y: F64, covariance: F64) -> Points:
-    """The features y (n, 6) with covariance (n, 6, 6) as points, judged from camera state (13,).  Raises BadShape."""
+    """The features y (n, 6) with covariance (n, 6, 6) as points, with their linearity as seen from camera state (13,).  Raises BadShape."""
     _check(state, y)
     n = len(y)
     if covariance.shape != (n, FEATURE, FEATURE):

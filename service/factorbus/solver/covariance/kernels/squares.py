@@ -58,7 +58,9 @@ def working_size(p: int, m: int) -> int:
 
 
 @part
-def gather_separator(tree: Tree, c: int, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int) -> None:
+def gather_separator_block(
+    tree: Tree, c: int, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int
+) -> None:
     """Σ_SS of clique c into its square at `target`, from that of the parent at `source`.
 
     column (n,), runs (5 w,): scratch
