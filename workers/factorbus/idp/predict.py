@@ -57,7 +57,10 @@ def predict(camera: Camera, state: F64, y: F64) -> Predicted:
 
 
 def to_points(state: F64, y: F64, covariance: F64) -> Points:
-    """The features y (n, 6) with covariance (n, 6, 6) as points, with their linearity as seen from camera state (13,).  Raises BadShape."""
+    """The features y (n, 6) with covariance (n, 6, 6) as points, with their linearity from camera state (13,).
+
+    Raises BadShape.
+    """
     _check(state, y)
     n = len(y)
     if covariance.shape != (n, FEATURE, FEATURE):
