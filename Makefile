@@ -12,7 +12,7 @@ READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
 
 .DEFAULT_GOAL := help
-.PHONY: help pictures docs setup demo live test test-data test-kernels test-faults lint check crash bench wheel clean
+.PHONY: help pictures docs setup demo live test test-data test-kernels plain-kernels checked-kernels stock-kernels test-faults lint check crash bench wheel clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -54,14 +54,22 @@ KERNEL_TESTS := tests/solver/test_factor_kinds.py tests/solver/test_cholesky_ker
 	tests/solver/test_sights.py tests/workers/test_idp_lenses.py tests/workers/test_idp_features.py
 # A kernel that counts from the end of an array without saying so would read what is before it.
 CHECKED_TESTS := tests/solver/test_solver_steps.py tests/solver/test_tree.py tests/solver/test_covariance.py \
-	tests/solver/test_joints.py tests/solver/test_worker_threads.py tests/solver/test_packing.py tests/solver/test_renew.py \
+	tests/solver/test_joints.py tests/solver/test_worker_threads.py tests/solver/test_columns.py tests/solver/test_renew.py \
 	tests/solver/test_room.py
 # Numba as it is, without what we change in it.
-STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
+STOCK_TESTS := tests/solver/test_jit.py tests/solver/test_jit_arrays.py tests/solver/test_cholesky_kernels.py tests/solver/test_factor_kinds.py
+# Three ways, side by side: each has kernels of its own to compile, on one core.
 test-kernels: $(READY_DEV) ## the kernels again: as plain Python, with every index checked, and by Numba as it is
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target stock-kernels checked-kernels plain-kernels
+
+plain-kernels:
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(ARGS)
+
+checked-kernels:
 	@NUMBA_BOUNDSCHECK=1 $(BIN)/factorbus warm
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNEL_TESTS) $(CHECKED_TESTS) $(ARGS)
+
+stock-kernels:
 	FACTORBUS_STOCK_NUMBA=1 $(BIN)/python -m pytest $(STOCK_TESTS) $(ARGS)
 
 test-faults: $(READY_DEV) ## workers killed and frozen in mid-job, 400 times

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.service.config import load
+from factorbus.service.config import load_config
 from factorbus.service.core.account import Histogram
 from factorbus.service.operations.metrics import families
 
@@ -67,7 +67,7 @@ def test_the_dashboard_is_one() -> None:
 
 @pytest.mark.parametrize("file", ["systemd/serve.toml", "docker/serve.toml"])
 def test_the_settings_are_settings(file: str) -> None:
-    assert load(DEPLOY / file).metrics
+    assert load_config(DEPLOY / file).metrics
 
 
 def test_what_the_image_copies_is_there() -> None:
@@ -107,7 +107,7 @@ def test_what_the_manifests_configure_is_a_configuration(tmp_path: Path) -> None
     (made,) = re.findall(r"printf '(.*?)'", (DEPLOY / "kubernetes" / "solver.yaml").read_text())
     settings = tmp_path / "serve.toml"
     settings.write_text(made.replace("\\n", "\n") % ("2", "factorbus-solver-2"))
-    config = load(settings, connect=("tls/router:7447",))
+    config = load_config(settings, connect=("tls/router:7447",))
     assert (config.maps, config.journal) == ("shard2-*", "/var/lib/factorbus")
 
 
@@ -141,4 +141,4 @@ def test_compose_is_of_one_piece() -> None:
             else:
                 assert source in compose["volumes"]
     targets = [volume.split(":")[1] for volume in compose["services"]["solver"]["volumes"]]
-    assert load(DEPLOY / "docker" / "serve.toml").journal in targets
+    assert load_config(DEPLOY / "docker" / "serve.toml").journal in targets

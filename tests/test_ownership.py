@@ -15,9 +15,9 @@ import pytest
 from factorbus.cli.doctor.checks import cache
 from factorbus.cli.output.exits import REFUSED
 from factorbus.journal.bundle import export_map, import_map
+from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.lock import own
 from factorbus.journal.problems import UnsafeJournal
-from factorbus.journal.snapshots import file_of, write_snapshot
 from factorbus.journal.store import create, open_store
 from factorbus.ownership import UnsafeFolder, check_file, check_folder, folders, make_private, why_unsafe
 
@@ -195,7 +195,7 @@ def test_journals_are_for_their_owner_alone(folder: Path) -> None:
         owned = own(folder / "maps")
         assert owned is not None
         store = create(folder / "maps" / "m", "m", "inc-l", {}, 77, "commit")
-        write_snapshot(file_of(folder / "maps" / "m", 1), {"a": 1})
+        write_checkpoint(file_of(folder / "maps" / "m", 1), {"a": 1})
         assert private(folder / "maps")
         store.close()
         export_map(folder / "maps" / "m", folder / "m.fbmap")

@@ -26,16 +26,9 @@ TWINS = (
 )
 STARTS = {"main"}
 LEFT = {
-    # in the solver
-    "add_end", "check_numbers", "ends_of", "extend_add", "has_room", "list_moved", "solve_rows",
     # in the solver and outside it
-    "BadLoss", "BadOption", "BadShape", "Course", "FactorKind", "Graph", "Problem", "Rule",
-    "Space", "TooLarge", "UnknownKind", "VariableKind", "begin", "check", "compiled_seconds", "connect",
-    "factor_chi2", "follow", "grown", "is_relative", "label_of", "load", "machine", "note", "placed", "rotation",
-    "warm", "word",
-    # between packages
-    "Answer", "Limits", "carried", "demo", "drive", "flag", "inverse", "named", "read_insert", "rotated", "seconds",
-    "checked", "product",
+    "BadLoss", "BadOption", "BadShape", "FactorKind", "Graph", "PoseSpace", "TooLarge", "UnknownKind", "VariableKind",
+    "grown", "warm",
 }  # fmt: skip
 
 

@@ -67,14 +67,14 @@ def test_the_filter_front_end_of_the_workers_guide(tmp_path: Path) -> None:
 
 
 def test_the_services_guide(tmp_path: Path) -> None:
-    from factorbus.service.config import load
+    from factorbus.service.config import load_config
 
     (console,) = (block for block in blocks("service/README.md") if block[0] == "console")
     with walker(tmp_path) as run:
         run(*console)
     (settings,) = (text for language, text in blocks("service/README.md") if language == "toml")
     (tmp_path / "serve.toml").write_text(settings)
-    assert load(tmp_path / "serve.toml").limits.waiting == 1024
+    assert load_config(tmp_path / "serve.toml").limits.waiting == 1024
 
 
 def test_every_block_of_every_guide_is_run_or_checked() -> None:

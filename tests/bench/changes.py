@@ -55,7 +55,7 @@ def run(poses: int, changes: int, folder: Path) -> dict[str, Any]:
                 pending_insert.result(600)
             burst_s = time.perf_counter() - begun
             after = changer.stats()
-        largest = max((path.stat().st_size for path in journal.rglob("snapshot-*.fbs")), default=0)
+        largest = max((path.stat().st_size for path in journal.rglob("checkpoint-*.fbs")), default=0)
     return {
         "poses": poses,
         "changes": changes,
@@ -64,7 +64,7 @@ def run(poses: int, changes: int, folder: Path) -> dict[str, Any]:
         "in_burst_s": [round(each, 4) for each in busy],
         "burst_s": round(burst_s, 2),
         "solver_cpu_s": round(after["solver_cpu_s"] - before["solver_cpu_s"], 2),
-        "snapshot_mb": round(largest / 1e6, 1),
+        "checkpoint_mb": round(largest / 1e6, 1),
         "cores": os.cpu_count(),
         "load": os.getloadavg()[0],
     }
@@ -133,7 +133,7 @@ def main() -> None:
     print(f"  tiny insert before the burst    {found['quiet_s']} s")
     print(f"  tiny insert in the burst        {found['in_burst_s']} s")
     print(f"  all changes answered after      {found['burst_s']} s, {found['solver_cpu_s']} s of a core")
-    print(f"  largest snapshot                {found['snapshot_mb']} MB;  load {found['load']:.1f}")
+    print(f"  largest checkpoint                {found['checkpoint_mb']} MB;  load {found['load']:.1f}")
 
 
 if __name__ == "__main__":

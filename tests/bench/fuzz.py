@@ -31,7 +31,7 @@ from bench.mutants import Mutator, good_insert
 from processes import processes
 
 from factorbus.proto import codec, features_codec, keys
-from factorbus.proto.limits import Limits as MessageLimits
+from factorbus.proto.limits import MessageLimits as MessageLimits
 from factorbus.proto.messages import Batch, Graph, Insert
 from factorbus.proto.problems import Problem, Refused
 from factorbus.service.config import Limits

@@ -19,6 +19,7 @@ from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import Frame, MonocularWorld, monocular
 from factorbus.solver import Options, Solver
+from factorbus.solver.changing import with_converted
 from factorbus.solver.kernels.model import layout as at
 
 LOSS = ("dcs", 4.0)
@@ -131,7 +132,7 @@ class Near:
         self.solver.stage(batch.batch() if isinstance(batch, Draft) else batch)
         self.reports.append(self.solver.step(settle=settle))
         if convert_below and (keys := self.solver.convertible(convert_below)).size:
-            self.solver, report = self.solver.with_points(keys)
+            self.solver, report = with_converted(self.solver, keys)
             self.reports.append(report)
         for group in self.solver.changed():
             self._values.update(zip(group.keys.tolist(), group.values, strict=True))

@@ -48,7 +48,7 @@ def counted(n: int, existing: int = 0) -> dict[str, int]:
 
 def half_count(sighting: Any, seen: Any) -> int:
     """Multiplications of the upper half."""
-    parts = minimal.NewRows(sighting, seen)
+    parts = minimal.FeatureRows(sighting, seen)
     return parts.multiplications + parts.half(0, len(seen.y)).multiplications
 
 

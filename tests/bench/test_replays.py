@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from naive.cholmod import cholmod
 
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.simulate import WORLDS
+from factorbus.simulate import WORLDS, LoopClosures, TreeSensor
 from factorbus.solver import Options, Solver
 
 POSES = 70
 REPLAYS = {
-    "poses": [step.batch for step in WORLDS["manhattan"](POSES, 3, loop_gap=8)],
+    "poses": [step.batch for step in WORLDS["manhattan"](POSES, 3, loops=LoopClosures(gap=8))],
     "landmarks": [step.batch for step in WORLDS["city_trees"](POSES, 2)],
-    "bearings": [step.batch for step in WORLDS["city_trees"](POSES, 2, sensor="bearing_range_se2")],
+    "bearings": [step.batch for step in WORLDS["city_trees"](POSES, 2, sensor=TreeSensor("bearing_range_se2"))],
     "space": [step.batch for step in WORLDS["sphere"](POSES, 2)],
 }
 

@@ -21,9 +21,9 @@ from factorbus.cli.main import main
 from factorbus.cli.output.exits import FAILED, INTERRUPTED, OK, REFUSED
 from factorbus.cli.process.children import service
 from factorbus.client import connect
-from factorbus.datasets import CATALOGUE, named
+from factorbus.datasets import CATALOGUE, dataset_named
 from factorbus.formats import read
-from factorbus.simulate import sphere
+from factorbus.simulate import Spiral, sphere
 from factorbus.solver import solve_batch
 from factorbus.solver.starts import descent
 
@@ -153,7 +153,7 @@ def test_intel_ends_at_the_reference_optimum(datasets: Path) -> None:
     ],
 )
 def test_a_data_set_over_the_bus_ends_at_the_reference_optimum(datasets: Path, name: str) -> None:
-    known = named(name, CATALOGUE)
+    known = dataset_named(name, CATALOGUE)
     found = replayed(datasets / known.file, timeout_s=1800)
     print(
         f"{name}: {found['seconds']:.0f} s, solver {found['solver_cpu_s']:.1f} s CPU, step p99 "
@@ -279,7 +279,7 @@ def test_an_adopted_optimum_that_had_not_converged_is_called_so(
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_a_drive_over_a_sphere_of_much_noise_ends_at_the_best_of_the_starts(seed: int) -> None:
-    world = sphere(300, seed, ring=25, rings=12, sigma_rotation_rad=0.25)
+    world = sphere(300, seed, spiral=Spiral(25, 12), sigma_rotation_rad=0.25)
     target, batches = LocalMap("auto"), [step.batch for step in world]
     for batch in batches:
         target.send(batch)

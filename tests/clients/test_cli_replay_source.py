@@ -10,7 +10,7 @@ import pytest
 from factorbus.cli.driving.replay_source import source_of
 from factorbus.cli.main import main
 from factorbus.cli.output.exits import BAD_FILE, Stopped
-from factorbus.datasets import CATALOGUE, Places, named
+from factorbus.datasets import CATALOGUE, Places, dataset_named
 
 GRAPH = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
 
@@ -43,7 +43,7 @@ def test_what_only_the_wheel_has_is_converted_into_the_cache(places: Places, tmp
     toro = b"VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\n"
     wheel = tmp_path / "Data"
     wheel.mkdir()
-    known = named("w10000_toro", CATALOGUE)
+    known = dataset_named("w10000_toro", CATALOGUE)
     assert known.wheel is not None
     (wheel / known.wheel.paths[0]).write_bytes(toro)
     source = replace(known.wheel, sha256=(hashlib.sha256(toro).hexdigest(),))

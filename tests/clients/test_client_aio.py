@@ -18,7 +18,7 @@ class Source:
         return lambda: self.callbacks.remove(callback)
 
     def snapshot(self):
-        from factorbus.client.mirror import Snapshot
+        from factorbus.client.snapshot import Snapshot
 
         keys = np.arange(self.last.revision)
         return Snapshot(1, self.last.revision, {"point2": (keys, np.ones((len(keys), 2)))}, {"point2": keys})

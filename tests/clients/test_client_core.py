@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from factorbus.client.draft import Draft
 from factorbus.client.following import Following, tables_of
-from factorbus.client.replies import Again, AnswerReply, Failure, Silence, TimedOut, judge
+from factorbus.client.replies import Again, AnswerReply, Failure, Silence, TimedOut, interpret_reply
 from factorbus.client.table import Table
 from factorbus.client.window import Window
 from factorbus.proto.codec import encode_problem
@@ -32,22 +32,22 @@ from factorbus.proto.symbols import symbol
 
 
 def test_an_answer_is_handed_on() -> None:
-    assert judge(AnswerReply(b"x"), 1) == b"x"
+    assert interpret_reply(AnswerReply(b"x"), 1) == b"x"
 
 
 def test_silence_is_asked_again_ever_more_slowly() -> None:
-    pauses = [again.pause_s for n in range(1, 7) if isinstance(again := judge(Silence(), n), Again)]
+    pauses = [again.pause_s for n in range(1, 7) if isinstance(again := interpret_reply(Silence(), n), Again)]
     assert pauses == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
 
 
 def test_a_timeout_is_asked_again_at_once() -> None:
-    again = judge(TimedOut(), 3)
+    again = interpret_reply(TimedOut(), 3)
     assert isinstance(again, Again)
     assert again.pause_s == 0.0
 
 
 def test_busy_is_asked_again_when_it_says() -> None:
-    again = judge(Failure(encode_problem(Busy(256, 0.37))), 1)
+    again = interpret_reply(Failure(encode_problem(Busy(256, 0.37))), 1)
     assert isinstance(again, Again)
     assert again.pause_s == 0.37
 
@@ -56,26 +56,26 @@ def test_busy_is_asked_again_when_it_says() -> None:
 def test_busy_with_a_senseless_time_is_asked_again_soon(seconds: object) -> None:
     busy = Busy(1, 1.0)
     busy.detail["retry_after_s"] = seconds
-    again = judge(Failure(encode_problem(busy)), 1)
+    again = interpret_reply(Failure(encode_problem(busy)), 1)
     assert isinstance(again, Again)
     assert 0 < again.pause_s < 1
 
 
 def test_a_service_that_stops_is_asked_again() -> None:
-    assert isinstance(judge(Failure(encode_problem(ShuttingDown())), 1), Again)
+    assert isinstance(interpret_reply(Failure(encode_problem(ShuttingDown())), 1), Again)
 
 
 def test_other_problems_are_final_unless_they_pass() -> None:
-    epoch = judge(Failure(encode_problem(WrongEpoch(1, 2))), 1)
+    epoch = interpret_reply(Failure(encode_problem(WrongEpoch(1, 2))), 1)
     assert isinstance(epoch, Refused)
     assert (epoch.code, epoch.detail["epoch"]) == ("wrong_epoch", 2)
     parked = Failure(encode_problem(BadSequence("c", 7, "6 first", 6)))
-    assert isinstance(judge(parked, 1), Refused)
-    assert isinstance(judge(parked, 1, lambda refused: refused.detail["next"] == 6), Again)
+    assert isinstance(interpret_reply(parked, 1), Refused)
+    assert isinstance(interpret_reply(parked, 1, lambda refused: refused.detail["next"] == 6), Again)
 
 
 def test_a_failure_nobody_can_read_is_a_problem() -> None:
-    problem = judge(Failure(b"\xc1"), 1)
+    problem = interpret_reply(Failure(b"\xc1"), 1)
     assert isinstance(problem, Problem)
     assert problem.code == "bad_message"
 

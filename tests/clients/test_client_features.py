@@ -12,7 +12,7 @@ from factorbus import idp
 from factorbus.client.filter_state import factored, grown
 from factorbus.client.shared_memory_pool import SharedMemoryPool
 from factorbus.idp import job, minimal
-from factorbus.proto.features import Answer, Ask, Done, Shard, ShardDone, Sighting
+from factorbus.proto.features import Ask, Done, FeaturesAnswer, Shard, ShardDone, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_answer, encode_ask, encode_shard
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.segments import PAGE
@@ -27,7 +27,7 @@ def seen() -> tuple[Sighting, np.ndarray, np.ndarray]:
     return sighting, P, minimal.covariance(P, sighting, idp.see(sighting)).P
 
 
-def answered(ask: Ask, cuts: tuple[tuple[int, int], ...] = CUTS) -> Answer:
+def answered(ask: Ask, cuts: tuple[tuple[int, int], ...] = CUTS) -> FeaturesAnswer:
     """What workers would answer, over the wire's bytes."""
     data = encode_ask(ask)
     shards = [(job.do(encode_shard(Shard(data, *cut))), f"w{cut[0]}", 0.5) for cut in cuts]
@@ -55,7 +55,7 @@ def test_rows_in_memory_and_rows_that_came_as_bytes_are_put_together(seen) -> No
     here = answered(Ask(sighting, "rows", allocation.segment), CUTS[:2])
     elsewhere = answered(Ask(sighting, "rows"), CUTS[2:])
     assert [done.shard.stored for done in here.shards] == [True, True]
-    found = grown(np.zeros(m), P, sighting, Answer((*here.shards, *elsewhere.shards), True), allocation.matrix)
+    found = grown(np.zeros(m), P, sighting, FeaturesAnswer((*here.shards, *elsewhere.shards), True), allocation.matrix)
     assert found.P.tobytes() == after.tobytes()
     pool.settle(allocation, clean=False)
     pool.close()
@@ -81,10 +81,10 @@ def test_no_pixels_leave_everything_as_it_was(seen) -> None:
     assert (found.x.tobytes(), found.P.tobytes(), found.y.shape) == (x.tobytes(), P.tobytes(), (0, 6))
 
 
-def broken(change: Callable[[Done], Done | None]) -> Callable[[Answer], Answer]:
+def broken(change: Callable[[Done], Done | None]) -> Callable[[FeaturesAnswer], FeaturesAnswer]:
     """An answer with its middle shard changed, or left out."""
 
-    def apply(answer: Answer) -> Answer:
+    def apply(answer: FeaturesAnswer) -> FeaturesAnswer:
         first, middle, last = answer.shards
         changed = change(middle)
         return answer._replace(shards=(first, changed, last) if changed else (first, last))

@@ -10,7 +10,7 @@ from factorbus.client.following import Following, tables_of
 from factorbus.proto import codec
 from factorbus.proto.camera import Camera
 from factorbus.proto.messages import Delta, Estimate, Insert, Variables
-from factorbus.proto.problems import BadLoss, BadShape
+from factorbus.proto.problems import BadInformation, BadLoss, BadShape
 from factorbus.proto.symbols import symbol
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors"
@@ -62,3 +62,16 @@ def test_a_delta_of_everything_lets_go_of_what_there_was() -> None:
     assert following.delta(whole) == [], "it has been seen"
     after = Delta(7, 5, 4, (point,))
     assert following.delta(after) == [after]
+
+
+@pytest.mark.parametrize(
+    ("certainty", "words"),
+    [
+        ({}, "no sigma_rho"),
+        ({"sigma_pixel": 1.0}, "no sigma_rho"),
+        ({"sigma_rho": 1.0, "sigma_pixels": 1.0}, "no keyword 'sigma_pixels'.*sigma_pixel"),
+    ],
+)
+def test_the_certainty_of_a_first_observation_is_checked_by_name(certainty: dict[str, float], words: str) -> None:
+    with pytest.raises(BadInformation, match=words):
+        Draft().idp_first("x1", "f1", RADTAN, (330, 250), 0.25, **certainty)

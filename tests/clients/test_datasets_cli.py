@@ -13,7 +13,7 @@ import pytest
 from dataset_sources import Answer, Site, raw_files, written_back
 
 from factorbus.cli.main import main
-from factorbus.datasets import CATALOGUE, named
+from factorbus.datasets import CATALOGUE, dataset_named
 from factorbus.datasets.places import Places
 
 
@@ -33,7 +33,7 @@ def site() -> Iterator[Site]:
 
 
 def serve(site: Site, name: str, content: bytes) -> None:
-    source = named(name, CATALOGUE).download
+    source = dataset_named(name, CATALOGUE).download
     assert source is not None
     site.holds(source.repository, source.commit, source.paths[0], Answer(content))
 

@@ -10,7 +10,7 @@ from dataset_sources import written_back
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorbus.datasets import CATALOGUE, Dataset, convert, named
+from factorbus.datasets import CATALOGUE, Dataset, convert, dataset_named
 from factorbus.datasets.errors import BadSource
 from factorbus.datasets.places import Places
 
@@ -131,7 +131,7 @@ def test_no_bytes_make_it_fail_otherwise(content: bytes) -> None:
 @pytest.mark.parametrize("name", ["manhattan3500", "city10000", "citytrees10000", "killian", "victoria_park"])
 def test_real_sources_to_the_last_bit(datasets: Path, name: str) -> None:
     """The source written back has the source's own checksum, so it is the source; converted, it has the other one."""
-    dataset = named(name, CATALOGUE)
+    dataset = dataset_named(name, CATALOGUE)
     assert dataset.download is not None
     source = written_back(name, datasets)
     assert sha256(source) == dataset.download.sha256[0]
@@ -140,7 +140,7 @@ def test_real_sources_to_the_last_bit(datasets: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["w10000_toro", "victoria_park"])
 def test_what_the_gtsam_wheel_ships_to_the_last_bit(name: str) -> None:
-    folder, dataset = Places.of_this_machine().wheel, named(name, CATALOGUE)
+    folder, dataset = Places.of_this_machine().wheel, dataset_named(name, CATALOGUE)
     if folder is None:
         pytest.skip("gtsam is not installed: pip install 'factorbus[bench]'")
     assert dataset.wheel is not None
@@ -153,7 +153,7 @@ def test_what_the_gtsam_wheel_ships_to_the_last_bit(name: str) -> None:
 @pytest.mark.parametrize("name", ["w10000", "intel", "sphere2500", "parking_garage", "killian_freiburg"])
 def test_any_order_of_a_source_that_keeps_each_poses_own(datasets: Path, name: str) -> None:
     """The order of these sources is not known; whatever it is, the outcome is the same, and that of the catalogue."""
-    dataset = named(name, CATALOGUE)
+    dataset = dataset_named(name, CATALOGUE)
     assert dataset.download is not None
     source = shuffled((datasets / dataset.file).read_text().splitlines(), dataset.download.form, seed=3)
     assert sha256(convert(dataset.download.form, [(name, source)])) == dataset.sha256

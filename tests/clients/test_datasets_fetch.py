@@ -12,7 +12,18 @@ from pathlib import Path
 import pytest
 from dataset_sources import Answer, Site, raw_files
 
-from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, Source, convert, fetch, find, locate, named
+from factorbus.datasets import (
+    CATALOGUE,
+    Dataset,
+    DatasetProblem,
+    Places,
+    Source,
+    convert,
+    dataset_named,
+    fetch_dataset,
+    find,
+    locate,
+)
 from factorbus.datasets.download import download
 from factorbus.datasets.errors import (
     BadAddress,
@@ -62,7 +73,7 @@ def left_in(cache: Path) -> list[str]:
 def refused(site: Site, cache: Path, kind: type[DatasetProblem], says: str, timeout_s: float = 20) -> DatasetProblem:
     """Fetch, see it fail in one line, with nothing left behind."""
     with pytest.raises(kind, match=says) as caught:
-        fetch(dataset_of(SMALL), cache, base=site.base, timeout_s=timeout_s)
+        fetch_dataset(dataset_of(SMALL), cache, base=site.base, timeout_s=timeout_s)
     assert type(caught.value) is kind
     assert "\n" not in caught.value.message
     assert left_in(cache) == []
@@ -71,7 +82,7 @@ def refused(site: Site, cache: Path, kind: type[DatasetProblem], says: str, time
 
 def test_a_data_set_is_downloaded_converted_and_put_in_place(site: Site, tmp_path: Path) -> None:
     path = serve(site, Answer(SMALL))
-    file = fetch(dataset_of(SMALL), tmp_path / "new" / "cache", base=site.base + "/")
+    file = fetch_dataset(dataset_of(SMALL), tmp_path / "new" / "cache", base=site.base + "/")
     assert file == tmp_path / "new" / "cache" / "lane.g2o"
     assert file.read_bytes() == convert("isam", [("lane", SMALL)])
     assert file.read_text().startswith("EDGE_SE2 0 1 1 0 0.5 9 0 0 9 0 16\n")
@@ -88,19 +99,19 @@ def current_umask() -> int:
 
 def test_what_is_there_and_good_is_not_fetched_again(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
-    first = fetch(dataset_of(SMALL), tmp_path, base=site.base)
+    first = fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base)
     before = first.stat().st_ino
-    assert fetch(dataset_of(SMALL), tmp_path, base=site.base).stat().st_ino == before
+    assert fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base).stat().st_ino == before
     assert len(site.asked) == 1
 
 
 def test_what_is_there_and_bad_is_replaced_but_not_before_the_new_one_is_good(site: Site, tmp_path: Path) -> None:
     (tmp_path / "lane.g2o").write_text("EDGE_SE2 damaged\n")
     with pytest.raises(HttpStatus):
-        fetch(dataset_of(SMALL), tmp_path, base=site.base)
+        fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base)
     assert (tmp_path / "lane.g2o").read_text() == "EDGE_SE2 damaged\n"
     serve(site, Answer(SMALL))
-    assert sha256(fetch(dataset_of(SMALL), tmp_path, base=site.base).read_bytes()) == dataset_of(SMALL).sha256
+    assert sha256(fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base).read_bytes()) == dataset_of(SMALL).sha256
     assert left_in(tmp_path) == ["lane.g2o"]
 
 
@@ -114,7 +125,7 @@ def test_progress_comes_while_the_file_still_does(site: Site, tmp_path: Path) ->
         seen.append((file, done, total))
         half_seen.set()
 
-    fetch(dataset_of(LARGE), tmp_path, base=site.base, watch=watch)
+    fetch_dataset(dataset_of(LARGE), tmp_path, base=site.base, watch=watch)
     counts = [done for _, done, _ in seen]
     assert 0 < counts[0] < len(LARGE)
     assert counts == sorted(counts)
@@ -125,12 +136,12 @@ def test_progress_comes_while_the_file_still_does(site: Site, tmp_path: Path) ->
 def test_a_redirect_is_followed(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(status=302, location="/elsewhere/lane.txt"))
     site.answers["/elsewhere/lane.txt"] = Answer(SMALL)
-    assert fetch(dataset_of(SMALL), tmp_path, base=site.base).is_file()
+    assert fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base).is_file()
 
 
 def test_without_a_length_the_checksum_decides(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL, length=None))
-    assert fetch(dataset_of(SMALL), tmp_path, base=site.base).is_file()
+    assert fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base).is_file()
     (tmp_path / "lane.g2o").unlink()
     serve(site, Answer(SMALL[:-20], length=None))
     refused(site, tmp_path, BadChecksum, "not the file of that commit")
@@ -191,14 +202,14 @@ def test_nobody_there_is_told(site: Site, tmp_path: Path) -> None:
 @pytest.mark.parametrize("base", ["", "mirror.example", "file:///etc", "ftp://mirror.example", "http://", "http://a?b"])
 def test_an_address_that_cannot_be_is_refused(tmp_path: Path, base: str) -> None:
     with pytest.raises(BadAddress, match="wanted one such as"):
-        fetch(dataset_of(SMALL), tmp_path / "cache", base=base)
+        fetch_dataset(dataset_of(SMALL), tmp_path / "cache", base=base)
     assert left_in(tmp_path) == []
 
 
 def test_a_conversion_with_another_outcome_is_refused(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
     with pytest.raises(BadChecksum, match=r"lane\.g2o as converted .* conversion is wrong here"):
-        fetch(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base)
+        fetch_dataset(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base)
     assert left_in(tmp_path) == []
 
 
@@ -208,15 +219,15 @@ def test_a_source_without_recorded_checksum_is_held_to_the_outcome(site: Site, t
     unknown = replace(known, download=replace(known.download, sha256=(None,)))
     serve(site, Answer(LARGE))
     with pytest.raises(BadChecksum, match="may be another file"):
-        fetch(unknown, tmp_path, base=site.base)
+        fetch_dataset(unknown, tmp_path, base=site.base)
     serve(site, Answer(SMALL + b"\n# the same in other words\n"))
-    assert sha256(fetch(unknown, tmp_path, base=site.base).read_bytes()) == known.sha256
+    assert sha256(fetch_dataset(unknown, tmp_path, base=site.base).read_bytes()) == known.sha256
 
 
 def test_the_source_is_kept_when_asked_for(site: Site, tmp_path: Path) -> None:
     serve(site, Answer(SMALL))
     with pytest.raises(BadChecksum):
-        fetch(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base, keep_source=True)
+        fetch_dataset(replace(dataset_of(SMALL), sha256="0" * 64), tmp_path, base=site.base, keep_source=True)
     assert left_in(tmp_path) == ["sources", "sources/lane", "sources/lane/lane one.txt"]
     assert (tmp_path / "sources/lane/lane one.txt").read_bytes() == SMALL
 
@@ -228,16 +239,16 @@ def test_two_files_of_one_source(site: Site, tmp_path: Path) -> None:
     pair = Dataset("pair", "a pair", "", "2D", 2, 0, 1, 0, 2, 0.0, sha256(made), source)
     site.holds("someone/maps", "c0ffee", "v.dat", Answer(vertices))
     with pytest.raises(HttpStatus, match=r"e\.dat answered 404"):
-        fetch(pair, tmp_path, base=site.base)
+        fetch_dataset(pair, tmp_path, base=site.base)
     assert left_in(tmp_path) == []
     site.holds("someone/maps", "c0ffee", "e.dat", Answer(edges))
-    assert fetch(pair, tmp_path, base=site.base).read_bytes() == made
+    assert fetch_dataset(pair, tmp_path, base=site.base).read_bytes() == made
 
 
 def test_a_cache_that_cannot_be_made_is_told(site: Site, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(CannotWrite, match="Not a directory; make the folder writable"):
-        fetch(dataset_of(SMALL), tmp_path / "file" / "cache", base=site.base)
+        fetch_dataset(dataset_of(SMALL), tmp_path / "file" / "cache", base=site.base)
     assert left_in(tmp_path) == ["file"]
 
 
@@ -245,7 +256,7 @@ def test_a_folder_in_the_place_of_the_file_is_told(site: Site, tmp_path: Path) -
     serve(site, Answer(SMALL))
     (tmp_path / "lane.g2o").mkdir()
     with pytest.raises(CannotWrite, match=r"lane\.g2o cannot be written: Is a directory"):
-        fetch(dataset_of(SMALL), tmp_path, base=site.base)
+        fetch_dataset(dataset_of(SMALL), tmp_path, base=site.base)
     assert left_in(tmp_path) == ["lane.g2o"]
 
 
@@ -290,21 +301,21 @@ def test_what_only_the_wheel_has_needs_the_wheel(tmp_path: Path) -> None:
     shipped = Source("isam", ("lane.txt",), (sha256(SMALL),))
     lane = replace(dataset_of(SMALL), download=None, wheel=shipped)
     with pytest.raises(NotShipped, match=r"pip install 'gtsam==4\.3\.0'"):
-        fetch(lane, tmp_path / "cache")
+        fetch_dataset(lane, tmp_path / "cache")
     wheel = tmp_path / "wheel"
     wheel.mkdir()
     (wheel / "lane.txt").write_bytes(SMALL)
-    assert sha256(fetch(lane, tmp_path / "cache", wheel=wheel).read_bytes()) == lane.sha256
+    assert sha256(fetch_dataset(lane, tmp_path / "cache", wheel=wheel).read_bytes()) == lane.sha256
 
 
 def test_the_wheels_file_is_taken_before_the_network_unless_it_is_another(site: Site, tmp_path: Path) -> None:
     lane = replace(dataset_of(SMALL), wheel=Source("isam", ("lane.txt",), (sha256(SMALL),)))
     (tmp_path / "lane.txt").write_bytes(SMALL)
-    fetch(lane, tmp_path / "one", wheel=tmp_path, base=site.base)
+    fetch_dataset(lane, tmp_path / "one", wheel=tmp_path, base=site.base)
     assert site.asked == []
     (tmp_path / "lane.txt").write_bytes(LARGE)
     path = serve(site, Answer(SMALL))
-    fetch(lane, tmp_path / "two", wheel=tmp_path, base=site.base)
+    fetch_dataset(lane, tmp_path / "two", wheel=tmp_path, base=site.base)
     assert site.asked == [path]
 
 
@@ -353,7 +364,7 @@ def test_every_entry_of_the_catalogue_can_be_had() -> None:
     ]  # fmt: skip
     assert len({each.name for each in CATALOGUE}) == len(CATALOGUE) == 11
     for each in CATALOGUE:
-        assert named(each.file, CATALOGUE) is each
+        assert dataset_named(each.file, CATALOGUE) is each
         assert each.download is not None
         assert len(each.download.commit) == 40
         assert len(each.download.paths) == len(each.download.sha256)

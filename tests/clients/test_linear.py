@@ -15,6 +15,7 @@ from factorbus.proto.messages import Batch, Change, Insert
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.changing import with_changes
 from factorbus.solver.graph.joints import find_joints
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
@@ -195,7 +196,7 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
             gone = [symbol(c, k) for c in "xvag" for k in range(n - 9, n - 4) if n > 9]
             gone += [symbol(c, k) for c in "xvag" for k in range(5) if n == 9]
             gone = [key for key in gone if window._graph.find(key) >= 0]
-            window, *_ = window.with_changes([Change("marginalize", keys=np.array(gone))])
+            window, *_ = with_changes(window, [Change("marginalize", keys=np.array(gone))])
     assert [len(joint.variables) for joint in find_joints(solver._graph)] == [8] * (count - 1)
     assert window.factor_count < solver.factor_count
     assert max(len(joint.variables) for joint in find_joints(window._graph)) <= 8
@@ -204,7 +205,9 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
     # The newest is undone, its variables with it; the one in the middle of all leaves its neighbours what they are.
     ids = np.arange(each[-1][0], sum(each[-1]))
     last = np.array([symbol(c, count - 1) for c in "xvag"])
-    undone, *_ = solver.with_changes([Change("remove_factors", ids), Change("remove_variables", keys=last, alone=True)])
+    undone, *_ = with_changes(
+        solver, [Change("remove_factors", ids), Change("remove_variables", keys=last, alone=True)]
+    )
     assert len(find_joints(undone._graph)) == count - 2
     # Sent on to another map they are still told apart.
     variables, factors = solver.graph()
@@ -215,7 +218,7 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
     for key, row in values(other).items():
         assert np.abs(row - values(solver)[key]).max() < 1e-7  # the last is known to half a metre
     # A marginal of one state has the next one in its border, and nothing else.
-    slid, *_ = solver.with_changes([Change("marginalize", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
+    slid, *_ = with_changes(solver, [Change("marginalize", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
     widths = sorted(len(joint.variables) for joint in find_joints(slid._graph))
     assert widths == [4] + [8] * (count - 2)
     for key, row in values(slid).items():

@@ -18,7 +18,7 @@ from factorbus.client import AbsoluteFactors, CannotMerge, Changes, Draft, KeyCo
 from factorbus.client.frames import compose, difference, inverse, moved_values
 from factorbus.client.merging import fit_into
 from factorbus.client.transform_factors import transform_factors
-from factorbus.client.transform_linear import is_relative, says_nothing
+from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.pieces import cut
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
@@ -26,6 +26,7 @@ from factorbus.proto.messages import Batch, Estimate, Factors, Graph, Variables
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.symbols import parse_symbol
 from factorbus.solver import Options, Solver
+from factorbus.solver.changing import with_changes
 
 seeds = st.integers(0, 2**32 - 1)
 ABSOLUTE = ("prior", "position", "heading", "attitude")
@@ -121,7 +122,7 @@ def test_what_two_variables_say_of_each_other_alone_is_told_from_what_they_say_o
         blocks = np.split(H, np.cumsum(widths)[:-1], axis=1)
         measured = np.concatenate([*y, *(block.ravel() for block in blocks), np.zeros(rows)])
         group = Factors(kind, np.array([[1, 2]]), measured[None], np.zeros((1, 0)))
-        assert is_relative(group).tolist() == [relative]
+        assert are_relative(group).tolist() == [relative]
 
 
 def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() -> None:
@@ -140,11 +141,11 @@ def test_a_marginal_of_relative_poses_is_relative_and_one_with_a_prior_is_not() 
             solver.stage(draft.batch())
             solver.step(settle=True)
             changes = Changes().marginalize("x2").listed()
-            marginal, *_ = solver.with_changes(changes, Batch(), True)
+            marginal, *_ = with_changes(solver, changes, Batch(), True)
             pairs = [f for f in marginal.graph()[1] if f.kind == f"linear_pair_{kind}"]
             assert len(pairs) == 1
             pair = Factors(pairs[0].kind, pairs[0].keys, pairs[0].measured, pairs[0].information)
-            assert is_relative(pair).tolist() == [not prior]
+            assert are_relative(pair).tolist() == [not prior]
             rest = [
                 Factors(f.kind, f.keys, f.measured, f.information)
                 for f in marginal.graph()[1]
@@ -263,7 +264,7 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     Lambda = np.kron(3.01 * np.eye(3) - np.ones((3, 3)), np.diag([100.0, 100.0, 400.0]))
     pieces = cut(["se2"] * 3, keys, [np.zeros(3)] * 3, Lambda, np.zeros(9))
     sent = tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in pieces)
-    assert is_relative(sent[-1]).all()
+    assert are_relative(sent[-1]).all()
     batch = there().batch
     other = Graph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))

@@ -12,7 +12,7 @@ from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver.starts import descent
-from factorbus.viz import Course, drive_figure, map_figure, sparsity_figure, spread_of
+from factorbus.viz import DriveHistory, MapLayers, drive_figure, map_figure, sparsity_figure, spread_of
 from factorbus.viz.ellipses import QUANTILE, outlines
 from factorbus.viz.geometry import view_of
 
@@ -78,14 +78,14 @@ def test_sparsity_is_drawn_block_by_block() -> None:
 
 
 def test_a_drive_shows_every_step_by_what_it_did() -> None:
-    course = Course(np.linspace(0, 5, 40), np.full(40, 0.5), np.array([[20.0, 2.0]]))
-    figure = drive_figure(course, ["extend"] * 30 + ["omega"] * 9 + ["full"], "a drive", "40 steps")
+    history = DriveHistory(np.linspace(0, 5, 40), np.full(40, 0.5), np.array([[20.0, 2.0]]))
+    figure = drive_figure(history, ["extend"] * 30 + ["omega"] * 9 + ["full"], "a drive", "40 steps")
     times = figure.axes[1]
     marks = {line.get_label(): len(line.get_xdata()) for line in times.lines if "(" in str(line.get_label())}
     assert marks == {"extend (30)": 30, "omega (9)": 9, "full (1)": 1}
     assert figure.axes[2].lines[0].get_ydata()[-1] == pytest.approx(0.02)
     work = np.stack([np.arange(1, 41), np.full(40, 3), np.eye(40)[7]], axis=1).astype(float)
-    worked = drive_figure(Course(course.chi2, course.step_ms, work=work), ["tree"] * 40).axes[3]
+    worked = drive_figure(DriveHistory(history.chi2, history.step_ms, work=work), ["tree"] * 40).axes[3]
     marks = {line.get_label(): line.get_xdata().tolist() for line in worked.lines}
     assert (len(marks["eliminated"]), marks["relinearized"]) == (40, [8]), (
         "steps that relinearized nothing have no mark"
@@ -118,7 +118,7 @@ def test_in_space_three_lines_go_round_each_place() -> None:
     assert lines.shape[0] == 90
     distance = (lines - np.tile(places, (3, 1))[:, None]) / [0.1, 0.2, 0.3]
     np.testing.assert_allclose(np.linalg.norm(distance, axis=2), QUANTILE[3], rtol=1e-9)
-    figure = map_figure(estimate=[points], spread=spread)
+    figure = map_figure(MapLayers([points], spread=spread))
     legend = [text.get_text() for axes in figure.axes if axes.get_legend() for text in axes.get_legend().get_texts()]
     assert "95 % of where it may be (30)" in legend
 

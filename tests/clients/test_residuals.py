@@ -10,7 +10,7 @@ from factorbus.cli.driving.columns import merged
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Factors, Variables
 from factorbus.solver import Options, Solver
-from factorbus.viz.residuals import Values, factor_chi2
+from factorbus.viz.residuals import Values, chi2_of_factors
 
 WORLDS = [(random_steps, 1), (random_steps, 2), (random_steps, 3), (other_steps, 1), (other_steps, 2)]
 
@@ -26,7 +26,7 @@ def test_every_kind_agrees_with_its_dense_twin_and_the_sum_with_the_solver(steps
     known = {k: v[: size[g.kind]] for g in variables for k, v in zip(g.keys.tolist(), g.values, strict=True)}
     values, total = Values(variables), 0.0
     for group in graph.factors:
-        found = factor_chi2(group, values)
+        found = chi2_of_factors(group, values)
         assert np.isfinite(found).all(), group.kind
         total += float(found.sum())
         for keys, z, triangle, chi2 in zip(
@@ -48,6 +48,6 @@ def test_the_graphs_above_have_every_kind_but_sights() -> None:
 def test_what_has_no_value_or_an_unknown_kind_is_nan_and_not_an_error() -> None:
     values = Values([Variables("se2", np.array([7]), np.zeros((1, 3)))])
     missing = Factors("prior_se2", np.array([[7], [8]]), np.ones((2, 3)), np.tile([1.0, 0, 0, 1, 0, 1], (2, 1)))
-    assert np.isnan(factor_chi2(missing, values)).tolist() == [False, True]
-    assert np.isnan(factor_chi2(missing._replace(kind="of_tomorrow"), values)).all()
-    assert np.isnan(factor_chi2(missing, Values([]))).all()
+    assert np.isnan(chi2_of_factors(missing, values)).tolist() == [False, True]
+    assert np.isnan(chi2_of_factors(missing._replace(kind="of_tomorrow"), values)).all()
+    assert np.isnan(chi2_of_factors(missing, Values([]))).all()

@@ -10,13 +10,23 @@ from counting import count_calls
 
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.symbols import format_symbol
-from factorbus.simulate import WORLDS, BadParameter, Step, city_trees, manhattan, sphere
+from factorbus.simulate import (
+    WORLDS,
+    BadParameter,
+    LoopClosures,
+    Spiral,
+    Step,
+    TreeSensor,
+    city_trees,
+    manhattan,
+    sphere,
+)
 
 CASES = {
     "manhattan": lambda poses, seed: manhattan(poses, seed, sigma_xy_m=0.05, sigma_theta_rad=0.1),
     "city_trees": lambda poses, seed: city_trees(poses, seed),
-    "city_trees by bearing": lambda poses, seed: city_trees(poses, seed, sensor="bearing_range_se2"),
-    "sphere": lambda poses, seed: sphere(poses, seed, ring=20, rings=15, sigma_rotation_rad=0.1),
+    "city_trees by bearing": lambda poses, seed: city_trees(poses, seed, sensor=TreeSensor("bearing_range_se2")),
+    "sphere": lambda poses, seed: sphere(poses, seed, spiral=Spiral(20, 15), sigma_rotation_rad=0.1),
 }
 
 
@@ -141,7 +151,7 @@ def test_noise_has_the_covariance_that_is_sent(case: str) -> None:
 
 def test_loops_of_manhattan_are_what_was_asked_for() -> None:
     places, loops = {}, []
-    for step in manhattan(3500, 2, loop_radius_m=3, loop_gap=60, loops=3):
+    for step in manhattan(3500, 2, loops=LoopClosures(radius_m=3, gap=60, most=3)):
         number = step.truth[0].keys[0]
         places[int(number)] = step.truth[0].values[0] if step.truth[0].values is not None else None
         if step.batch.factors:
@@ -151,7 +161,7 @@ def test_loops_of_manhattan_are_what_was_asked_for() -> None:
     assert all(j - i >= 60 for i, j in loops)
     assert max(np.hypot(*(places[i] - places[j])[:2]) for i, j in loops) <= 3
     assert max(j - i for i, j in loops) > 2000  # over most of the drive too
-    steps = list(manhattan(300, 2, loop_share=0))
+    steps = list(manhattan(300, 2, loops=LoopClosures(share=0)))
     assert sum(step.batch.factor_count for step in steps) == 299
 
 
@@ -175,7 +185,7 @@ def test_trees_are_seen_again() -> None:
 
 def test_sphere_goes_up_and_down_on_its_surface() -> None:
     ring, rings = 12, 6
-    steps = list(sphere(2 * ring * rings, 1, ring=ring, rings=rings, radius_m=10, revisit_share=1))
+    steps = list(sphere(2 * ring * rings, 1, spiral=Spiral(ring, rings, radius_m=10), revisit_share=1))
     poses = np.array([step.truth[0].values[0] for step in steps if step.truth[0].values is not None])
     np.testing.assert_allclose(np.linalg.norm(poses[:, :3], axis=1), 10)
     np.testing.assert_allclose(poses[ring * rings :, :3], poses[ring * rings - 1 :: -1, :3], atol=1e-12)
@@ -208,15 +218,15 @@ WRONG = [
     (manhattan, {"sigma_xy_m": 0.0}, "sigma_xy_m is 0.0; wanted a standard deviation above 0"),
     (manhattan, {"sigma_theta_rad": float("nan")}, "sigma_theta_rad is nan"),
     (manhattan, {"sigma_theta_rad": 2.0}, "up to 0.5"),
-    (manhattan, {"loop_share": 1.5}, "loop_share is 1.5; wanted a number from 0 to 1"),
-    (manhattan, {"loops": -1}, "loops is -1"),
-    (manhattan, {"loop_gap": 1}, "loop_gap is 1; wanted 2 or more"),
-    (manhattan, {"loop_radius_m": float("inf")}, "loop_radius_m is inf"),
-    (city_trees, {"sensor": "radar"}, "sensor is 'radar'; wanted landmark_se2 or bearing_range_se2"),
-    (city_trees, {"sigma_sight_m": 1.0}, "up to 0.125"),
+    (LoopClosures, {"share": 1.5}, "LoopClosures.share is 1.5; wanted a number from 0 to 1"),
+    (LoopClosures, {"most": -1}, "LoopClosures.most is -1"),
+    (LoopClosures, {"gap": 1}, "LoopClosures.gap is 1; wanted 2 or more"),
+    (LoopClosures, {"radius_m": float("inf")}, "LoopClosures.radius_m is inf"),
+    (TreeSensor, {"kind": "radar"}, "TreeSensor.kind is 'radar'; wanted landmark_se2 or bearing_range_se2"),
+    (TreeSensor, {"sigma_m": 1.0}, "up to 0.125"),
     (city_trees, {"block_m": 2}, "block_m is 2"),
     (sphere, {"sigma_rotation_rad": 1.0}, "sigma_rotation_rad is 1.0"),
-    (sphere, {"ring": 2}, "ring is 2; wanted 3 or more"),
+    (Spiral, {"ring": 2}, "Spiral.ring is 2; wanted 3 or more"),
 ]
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.simulate import city_trees, manhattan, sphere
-from factorbus.viz import BadPicture, Course, Odometry, loops_of, map_figure, save_map
+from factorbus.simulate import Spiral, city_trees, manhattan, sphere
+from factorbus.viz import BadPicture, DriveHistory, MapLayers, Odometry, loops_of, map_figure, save_map
 
 pytest.importorskip("matplotlib")
 
@@ -51,10 +51,9 @@ def test_file_is_what_its_ending_says(tmp_path: Path, ending: str, magic: bytes)
     path = tmp_path / f"map{ending}"
     save_map(
         path,
-        estimate=[square()],
+        MapLayers([square()], loops=np.array([[symbol("x", 0), symbol("x", 3)]])),
         title="A square",
         subtitle="five poses",
-        loops=np.array([[symbol("x", 0), symbol("x", 3)]]),
     )
     content = path.read_bytes()
     assert content.startswith(magic)
@@ -68,7 +67,7 @@ def test_every_layer_is_drawn_and_named() -> None:
     truth, odometry, _ = drive(city_trees(400, 1))
     loops = np.array([[symbol("x", 0), symbol("x", 300)], [symbol("x", 5), symbol("x", 999)]])
     figure = map_figure(
-        estimate=truth, truth=truth, odometry=odometry.variables(), loops=loops, title="t", subtitle="s"
+        MapLayers(truth, truth=truth, odometry=odometry.variables(), loops=loops), title="t", subtitle="s"
     )
     trees = sum(len(group.keys) for group in truth if group.kind == "point2")
     assert set(names_in_legend(figure)) == {
@@ -86,29 +85,29 @@ def test_every_layer_is_drawn_and_named() -> None:
 
 def test_known_things_are_in_the_picture_and_odometry_far_out_is_not() -> None:
     far = poses("se2", np.array([[0, 0, 0], [5000, 0, 0]]))
-    axes = map_figure(estimate=[square()], odometry=[far]).axes[0]
+    axes = map_figure(MapLayers([square()], odometry=[far])).axes[0]
     assert axes.get_xlim()[0] < -10 < 10 < axes.get_xlim()[1] < 20
     assert axes.get_ylim()[0] < -10 < 10 < axes.get_ylim()[1]
 
 
 def test_two_robots_are_two_lines() -> None:
-    line = lines_of(map_figure(estimate=[square(), poses("se2", np.ones((2, 3)), "y")]))["estimate (7 poses)"]
+    line = lines_of(map_figure(MapLayers([square(), poses("se2", np.ones((2, 3)), "y")])))["estimate (7 poses)"]
     assert np.isnan(line).any(axis=1).tolist() == [False] * 5 + [True] + [False] * 2
 
 
 def test_space_is_drawn_in_space_and_a_floor_in_the_plane() -> None:
-    truth, odometry, loops = drive(sphere(300, 1, ring=20, rings=15))
-    figure = map_figure(estimate=truth, odometry=odometry.variables(), loops=loops)
+    truth, odometry, loops = drive(sphere(300, 1, spiral=Spiral(20, 15)))
+    figure = map_figure(MapLayers(truth, odometry.variables(), loops=loops))
     assert figure.axes[0].name == "3d"
     figure.canvas.draw()
     floor = np.zeros((40, 7))
     floor[:, 0], floor[:, 1] = np.cos(np.arange(40)), np.arange(40)
     floor[:, 2], floor[:, 6] = 0.01 * np.arange(40) % 2, 1
-    figure = map_figure(estimate=[poses("se3", floor)])
+    figure = map_figure(MapLayers([poses("se3", floor)]))
     assert figure.axes[0].name == "rectilinear"
     np.testing.assert_array_equal(lines_of(figure)["estimate (40 poses)"], floor[:, :2])
     wall = floor[:, [0, 2, 1, 3, 4, 5, 6]]  # stands upright: drawn along its own two axes
-    figure = map_figure(estimate=[poses("se3", wall)])
+    figure = map_figure(MapLayers([poses("se3", wall)]))
     assert figure.axes[0].get_xlabel() == "widest axis (m)"
     drawn = lines_of(figure)["estimate (40 poses)"]
     np.testing.assert_allclose(np.ptp(drawn, axis=0), np.ptp(wall[:, [2, 0]], axis=0), rtol=0.05)
@@ -119,7 +118,7 @@ def test_a_straight_drive_is_drawn_along_its_own_axis_and_not_as_a_sliver(axis: 
     line = np.zeros((20, 7))
     line[:, axis], line[:, 6] = np.arange(20), 1
     line[:, 2] += 1.0  # not at the origin
-    axes = map_figure(estimate=[poses("se3", line)]).axes[0]
+    axes = map_figure(MapLayers([poses("se3", line)])).axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel()) == tuple(f"{name} (m)" for name in labels)
     sides = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     assert sides.min() / sides.max() > 0.3
@@ -127,42 +126,44 @@ def test_a_straight_drive_is_drawn_along_its_own_axis_and_not_as_a_sliver(axis: 
 
 
 def test_panels_show_the_course() -> None:
-    course = Course(chi2=np.linspace(0, 90, 50), step_ms=np.full(50, 2.5), optimum=np.array([[25, 40.0], [50, 88.0]]))
-    figure = map_figure(estimate=[square()], course=course)
+    history = DriveHistory(
+        chi2=np.linspace(0, 90, 50), step_ms=np.full(50, 2.5), optimum=np.array([[25, 40.0], [50, 88.0]])
+    )
+    figure = map_figure(MapLayers([square()]), history=history)
     chi2, times = figure.axes[2:]
-    np.testing.assert_array_equal(chi2.lines[0].get_ydata(), course.chi2)
-    np.testing.assert_array_equal(chi2.lines[1].get_xydata(), course.optimum)
+    np.testing.assert_array_equal(chi2.lines[0].get_ydata(), history.chi2)
+    np.testing.assert_array_equal(chi2.lines[1].get_xydata(), history.optimum)
     assert [text.get_text() for text in times.get_legend().get_texts()] == ["p50  2.5 ms", "p99  2.5 ms"]
     assert [text.get_text() for text in chi2.get_legend().get_texts()] == ["after the step", "batch optimum"]
     figure.canvas.draw()
-    assert len(map_figure(estimate=[square()], course=Course(chi2=np.ones(3))).axes) == 3
-    assert len(map_figure(estimate=[square()], course=Course()).axes) == 2
+    assert len(map_figure(MapLayers([square()]), history=DriveHistory(chi2=np.ones(3))).axes) == 3
+    assert len(map_figure(MapLayers([square()]), history=DriveHistory()).axes) == 2
 
 
 def test_an_optimum_that_had_not_converged_is_drawn_and_called_so() -> None:
     early = np.array([[30, 41.0]])
-    course = Course(chi2=np.linspace(0, 90, 50), optimum=np.array([[25, 40.0]]), not_converged=early)
-    chi2 = map_figure(estimate=[square()], course=course).axes[2]
+    history = DriveHistory(chi2=np.linspace(0, 90, 50), optimum=np.array([[25, 40.0]]), not_converged=early)
+    chi2 = map_figure(MapLayers([square()]), history=history).axes[2]
     drawn = {line.get_label(): line for line in chi2.lines}
     np.testing.assert_array_equal(drawn["batch, not converged"].get_xydata(), early)
     assert drawn["batch, not converged"].get_marker() != drawn["batch optimum"].get_marker()
     assert len(chi2.get_legend().get_texts()) == 3
-    alone = map_figure(estimate=[square()], course=Course(chi2=np.ones(50), not_converged=early)).axes[2]
+    alone = map_figure(MapLayers([square()]), history=DriveHistory(chi2=np.ones(50), not_converged=early)).axes[2]
     assert [text.get_text() for text in alone.get_legend().get_texts()] == ["after the step", "batch, not converged"]
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_the_smallest_maps(tmp_path: Path, count: int) -> None:
-    save_map(tmp_path / "a.png", estimate=[square(count)], truth=[square(count)], odometry=[square(count)])
-    save_map(tmp_path / "b.png", estimate=[Variables("point3", np.arange(count), np.ones((count, 3)))])
+    save_map(tmp_path / "a.png", MapLayers([square(count)], truth=[square(count)], odometry=[square(count)]))
+    save_map(tmp_path / "b.png", MapLayers([Variables("point3", np.arange(count), np.ones((count, 3)))]))
     assert (tmp_path / "b.png").stat().st_size > 2000
 
 
 def test_what_cannot_be_drawn(tmp_path: Path) -> None:
     with pytest.raises(BadPicture, match=r"cannot be a \.jpeg; wanted \.png, \.svg, \.pdf"):
-        save_map(tmp_path / "map.jpeg", estimate=[square()])
+        save_map(tmp_path / "map.jpeg", MapLayers([square()]))
     with pytest.raises(BadPicture, match="neither a pose nor a point"):
-        save_map(tmp_path / "map.png", estimate=[Variables("se2", np.arange(3))])
+        save_map(tmp_path / "map.png", MapLayers([Variables("se2", np.arange(3))]))
     assert not any(tmp_path.iterdir())
 
 
@@ -171,7 +172,7 @@ def test_a_large_map_is_drawn_as_pixels_and_its_loops_in_part(tmp_path: Path) ->
     turn = np.arange(count) / 3000
     track = poses("se2", np.stack([turn * np.cos(turn), turn * np.sin(turn), turn], axis=1))
     loops = symbol("x", 0) + np.stack([np.arange(count - 19000), np.arange(19000, count)], axis=1)
-    save_map(tmp_path / "large.svg", estimate=[track], loops=loops)
+    save_map(tmp_path / "large.svg", MapLayers([track], loops=loops))
     assert (tmp_path / "large.svg").stat().st_size < 5e6  # as pixels; as lines it would be tens of megabytes
     assert b"loop closures (181,000, one in 2 drawn)" in (tmp_path / "large.svg").read_bytes()
 

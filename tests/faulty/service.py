@@ -16,6 +16,8 @@ import numpy as np
 import zenoh
 from zenoh.handlers import Callback
 
+from factorbus.client import Draft
+from factorbus.client.mirror import Mirror
 from factorbus.proto import codec, keys
 from factorbus.proto.messages import Accepted, Delta, Estimate, Variables
 from factorbus.proto.problems import BadSequence, Busy, Problem, UnknownMap, WrongEpoch
@@ -173,3 +175,14 @@ def peer(endpoint: str) -> zenoh.Config:
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
+
+
+def point(key: str, x: float, y: float = 0.0) -> Draft:
+    return Draft().point2(key, (x, y))
+
+
+def same(mirror: Mirror, service: Service) -> bool:
+    numbers, values = mirror.columns("point2")
+    return {k: v.tobytes() for k, v in zip(numbers.tolist(), values, strict=True)} == {
+        k: v.tobytes() for k, v in service.values.items()
+    }

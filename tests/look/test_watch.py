@@ -20,7 +20,7 @@ from factorbus.proto.messages import Variables
 from factorbus.proto.ports import PortTaken
 from factorbus.simulate import city_trees, manhattan
 from factorbus.viz import style
-from factorbus.viz.geometry import rays_of
+from factorbus.viz.geometry import feature_rays
 
 pytest.importorskip("rerun")
 
@@ -110,7 +110,7 @@ def is_drawn(picture: np.ndarray) -> bool:
 
 def test_rays_point_where_the_features_angles_say_and_end_at_the_horizon() -> None:
     features = Variables("idp", np.array([1, 2]), np.array([[1.0, 2, 3, 0.3, -0.2, 0.25], [0, 0, 0, 0, 0, 1e-9]]))
-    rays = rays_of([features], horizon_m=30.0).places
+    rays = feature_rays([features], horizon_m=30.0).places
     np.testing.assert_array_equal(rays[0, 0], [1, 2, 3])
     h = rays[0, 1] - rays[0, 0]
     assert np.linalg.norm(h) == pytest.approx(4.0)

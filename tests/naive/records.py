@@ -24,6 +24,6 @@ def _record_of(record: type, record_at: Any, arrays: dict[str, np.ndarray]) -> A
     holder: Any = type("Holder", (Arenas,), {"ARENAS": record._fields})()
     for name, (kind, dimensions) in fields_of(record).items():
         setattr(holder, name, arrays.get(name, np.zeros((0,) * dimensions, kind)))
-    made = record_at(holder.places)
+    made = record_at(holder.array_table)
     made.holder = holder
     return made

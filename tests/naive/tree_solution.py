@@ -9,7 +9,7 @@ from naive.tree_records import assert_is_a_tree, tree_of
 from factorbus.solver import Solver
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 
 def assert_solves(solver: Solver) -> None:
@@ -36,7 +36,7 @@ def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.
     """Λ, η and χ² of all factors at the linearization points, by the kernels of the other modes; and δ."""
     graph = copy.copy(solver._graph)
     graph.fac, graph.values = graph.fac.copy(), tree_of(solver).lin[0].copy()
-    blocks, scalars = Blocks(), int(graph.counts[at.SCALARS])
+    blocks, scalars = HessianBlocks(), int(graph.counts[at.SCALARS])
     chi2 = blocks.extend(graph, (0,) * at.COUNTS)
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     first = np.concatenate([[0], np.cumsum(dims)])

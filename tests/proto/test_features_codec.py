@@ -17,7 +17,7 @@ from naive import dense_idp
 from factorbus.proto import codec
 from factorbus.proto import features_codec as features
 from factorbus.proto.camera import MODELS, BadCamera, Camera
-from factorbus.proto.features import FORMS, Answer, Ask, Done, Segment, Shard, ShardDone, Sighting
+from factorbus.proto.features import FORMS, Ask, Done, FeaturesAnswer, Segment, Shard, ShardDone, Sighting
 from factorbus.proto.problems import BadMessage, Problem, TooLarge
 
 VECTORS = Path(__file__).parents[2] / "proto" / "vectors" / "features"
@@ -26,7 +26,7 @@ GOLDEN = {name: (VECTORS / f"{name}.msgpack").read_bytes() for name in MADE}
 CONTRACT = (Path(__file__).parents[2] / "proto" / "README.md").read_text()
 
 
-def again_answer(answer: Answer) -> bytes:
+def again_answer(answer: FeaturesAnswer) -> bytes:
     rows = [(features.encode_shard_done(done.shard), done.worker, done.seconds) for done in answer.shards]
     return features.encode_answer(rows, answer.clean)
 
@@ -203,7 +203,7 @@ def test_a_field_of_another_type_or_length_is_refused(ask: Ask, name: str, data:
 
 
 def test_every_field_is_explained() -> None:
-    names = {*Ask._fields, *Segment._fields, *Shard._fields, *ShardDone._fields, *Answer._fields, *Done._fields}
+    names = {*Ask._fields, *Segment._fields, *Shard._fields, *ShardDone._fields, *FeaturesAnswer._fields, *Done._fields}
     names |= {"camera", "state", "covariance", "pixels", "rho", "sigma_rho", "sigma_pixel", "model", "numbers", *FORMS}
     names -= {"sighting"}
     assert not {name for name in names if f"`{name}`" not in CONTRACT}

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from factorbus.client import Draft
 from factorbus.proto.messages import Factors
 from factorbus.proto.symbols import symbol
-from factorbus.ros2.certainty import checked, floored
+from factorbus.ros2.certainty import checked_covariance, floored
 from factorbus.ros2.front_end import FrontEnd, landmark_index
 from factorbus.ros2.geometry import (
     Transform,
@@ -23,7 +23,7 @@ from factorbus.ros2.geometry import (
     from_quaternion,
     local,
     quaternion,
-    rotation,
+    rotation_exp,
     rotation_vector,
 )
 from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, Messages
@@ -77,7 +77,7 @@ def random_transform(random: np.random.Generator) -> Transform:
 
 def exp(delta: np.ndarray) -> Transform:
     """To first order in the translation, which is all that is asked of it here."""
-    return Transform(rotation(delta[3:]), delta[:3])
+    return Transform(rotation_exp(delta[3:]), delta[:3])
 
 
 @given(seeds)
@@ -88,7 +88,7 @@ def test_transforms_are_a_group_with_its_adjoint(seed: int) -> None:
     assert_allclose((a @ b).R @ p + (a @ b).t, a.R @ (b.R @ p + b.t) + a.t, atol=1e-12)
     assert_allclose((a @ a.inverse()).R, np.eye(3), atol=1e-12)
     assert_allclose(from_quaternion((0, 0, 0), quaternion(a.R)).R, a.R, atol=1e-12)
-    assert_allclose(rotation(rotation_vector(a.R)), a.R, atol=1e-9)
+    assert_allclose(rotation_exp(rotation_vector(a.R)), a.R, atol=1e-9)
     assert_allclose(between(a, b, 1.0).R, b.R, atol=1e-9)
     delta = 1e-6 * random.normal(size=6)
     left, right = a @ exp(delta) @ a.inverse(), exp(adjoint(a) @ delta)
@@ -117,11 +117,11 @@ def test_what_cannot_be_a_covariance_is_refused(bad: list[float]) -> None:
     numbers = np.zeros(36)
     numbers[: len(bad)] = bad
     with pytest.raises(BadRosMessage):
-        checked("/odom", numbers, (0, 1, 5))
+        checked_covariance("/odom", numbers, (0, 1, 5))
     elsewhere = np.zeros(36)
     elsewhere[14] = bad[0]  # z, which does not count in the plane
     if len(bad) == 1:
-        assert not checked("/odom", elsewhere, (0, 1, 5)).whole.any()
+        assert not checked_covariance("/odom", elsewhere, (0, 1, 5)).whole.any()
 
 
 def test_the_first_odometry_begins_the_map_and_the_next_makes_keyframes() -> None:

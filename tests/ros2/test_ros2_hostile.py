@@ -19,7 +19,7 @@ from factorbus.client.draft import Draft
 from factorbus.proto.messages import Batch
 from factorbus.proto.symbols import symbol
 from factorbus.ros2.bridge import Bridge
-from factorbus.ros2.certainty import checked, information
+from factorbus.ros2.certainty import checked_covariance, information
 from factorbus.ros2.front_end import FrontEnd
 from factorbus.ros2.messages import DETECTIONS, ODOMETRY, POSE, Messages
 from factorbus.ros2.problems import BadRosMessage
@@ -181,11 +181,13 @@ def covariance(*diagonal: float) -> list[float]:
 def test_an_axis_with_a_huge_variance_is_not_known_and_the_others_are(largest: float) -> None:
     numbers = covariance(0.04, 0.09, largest, largest, largest, 0.01)
     numbers[2] = numbers[12] = largest  # and correlated with one that is
-    made = checked("/odom", np.array(numbers), (0, 1, 2, 3, 4, 5))
+    made = checked_covariance("/odom", np.array(numbers), (0, 1, 2, 3, 4, 5))
     assert made.unknown == (2, 3, 4)
     np.testing.assert_allclose(made.whole, np.diag([0.04, 0.09, 1e6, math.pi**2, math.pi**2, 0.01]))
     assert "in z, roll, pitch" in made.remark()
-    assert checked("/odom", np.array(numbers), (0, 1, 5)).remark() == ""  # in the plane nothing is wrong with it
+    assert (
+        checked_covariance("/odom", np.array(numbers), (0, 1, 5)).remark() == ""
+    )  # in the plane nothing is wrong with it
 
 
 def test_in_space_odometry_that_does_not_know_its_height_says_so_in_the_map() -> None:
@@ -206,7 +208,7 @@ def test_in_space_odometry_that_does_not_know_its_height_says_so_in_the_map() ->
 @given(st.lists(st.sampled_from(WILD) | st.floats(), min_size=36, max_size=36))
 def test_whatever_passes_has_an_inverse(numbers: list[float]) -> None:
     try:
-        made = checked("/t", np.array(numbers), (0, 1, 2, 3, 4, 5))
+        made = checked_covariance("/t", np.array(numbers), (0, 1, 2, 3, 4, 5))
     except BadRosMessage:
         return
     assert np.linalg.eigvalsh(information(made.whole + np.eye(6)))[0] > 0.0

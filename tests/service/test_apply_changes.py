@@ -10,6 +10,7 @@ from factorbus.proto.symbols import symbol
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Arrived, Outcome, Stepped, Verdict
 from factorbus.service.questions.answers import Question
+from factorbus.service.solving import apply
 from factorbus.service.solving.apply import MapSolver
 from factorbus.service.solving.arrival import read_again, read_insert
 from factorbus.solver import Options, Solver
@@ -39,18 +40,9 @@ def gone(*names: int) -> tuple[Change, ...]:
     return (Change("remove_variables", keys=np.array([symbol("x", n) for n in names])),)
 
 
-class Broken(Solver):
-    """One whose changes fail in a way that nobody thought of."""
-
-    def with_changes(self, *arguments: object, **more: object) -> object:  # type: ignore[override]
-        raise ZeroDivisionError("a fault of the solver")
-
-
-class BrokenInPlace(Solver):
-    """One that fails in a change of factors, when that is half made."""
-
-    def try_change(self, *arguments: object, **more: object) -> object:  # type: ignore[override]
-        raise ZeroDivisionError("a fault of the solver")
+def broken(*_arguments: object, **_more: object) -> object:
+    """A change that fails in a way that nobody thought of."""
+    raise ZeroDivisionError("a fault of the solver")
 
 
 def weighed(factor: int, weight: float) -> Change:
@@ -62,8 +54,8 @@ def loop(i: int, j: int, x: float) -> Batch:
     return Batch(factors=(Factors("between_se2", keys, np.array([[x, 0.0, 0.3]]), information),))
 
 
-def make(map_solver: MapSolver | None = None, solver: type[Solver] = Solver) -> MapSolver:
-    map_solver = map_solver or MapSolver(lambda: solver(Options()), EPOCH, Limits())
+def make(map_solver: MapSolver | None = None) -> MapSolver:
+    map_solver = map_solver or MapSolver(lambda: Solver(Options()), EPOCH, Limits())
     for n in range(5):
         list(map_solver.apply([waiting(pose(n), n + 1)]))
     return map_solver
@@ -113,8 +105,9 @@ def test_what_cannot_be_changed_is_refused_and_its_neighbours_go_on() -> None:
     assert keys_in(map_solver) == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_fault_in_a_change_leaves_the_map_as_it_was() -> None:
-    map_solver = make(solver=Broken)
+def test_a_fault_in_a_change_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apply, "with_changes", broken)
+    map_solver = make()
     judged, steps = came(map_solver, waiting(gone(4), 6))
     assert [o.answer.code for o in outcomes(judged)] == ["internal"]
     assert steps == []
@@ -151,7 +144,7 @@ def test_the_same_folds_give_the_same_bits_again() -> None:
 
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l"])
-def test_a_snapshot_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
+def test_a_checkpoint_after_a_change_is_where_the_map_goes_on_from(mode: str) -> None:
     map_solver = make(MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits()))
     came(map_solver, waiting(gone(4), 6))
     again = MapSolver(lambda: Solver(Options(mode=mode)), EPOCH, Limits())
@@ -190,15 +183,16 @@ def test_a_change_of_factors_is_a_step_whose_delta_has_what_moved() -> None:
     assert map_solver.size == (6, 5)
 
 
-def test_a_fault_in_a_change_of_factors_has_the_solver_replaced() -> None:
-    map_solver = make(solver=BrokenInPlace)
+def test_a_fault_in_a_change_of_factors_has_the_solver_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apply, "try_change", broken)
+    map_solver = make()
     judged, steps = came(map_solver, waiting((weighed(1, 0.5),), 6))
     assert [o.answer.code for o in outcomes(judged)] == ["internal"]
     assert [step.rebuilt for step in steps] == [True]
     assert map_solver.size == (5, 4)
 
 
-def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_snapshot() -> None:
+def test_changes_of_factors_have_the_same_bits_when_folded_again_and_after_a_checkpoint() -> None:
     """Those that are refused among them: they leave no trace either."""
     records = [[waiting(pose(n), n + 1)] for n in range(5)]
     records += [[waiting(loop(0, 4, 3.5), 6)], [waiting(loop(1, 4, 2.5), 7)]]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from factorbus.service.config import BadConfig, Config, Limits, checked, load
+from factorbus.service.config import BadConfig, Config, Limits, checked_config, load_config
 
 
 def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
@@ -12,7 +12,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
     path.write_text(
         'listen = ["tcp/0.0.0.0:7447"]\nmaps = "site7-*"\njob_deadline_s = 5\n[limits]\nwaiting = 9\nparked_s = 2\n'
     )
-    config = load(path, name="s1")
+    config = load_config(path, name="s1")
     assert config == Config(
         listen=("tcp/0.0.0.0:7447",),
         maps="site7-*",
@@ -28,7 +28,7 @@ def test_a_file_sets_what_it_names(tmp_path: Path) -> None:
         ("job_deadline_s = inf", "job_deadline_s is inf; wanted a number below 1e"),
         ("stuck_s = nan", "stuck_s is nan"),
         ("group_s = inf", "group_s is inf"),
-        ("snapshot_s = 1e300", "snapshot_s is 1e"),
+        ("checkpoint_s = 1e300", "checkpoint_s is 1e"),
         ("[limits]\nparked_s = inf", "parked_s is inf"),
         ("[limits]\nparked_s = nan", "parked_s is nan"),
         ("lissten = []", "'lissten' is not a setting"),
@@ -53,8 +53,8 @@ def test_what_cannot_be_is_named(tmp_path: Path, text: str, wanted: str) -> None
     path = tmp_path / "factorbus.toml"
     path.write_text(text)
     with pytest.raises(BadConfig, match=wanted):
-        load(path)
+        load_config(path)
 
 
 def test_the_defaults_can_work() -> None:
-    assert checked(Config()) == Config()
+    assert checked_config(Config()) == Config()

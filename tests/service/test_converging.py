@@ -13,7 +13,7 @@ from factorbus.service.core import converging
 from factorbus.service.core.events import (
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Drained,
     Effect,
     InsertBatch,
@@ -210,13 +210,13 @@ def test_who_inserts_waits_for_no_more_than_one_step_and_comes_first(driven: Dri
 def test_questions_are_answered_of_the_latest_revision_and_do_not_stop_it(driven: Driven) -> None:
     driven.insert(converged=False)
     run = the_run(driven.tick())
-    assert driven.core.ask(Asked("q", "chi2", b""), driven.now) == []
+    assert driven.core.ask(ArrivedQuestion("q", "chi2", b""), driven.now) == []
     following = the_run(driven.done(run, converged=False))
     assert [read.asker for read in following.reads] == ["q"]
     assert following.further, "reads come first in an InsertBatch, and so are of the step before"
     driven.done(following, converged=False)
     for n in range(20):  # who asks all the time
-        effects = driven.core.ask(Asked(f"q{n}", "chi2", b""), driven.now)
+        effects = driven.core.ask(ArrivedQuestion(f"q{n}", "chi2", b""), driven.now)
         if not effects:
             break
         driven.core.applied(Applied(3, 4, 0.0, driven.now))

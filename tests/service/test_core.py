@@ -12,7 +12,7 @@ from factorbus.service.core.events import (
     Answer,
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Drained,
     Effect,
     InsertBatch,
@@ -97,7 +97,7 @@ def test_a_run_is_not_short_when_it_is_large_settles_reads_or_follows_another(co
     run = brought(core, 3, 3.0, settle=True)
     assert not run.short
     finish(core, run, 3.001)
-    asked = run_of(core.ask(Asked("q", "estimate", b""), 4.0))
+    asked = run_of(core.ask(ArrivedQuestion("q", "estimate", b""), 4.0))
     assert not asked.short
     core.insert(insert("a", 4))
     assert not run_of(finish(core, asked, 4.001)).short, "that one came in meanwhile, and so may others"
@@ -113,7 +113,7 @@ def test_a_refusal_is_answered_and_counted(core: MapCore) -> None:
 
 def test_questions_are_answered_between_two_steps(core: MapCore) -> None:
     run = run_of(core.insert(insert("a", 1)))
-    assert core.ask(Asked("q", "estimate", b""), 1.0) == []
+    assert core.ask(ArrivedQuestion("q", "estimate", b""), 1.0) == []
     core.insert(insert("a", 2))
     following = run_of(solved(core, run))
     assert [read.asker for read in following.reads] == ["q"]
@@ -123,7 +123,7 @@ def test_questions_are_answered_between_two_steps(core: MapCore) -> None:
 def test_stats_do_not_wait_for_the_solver(core: MapCore) -> None:
     core.insert(insert("a", 1))
     core.insert(insert("a", 2))
-    (tell,) = core.ask(Asked("q", "stats", b""), 4.0)
+    (tell,) = core.ask(ArrivedQuestion("q", "stats", b""), 4.0)
     assert isinstance(tell, Tell)
     assert tell.asker == "q"
     assert {k: tell.content[k] for k in ("name", "epoch", "waiting", "in_solver", "clients", "uptime_s")} == {
@@ -152,14 +152,14 @@ def test_stats_do_not_wait_for_the_solver(core: MapCore) -> None:
     ],
 )
 def test_a_question_that_cannot_be_answered_is_refused(core: MapCore, question: str, payload: bytes, code: str) -> None:
-    (effect,) = core.ask(Asked("q", question, payload), 1.0)
+    (effect,) = core.ask(ArrivedQuestion("q", question, payload), 1.0)
     assert isinstance(effect, Refuse)
     assert effect.problem.code == code
 
 
 def test_questions_are_bounded(core: MapCore) -> None:
     core.insert(insert("a", 1))
-    seen = [core.ask(Asked(n, "estimate", b""), 1.0) for n in range(3)]
+    seen = [core.ask(ArrivedQuestion(n, "estimate", b""), 1.0) for n in range(3)]
     assert seen[:2] == [[], []]
     (effect,) = seen[2]
     assert isinstance(effect, Refuse)
@@ -191,7 +191,7 @@ def test_stopping_answers_everything_accepted_and_takes_nothing_new(core: MapCor
     effects = solved(core, run_of(effects))
     assert [e.asker for e in effects if isinstance(e, Answer)] == ["a2"]
     assert effects[-1] == Drained()
-    assert core.ask(Asked("q", "stats", b""), 3.0)[0].problem.code == "shutting_down"  # type: ignore[union-attr]
+    assert core.ask(ArrivedQuestion("q", "stats", b""), 3.0)[0].problem.code == "shutting_down"  # type: ignore[union-attr]
 
 
 def test_stopping_when_nothing_waits_is_done_at_once(core: MapCore) -> None:
@@ -202,7 +202,7 @@ def test_stopping_when_nothing_waits_is_done_at_once(core: MapCore) -> None:
 def test_dropping_refuses_what_waits_but_not_what_is_being_solved(core: MapCore) -> None:
     run = run_of(core.insert(insert("a", 1)))
     core.insert(insert("a", 2))
-    core.ask(Asked("q", "estimate", b""), 1.0)
+    core.ask(ArrivedQuestion("q", "estimate", b""), 1.0)
     dropping = core.drop(2.0)
     assert sorted((e.asker, e.problem.code) for e in dropping if isinstance(e, Refuse)) == [
         ("a2", "unknown_map"),
@@ -217,12 +217,12 @@ def test_when_the_thread_of_a_map_fails_nobody_is_left_waiting(core: MapCore) ->
     core.insert(insert("a", 1))
     core.insert(insert("a", 2))
     core.insert(insert("b", 2))
-    core.ask(Asked("q", "estimate", b""), 1.0)
+    core.ask(ArrivedQuestion("q", "estimate", b""), 1.0)
     effects = core.failed(Internal("0123"), 2.0)
     told = [(e.asker, e.problem.code) for e in effects if isinstance(e, Refuse)]
     assert sorted(told) == [("a1", "internal"), ("a2", "internal"), ("b2", "internal"), ("q", "internal")]
     assert effects[-1] == Drained()
-    for later in (core.insert(insert("a", 3)), core.ask(Asked("q", "stats", b""), 3.0)):
+    for later in (core.insert(insert("a", 3)), core.ask(ArrivedQuestion("q", "stats", b""), 3.0)):
         assert [e.problem.code for e in later if isinstance(e, Refuse)] == ["internal"]
 
 

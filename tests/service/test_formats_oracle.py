@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from factorbus.formats import read, write_g2o
-from factorbus.formats.rotations import inverse, product
+from factorbus.formats.rotations import compose_poses, inverse_poses
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -123,13 +123,13 @@ def offset_file(path: Path, record: str, rng: np.random.Generator, lever: float,
     poses = np.array([near(rng, space), near(rng, space)])
     if kind.size in (3, 7) and name != "landmark_se3":
         starts = poses[:1] if name.startswith("between") else None
-        seen = product(poses[-1:], places[offsets - 1 :][:1])  # where the sensor is, or the second one
-        z = seen if starts is None else product(inverse(product(starts, places[:1])), seen)
+        seen = compose_poses(poses[-1:], places[offsets - 1 :][:1])  # where the sensor is, or the second one
+        z = seen if starts is None else compose_poses(inverse_poses(compose_poses(starts, places[:1])), seen)
         wrong = near(rng, space, error)
         if space == "se3":
             wrong[3:6] *= error
             wrong[3:] /= np.linalg.norm(wrong[3:])
-        z = product(z, wrong[None])[0]
+        z = compose_poses(z, wrong[None])[0]
     else:
         z = rng.normal(size=kind.dim)
     root = rng.normal(size=(kind.dim, kind.dim)) + 2 * np.eye(kind.dim)

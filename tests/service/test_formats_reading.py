@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factorbus.formats import GraphFile, read
-from factorbus.formats.rotations import quat_xyzw, rotated
+from factorbus.formats.rotations import quat_xyzw, rotate_vectors
 from factorbus.proto.messages import Factors, Variables
 from factorbus.proto.symbols import symbol
 
@@ -117,7 +117,7 @@ def test_isam_turns_by_yaw_then_pitch_then_roll() -> None:
         @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     )
     quat = np.repeat(quat_xyzw(angles), 3, axis=0)
-    np.testing.assert_allclose(rotated(quat, np.eye(3)).T, turn, atol=1e-15)
+    np.testing.assert_allclose(rotate_vectors(quat, np.eye(3)).T, turn, atol=1e-15)
 
 
 def rpy(quat: np.ndarray) -> np.ndarray:

@@ -1,41 +1,30 @@
 """A map that is left alone before it is at its optimum: further steps of a real solver, told, kept and made again."""
 
-import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from turned import closing, drive, optimum
+from turned import closing, optimum
+from unconverged import DEGREES, EPOCH, FEW, POSES, arrived, inserts
 
 from factorbus.client import Draft
+from factorbus.journal.checkpoints import read_checkpoint, write_checkpoint
 from factorbus.journal.problems import JournalDiffers
-from factorbus.journal.snapshots import read_snapshot, write_snapshot
 from factorbus.journal.store import Store, create, open_store
 from factorbus.proto import codec
-from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Batch, Delta, Insert
+from factorbus.proto.messages import Delta
 from factorbus.service.config import Limits
-from factorbus.service.core.converging import CONVERGE_IDLE_S
-from factorbus.service.core.events import Answer, Applied, Arrived, Drained, Effect, Publish, Stepped
-from factorbus.service.core.map_state import MapCore
+from factorbus.service.core.events import Arrived, Stepped
 from factorbus.service.journal.recovery import recover, verify
 from factorbus.service.journal.writing import written
-from factorbus.service.maps.host import Host
 from factorbus.service.questions.answers import Question
 from factorbus.service.solving.apply import GOES_ON, MapSolver
-from factorbus.service.solving.arrival import read_insert
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 from factorbus.solver.errors import NotFinite
 from factorbus.solver.kernels.model.bounds import MOST_NUMBER
 
-EPOCH, PATIENCE_S = 7, 120.0
-POSES, DEGREES = 100, 120.0
-# Few tries in each step, so that there are many steps.
-FEW = {"max_iterations": 2, "max_nonmonotone_steps": 0}
 MODES = ["inc-l", "all-batch"]
 ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
 
@@ -43,16 +32,6 @@ ALL_MODES = [*MODES, "inc-l-b10", "bayes-tree"]
 def folder_in(mode: str, **options: Any) -> MapSolver:
     settings = Options.of(**{"mode": mode, **FEW, **options})
     return MapSolver(lambda: Solver(settings), EPOCH, Limits(), settings.as_dict())
-
-
-def arrived(sequence: int, batch: Batch) -> Arrived:
-    made = read_insert(None, "a", codec.encode_insert(Insert(sequence, batch)), REQUEST_LIMITS, time.monotonic())
-    assert isinstance(made, Arrived)
-    return made._replace(askers=[f"asker {sequence}"])
-
-
-def inserts() -> list[Arrived]:
-    return [arrived(n + 1, batch) for n, batch in enumerate((*drive(POSES, DEGREES), closing(POSES)))]
 
 
 class Written:
@@ -136,7 +115,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
     again, late = (folder_in(mode, max_iterations=10, max_nonmonotone_steps=20) for _ in range(2))
     assert recover(map_.store, again).same
     late.load(state)
-    assert late.unfinished, "a snapshot knows"
+    assert late.unfinished, "a checkpoint knows"
     while late.unfinished:
         late.apply_whole((), further=True)
     assert values(again) == values(map_.map_solver) == values(late)
@@ -171,9 +150,9 @@ def test_a_journal_has_the_same_bits_again_wherever_it_ends(tmp_path: Path, mode
     assert [record.number for record in map_.store.records() if record.further] == [
         len(came) + n for n in (1, 2, 3, 5, 6)
     ]
-    write_snapshot(tmp_path / "s", state)
+    write_checkpoint(tmp_path / "s", state)
     late = folder_in(mode)
-    late.load(read_snapshot(tmp_path / "s"))
+    late.load(read_checkpoint(tmp_path / "s"))
     assert (late.revision, late.converged) == (at.revision, False)
     map_.converge()
     for other, made in ((again, 2), (late, 0)):
@@ -322,130 +301,3 @@ def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypa
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
     assert map_solver.solver is not broken
     assert told([codec.decode_delta(stepped.delta)]) == values(map_solver)
-
-
-# ---- with threads ---------------------------------------------------------------------------------------------------
-
-
-class Waiting(Solver):
-    """A solver whose further steps say when they begin, and wait for leave."""
-
-    def __init__(self) -> None:
-        super().__init__(Options.of(mode="all-batch", **FEW))
-        self.begun, self.leave = threading.Semaphore(0), threading.Semaphore(0)
-
-    def step(self, settle: bool = False) -> Any:
-        if self.factor_count == POSES and not settle and self._stepper.mark == self._graph.mark():
-            self.begun.release()
-            assert self.leave.acquire(timeout=PATIENCE_S)
-        return super().step(settle)
-
-
-class Told:
-    """What a host had done."""
-
-    def __init__(self) -> None:
-        self.effects: list[Effect] = []
-        self._more = threading.Condition()
-
-    def take(self, effects: list[Effect]) -> None:
-        with self._more:
-            self.effects += effects
-            self._more.notify_all()
-
-    def take_both(self, asker: Any, answer: bytes, delta: bytes) -> None:
-        self.take([Answer(asker, answer), Publish("delta", delta)])
-
-    def wait_for(self, happened: Any) -> None:
-        with self._more:
-            assert self._more.wait_for(happened, PATIENCE_S)
-
-    def answered(self) -> int:
-        return sum(isinstance(effect, Answer) for effect in self.effects)
-
-    def further(self) -> list[int]:
-        """Where deltas of further steps are among all answers and deltas."""
-        sent = [e for e in self.effects if isinstance(e, Answer) or (isinstance(e, Publish) and e.channel == "delta")]
-        reports = [codec.decode_delta(e.message).report if isinstance(e, Publish) else {} for e in sent]
-        return [n for n, report in enumerate(reports) if str(report.get("because")).startswith(GOES_ON)]
-
-
-class Hosted:
-    """A host of a map that has not converged."""
-
-    def __init__(self, solver: Solver) -> None:
-        self.told = Told()
-        self.core = MapCore("m", "all-batch", EPOCH, Limits(step_inserts=1), 0.0)
-        self.host = Host(
-            self.core, MapSolver(lambda: solver, EPOCH, Limits()), self.told.take, self.told.take,
-            lambda reads, taken: None, threading.Lock(), self.told.take_both,
-        )  # fmt: skip
-        self.came = inserts()
-        for one in self.came:
-            self.host.insert(one)
-        self.told.wait_for(lambda: self.told.answered() == len(self.came))
-
-    def tick_until(self, happened: Any) -> None:
-        end = time.monotonic() + PATIENCE_S
-        while not happened():
-            self.host.tick()
-            assert time.monotonic() < end
-
-    def end(self) -> None:
-        self.host.stop()
-        self.told.wait_for(lambda: any(isinstance(effect, Drained) for effect in self.told.effects))
-        self.host.end()
-
-
-@pytest.fixture
-def waiting() -> Iterator[tuple[Hosted, Waiting]]:
-    solver = Waiting()
-    hosted = Hosted(solver)
-    yield hosted, solver
-    solver.leave.release(10_000)
-    hosted.end()
-
-
-def test_an_insert_waits_for_the_further_step_under_way_and_no_other(waiting: tuple[Hosted, Waiting]) -> None:
-    hosted, solver = waiting
-    hosted.tick_until(lambda: solver.begun.acquire(blocking=False))
-    answered = hosted.told.answered()
-    hosted.host.insert(arrived(len(hosted.came) + 1, closing(POSES)))
-    solver.leave.release()
-    hosted.told.wait_for(lambda: hosted.told.answered() == answered + 1)
-    assert len(hosted.told.further()) == 1
-    assert not solver.begun.acquire(blocking=False), "no second one had begun"
-
-
-def test_a_map_whose_steps_are_of_no_use_does_not_spin() -> None:
-    steps: list[float] = []
-
-    class Stuck(Solver):
-        def step(self, settle: bool = False) -> Any:
-            report = super().step(settle)
-            if report.new_factors or report.new_variables:
-                return report._replace(converged=self.factor_count < POSES)
-            steps.append(time.monotonic())
-            self._stepper._changed = self._stepper._changed[:0]
-            return report._replace(converged=False, changed=0, damping=0.0)
-
-    hosted = Hosted(Stuck(Options(mode="all-batch")))
-    try:
-        hosted.tick_until(lambda: hosted.core.stats(0.0)["gave_up"])
-        end = time.monotonic() + 20 * CONVERGE_IDLE_S
-        hosted.tick_until(lambda: time.monotonic() > end)
-        assert len(steps) == 3
-        assert "3 further steps in a row changed nothing" in hosted.core.stats(0.0)["gave_up"]
-        assert not hosted.core.row()["converging"]
-    finally:
-        hosted.end()
-
-
-def test_a_map_that_comes_to_an_end_by_itself_is_what_it_says(waiting: tuple[Hosted, Waiting]) -> None:
-    hosted, solver = waiting
-    solver.leave.release(10_000)
-    hosted.tick_until(lambda: not hosted.core.row()["converging"])
-    assert hosted.core.row()["converged"]
-    assert not any(isinstance(e, Applied) for e in hosted.told.effects)
-    assert hosted.core.stats(0.0)["chi2"] == pytest.approx(optimum(POSES, DEGREES), rel=1e-6)
-    assert np.isclose(solver.chi2(), hosted.core.stats(0.0)["chi2"], rtol=1e-12)

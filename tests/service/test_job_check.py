@@ -14,7 +14,7 @@ from factorbus.proto.messages import Batch, Factors, Graph, Job, JobDone, Optimu
 from factorbus.proto.symbols import symbol
 from factorbus.service.jobs import running as service_jobs
 from factorbus.service.jobs.dispatch import Ended
-from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, judged
+from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, checked_result
 from factorbus.service.jobs.running import Jobs, do_here
 
 N, FIRST, LAST = 7, 2, 5
@@ -47,7 +47,7 @@ def done(job: Job, payload: bytes) -> JobDone:
 def test_what_the_service_does_itself_passes(job: Job) -> None:
     answer = do_here(job)
     assert isinstance(answer, JobDone)
-    assert judged(job, answer) is answer
+    assert checked_result(job, answer) is answer
 
 
 def test_an_optimum_may_leave_out_what_is_fixed_and_may_not_move_it() -> None:
@@ -56,11 +56,11 @@ def test_an_optimum_may_leave_out_what_is_fixed_and_may_not_move_it() -> None:
     free = tuple(group for group in right.variables if not group.fixed)
     assert len(free) < len(right.variables)
     short = done(job, codec.encode_optimum(Optimum(right.chi2, 1, free)))
-    assert judged(job, short) is short
+    assert checked_result(job, short) is short
     (fixed,) = (group for group in right.variables if group.fixed)
     moved = Variables("se2", fixed.keys, np.ones((1, 3)), fixed=True)
     answer = done(job, codec.encode_optimum(Optimum(right.chi2, 1, (*free, moved))))
-    assert judged(job, answer) is answer, "it is held where it is, whatever a worker says"
+    assert checked_result(job, answer) is answer, "it is held where it is, whatever a worker says"
 
 
 def test_an_optimum_may_say_that_it_has_not_converged_and_says_it_with_a_bool() -> None:
@@ -68,9 +68,9 @@ def test_an_optimum_may_say_that_it_has_not_converged_and_says_it_with_a_bool() 
     right = codec.decode_map(do_here(job).payload)
     assert "converged" not in right
     early = done(job, codec.encode_map(right | {"converged": False}))
-    assert judged(job, early) is early
+    assert checked_result(job, early) is early
     for wrong in ("no", 0, None):
-        answer = judged(job, done(job, codec.encode_map(right | {"converged": wrong})))
+        answer = checked_result(job, done(job, codec.encode_map(right | {"converged": wrong})))
         assert type(answer) is WrongAnswer
         assert "converged" in answer.message
 
@@ -84,11 +84,11 @@ def test_arrays_of_features_have_the_shapes_of_their_form(form: str) -> None:
             continue
         for wrong, kind in ((array[:-1], WrongAnswer), (np.full_like(array, np.inf), DoubtfulAnswer)):
             answer = encoded(right._replace(**{name: wrong}))
-            assert type(judged(job, done(job, answer))) is kind, name
+            assert type(checked_result(job, done(job, answer))) is kind, name
     for other in set(FORMS) - {form}:
         there = idp_job.do(features_job(other).payload)
-        assert isinstance(judged(job, done(job, there)), WrongAnswer)
-    assert isinstance(judged(job, done(job, encoded(right._replace(stored=True, rows=None)))), JobDone) == (
+        assert isinstance(checked_result(job, done(job, there)), WrongAnswer)
+    assert isinstance(checked_result(job, done(job, encoded(right._replace(stored=True, rows=None)))), JobDone) == (
         form != "rows"
     ), "there is no segment to store it in"
 

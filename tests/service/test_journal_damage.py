@@ -59,7 +59,7 @@ def content(folder: Path) -> tuple[object, ...]:
     store = open_store(folder)
     try:
         store.check_form()
-        return store.header(), store.last(), list(store.records()), store.senders(1, 256, 1024), store.snapshots()
+        return store.header(), store.last(), list(store.records()), store.senders(1, 256, 1024), store.checkpoints()
     finally:
         store.close()
 
@@ -226,7 +226,7 @@ def test_whatever_is_damaged_is_said_or_all_there(tmp_path: Path, left: Callable
         "UPDATE entry SET client = CAST(x'ff' AS TEXT) WHERE number = 3",
         "UPDATE entry SET message = 'text' WHERE number = 3",
         "UPDATE entry SET sequence = 'text' WHERE number = 3",
-        "DROP TABLE snapshot",
+        "DROP TABLE checkpoint",
     ],
 )
 def test_rows_that_are_not_what_was_written_are_damage(tmp_path: Path, statement: str) -> None:
@@ -262,7 +262,7 @@ def test_a_map_whose_database_is_gone_is_still_a_map(tmp_path: Path) -> None:
     for name in ("m", "n"):
         written(tmp_path, name=name)
         (tmp_path / name / NAME).unlink()
-    (tmp_path / "n" / LOG).rename(tmp_path / "n" / "snapshot-3.fbs")
+    (tmp_path / "n" / LOG).rename(tmp_path / "n" / "checkpoint-3.fbs")
     (tmp_path / "else").mkdir(mode=0o700)
     (tmp_path / "else" / "notes.txt").write_text("no map")
     assert maps_in(tmp_path, NAME) == ["m", "n"]

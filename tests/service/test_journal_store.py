@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from factorbus.cli.main import main
 from factorbus.journal import chain
 from factorbus.journal.bundle import export_map, import_map
+from factorbus.journal.checkpoints import file_of, read_checkpoint, remove_strangers, write_checkpoint
 from factorbus.journal.digest import sealed
 from factorbus.journal.folders import left_behind, maps_in
 from factorbus.journal.lock import own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalInUse, JournalVersion, MapThere, NoJournal
 from factorbus.journal.records import ACCEPTED, REFUSED, Entry, Epoch, JournalRecord
-from factorbus.journal.snapshots import file_of, read_snapshot, remove_strangers, write_snapshot
-from factorbus.journal.store import FORM, NAME, Saved, Store, create, open_store
+from factorbus.journal.store import FORM, NAME, Checkpoint, Store, create, open_store
 
 
 def entry(client: str, sequence: int, message: bytes = b"hello") -> Entry:
@@ -50,7 +51,7 @@ def test_what_was_written_is_there_when_it_is_opened_again(store: Store) -> None
         (3, [("a", 3), ("b", 2)]),
     ]
     assert again.last() == (3, 3, b"\x03" * 16)
-    assert again.at(2).chain == b"\x02" * 16
+    assert again.last_at(2).chain == b"\x02" * 16
     assert list(again.check()) == []
     assert again.counts() == {"records": 3, "inserts": 5, "clients": 2, "message_bytes": 24}
 
@@ -208,14 +209,17 @@ def test_a_journal_that_was_not_finished_is_not_there(tmp_path: Path) -> None:
     assert maps_in(tmp_path, NAME) == ["m", "n"]
 
 
-def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path) -> None:
+def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     store.close()
-    with sqlite3.connect(store.path) as database:
-        database.execute(f"PRAGMA user_version = {FORM + 1}")
-    database.close()
-    with pytest.raises(JournalVersion, match="a newer version wrote it") as caught:
-        open_store(store.path.parent)
-    assert caught.value.code == "journal_version"
+    for form, words in ((FORM + 1, "a newer version wrote it"), (FORM - 1, "export it with the version that wrote it")):
+        with sqlite3.connect(store.path) as database:
+            database.execute(f"PRAGMA user_version = {form}")
+        database.close()
+        with pytest.raises(JournalVersion, match=words) as caught:
+            open_store(store.path.parent)
+        assert caught.value.code == "journal_version"
+        assert main(["journal", "show", "--journal", str(tmp_path)]) != 0
+        assert "[journal_version]" in capsys.readouterr().err
     store.path.write_bytes(b"not a database" * 100)
     with pytest.raises(JournalDamaged):
         open_store(store.path.parent)
@@ -223,7 +227,7 @@ def test_of_another_form_or_no_journal_at_all(store: Store, tmp_path: Path) -> N
         open_store(tmp_path / "nothing")
 
 
-def test_a_snapshot_comes_back_to_the_bit_or_not_at_all(tmp_path: Path) -> None:
+def test_a_checkpoint_comes_back_to_the_bit_or_not_at_all(tmp_path: Path) -> None:
     state = {
         "numbers": np.array([[1.5, -0.0], [np.nan, 0.0]]),
         "none": np.zeros((0, 3)),
@@ -231,8 +235,8 @@ def test_a_snapshot_comes_back_to_the_bit_or_not_at_all(tmp_path: Path) -> None:
         "inner": {"list": [1, "two", None], "zero": np.zeros(5, np.int64)},
     }
     path = file_of(tmp_path, 12)
-    assert write_snapshot(path, state) == path.stat().st_size
-    back = read_snapshot(path)
+    assert write_checkpoint(path, state) == path.stat().st_size
+    back = read_checkpoint(path)
     assert back["inner"]["list"] == [1, "two", None]
     for one, other in ((state["numbers"], back["numbers"]), (state["many"], back["many"])):
         assert one.tobytes() == other.tobytes()  # type: ignore[attr-defined]
@@ -242,32 +246,33 @@ def test_a_snapshot_comes_back_to_the_bit_or_not_at_all(tmp_path: Path) -> None:
         content[at] ^= 1
         path.write_bytes(content)
         with pytest.raises(ValueError, match="damaged or incomplete"):
-            read_snapshot(path)
+            read_checkpoint(path)
         content[at] ^= 1
     path.write_bytes(content[:-1])
     with pytest.raises(ValueError, match="damaged or incomplete"):
-        read_snapshot(path)
+        read_checkpoint(path)
 
 
-def test_snapshots_that_nobody_noted_go(store: Store) -> None:
+def test_checkpoints_that_nobody_noted_go(store: Store) -> None:
     folder = store.path.parent
     for number in (1, 2, 3):
-        write_snapshot(file_of(folder, number), {"n": number})
-        assert store.add_snapshot(Saved(number, 1, {"sources": "here"}, "", 10), 2) == ([1] if number == 3 else [])
-    (folder / "snapshot-4.part").write_bytes(b"begun")
-    remove_strangers(folder, {saved.record for saved in store.snapshots()})
-    assert sorted(p.name for p in folder.glob("snapshot*")) == ["snapshot-2.fbs", "snapshot-3.fbs"]
+        write_checkpoint(file_of(folder, number), {"n": number})
+        saved = Checkpoint(number, 1, {"sources": "here"}, "", 10)
+        assert store.add_checkpoint(saved, 2) == ([1] if number == 3 else [])
+    (folder / "checkpoint-4.part").write_bytes(b"begun")
+    remove_strangers(folder, {saved.record for saved in store.checkpoints()})
+    assert sorted(p.name for p in folder.glob("checkpoint*")) == ["checkpoint-2.fbs", "checkpoint-3.fbs"]
 
 
 def test_a_map_is_one_file_and_back(store: Store, tmp_path: Path) -> None:
-    write_snapshot(file_of(store.path.parent, 3), {"state": np.arange(5)})
-    store.add_snapshot(Saved(3, 1, {"sources": "here"}, "", 1), 2)
+    write_checkpoint(file_of(store.path.parent, 3), {"state": np.arange(5)})
+    store.add_checkpoint(Checkpoint(3, 1, {"sources": "here"}, "", 1), 2)
     export_map(store.path.parent, tmp_path / "m.fbmap")  # while it is open for writing
     import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     again = open_store(tmp_path / "other" / "n")
     assert list(again.records()) == list(store.records())
     assert (again.header().map, again.header().epoch) == ("n", 77)
-    assert read_snapshot(file_of(tmp_path / "other" / "n", 3))["state"].tolist() == [0, 1, 2, 3, 4]
+    assert read_checkpoint(file_of(tmp_path / "other" / "n", 3))["state"].tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(MapThere, match="there is a map 'n'"):
         import_map(tmp_path / "m.fbmap", tmp_path / "other" / "n")
     (tmp_path / "broken").write_bytes((tmp_path / "m.fbmap").read_bytes()[:5000])
@@ -307,9 +312,9 @@ def test_the_chain_follows_values_and_time_stamps_and_not_accounts() -> None:
         rows = (Variables("se2", np.array([1]), np.array([[value, 0.0, 0.0]]), stamps=stamps),)
         return codec.encode_delta(Delta(1, 2, 1, rows, {"step_ms": ms}))
 
-    one = chain.follow(chain.START, delta(1.0, 3.0))
-    assert one == chain.follow(chain.START, delta(1.0, 4.0))
-    assert one != chain.follow(chain.START, delta(np.nextafter(1.0, 2.0), 3.0))
-    assert one != chain.follow(one, delta(1.0, 3.0))
-    assert len({one, *(chain.follow(chain.START, delta(1.0, 3.0, stamp)) for stamp in (0, 1))}) == 3
+    one = chain.extend_chain(chain.START, delta(1.0, 3.0))
+    assert one == chain.extend_chain(chain.START, delta(1.0, 4.0))
+    assert one != chain.extend_chain(chain.START, delta(np.nextafter(1.0, 2.0), 3.0))
+    assert one != chain.extend_chain(one, delta(1.0, 3.0))
+    assert len({one, *(chain.extend_chain(chain.START, delta(1.0, 3.0, stamp)) for stamp in (0, 1))}) == 3
     assert NAME == "journal.db"

@@ -1,4 +1,4 @@
-"""A journal that another build of the solver wrote: opened from its snapshot, and what differs is said."""
+"""A journal that another build of the solver wrote: opened from its checkpoint, and what differs is said."""
 
 import json
 import sqlite3
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from factorbus.journal.checkpoints import file_of
 from factorbus.journal.problems import JournalDiffers, JournalFailed
 from factorbus.journal.records import Maker
-from factorbus.journal.snapshots import file_of
 from factorbus.journal.store import NAME
 from factorbus.proto import codec
 from factorbus.proto.limits import REQUEST_LIMITS
@@ -31,7 +31,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import MODE_OF_NAME
 from factorbus.solver.state import FORMAT
 
-INSERTS, SNAPSHOT = 12, 8
+INSERTS, CHECKPOINT = 12, 8
 BATCHES = [step.batch for step in manhattan(INSERTS + 8, 2)]
 
 
@@ -78,8 +78,8 @@ class Session:
     def makers(self) -> list[Maker]:
         return self.kept.store.makers()
 
-    def close(self, snapshot: bool = False) -> None:
-        self.keeper.close(self.map_solver.dump if snapshot else None)
+    def close(self, checkpoint: bool = False) -> None:
+        self.keeper.close(self.map_solver.dump if checkpoint else None)
 
 
 @pytest.fixture
@@ -98,11 +98,11 @@ def reopen(library: Library) -> Callable[[], Session]:
 
 @pytest.fixture(params=["bayes-tree", "inc-l"])
 def values(library: Library, request: pytest.FixtureRequest) -> dict[int, bytes]:
-    """A map with twelve inserts and a snapshot after the eighth, closed; what its values were."""
+    """A map with twelve inserts and a checkpoint after the eighth, closed; what its values were."""
     session = Session(library.make("m", request.param, Limits()))
-    session.insert(*BATCHES[:SNAPSHOT])
-    session.keeper.snapshot(session.map_solver.dump(), 0.0)
-    session.insert(*BATCHES[SNAPSHOT:INSERTS])
+    session.insert(*BATCHES[:CHECKPOINT])
+    session.keeper.checkpoint(session.map_solver.dump(), 0.0)
+    session.insert(*BATCHES[CHECKPOINT:INSERTS])
     found = session.values()
     session.close()
     return found
@@ -118,7 +118,7 @@ def changed(folder: Path, *statements: str) -> None:
 def by_another(folder: Path, **parts: str) -> None:
     """As if a build that differs in these parts had written it."""
     other = json.dumps({**present_build(), **parts})
-    changed(folder, f"UPDATE snapshot SET build = '{other}'", f"UPDATE maker SET build = '{other}'")
+    changed(folder, f"UPDATE checkpoint SET build = '{other}'", f"UPDATE maker SET build = '{other}'")
 
 
 def rounding_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,13 +135,13 @@ def rounding_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("part", ["sources", "processor", "versions", "flags"])
-def test_another_build_goes_on_from_the_snapshot_and_says_so(
+def test_another_build_goes_on_from_the_checkpoint_and_says_so(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, part: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Upgraded, or moved to another machine; here all bits are the same, and that has been seen."""
     by_another(tmp_path / "m", **{part: "elsewhere"})
     session = reopen()
-    assert (session.recovered.from_record, session.recovered.records) == (SNAPSHOT, INSERTS - SNAPSHOT)
+    assert (session.recovered.from_record, session.recovered.records) == (CHECKPOINT, INSERTS - CHECKPOINT)
     assert session.recovered.same
     assert session.recovered.other_build.startswith(f"{part} elsewhere, here ")
     assert f"map m was made by another build of the solver: {part} elsewhere" in caplog.text
@@ -162,7 +162,7 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
 ) -> None:
     session = reopen()
     session.insert(BATCHES[INSERTS])
-    session.keeper.snapshot(session.map_solver.dump(), 0.0)
+    session.keeper.checkpoint(session.map_solver.dump(), 0.0)
     session.close()
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
@@ -170,7 +170,7 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
     assert session.recovered.same, "no value has changed"
     row = session.row()
     assert row["reproducible"] is False
-    assert row["reason"].startswith(f"another build wrote the snapshot of record {INSERTS + 1} (processor elsewhere")
+    assert row["reason"].startswith(f"another build wrote the checkpoint of record {INSERTS + 1} (processor elsewhere")
     assert f"map m is not reproducible: {row['reason']}" in caplog.text
     assert session.kept.header.epochs[1:] == ()
     session.close()
@@ -180,32 +180,32 @@ def test_where_no_fold_can_be_compared_that_is_said_and_stays_known(
     session.close()
     session = reopen()
     assert session.row()["reason"] == row["reason"], "a record that this build made itself compares nothing"
-    session.keeper.snapshot(session.map_solver.dump(), 0.0)
+    session.keeper.checkpoint(session.map_solver.dump(), 0.0)
     session.close()
     session = reopen()
     assert session.recovered.other_build == ""
-    assert session.row()["reason"] == row["reason"], "what is before the snapshot is still by another one"
+    assert session.row()["reason"] == row["reason"], "what is before the checkpoint is still by another one"
     session.close()
 
 
-def test_other_bits_after_the_snapshot_are_said_and_begin_an_epoch(
+def test_other_bits_after_the_checkpoint_are_said_and_begin_an_epoch(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_another(tmp_path / "m", processor="elsewhere")
     rounding_otherwise(monkeypatch)
     session = reopen()
-    assert (session.recovered.from_record, session.recovered.same) == (SNAPSHOT, False)
+    assert (session.recovered.from_record, session.recovered.same) == (CHECKPOINT, False)
     assert session.values() != values
     assert session.values().keys() == values.keys()
     row = session.row()
     assert row["reproducible"] is False
     assert row["reason"].startswith(
-        f"from revision {SNAPSHOT + 1} on, values have other bits than they had: another build made them (processor "
+        f"from revision {CHECKPOINT + 1} on, values have other bits than they had: another build made them (processor "
     )
     assert len(session.kept.header.epochs) == 2
     assert "other bits" in session.kept.header.epochs[-1].because
-    assert session.keeper.wants_snapshot(), "another restart would not lead to these bits by another build"
-    session.keeper.snapshot(session.map_solver.dump(), 0.0)
+    assert session.keeper.wants_checkpoint(), "another restart would not lead to these bits by another build"
+    session.keeper.checkpoint(session.map_solver.dump(), 0.0)
     session.insert(BATCHES[INSERTS])
     present = session.values()
     session.close()
@@ -238,10 +238,10 @@ def test_a_fold_with_other_bits_does_not_hide_those_after_it(
     assert [number for number, alike in same.items() if not alike] == [9, 10], "10 begins with the digest of 9"
 
 
-def test_a_snapshot_in_another_format_is_not_read_and_all_is_folded_again(
+def test_a_checkpoint_in_another_format_is_not_read_and_all_is_folded_again(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    changed(tmp_path / "m", f"UPDATE snapshot SET format = {FORMAT + 1}")
+    changed(tmp_path / "m", f"UPDATE checkpoint SET format = {FORMAT + 1}")
     session = reopen()
     assert (session.recovered.from_record, session.recovered.records, session.recovered.same) == (0, INSERTS, True)
     assert f"has a state of format {FORMAT + 1}, this version reads {FORMAT}: not used" in caplog.text
@@ -254,24 +254,24 @@ def test_a_long_replay_is_made_once(
     values: dict[int, bytes], library: Library, reopen: Callable[[], Session], tmp_path: Path
 ) -> None:
     """It counts as steps do: the state is written when the service stops, if nothing came, or soon after an insert."""
-    changed(tmp_path / "m", f"UPDATE snapshot SET format = {FORMAT + 1}")
-    library._config = Config(journal=str(tmp_path), snapshot_s=1e-6)
+    changed(tmp_path / "m", f"UPDATE checkpoint SET format = {FORMAT + 1}")
+    library._config = Config(journal=str(tmp_path), checkpoint_s=1e-6)
     session = reopen()
     assert session.recovered.from_record == 0
-    assert session.keeper.wants_snapshot()
-    session.close(snapshot=True)
+    assert session.keeper.wants_checkpoint()
+    session.close(checkpoint=True)
     session = reopen()
     assert (session.recovered.from_record, session.recovered.records) == (INSERTS, 0)
     session.close()
 
 
 @pytest.mark.parametrize("processor", ["", "elsewhere"])
-def test_a_damaged_snapshot_is_not_read_whoever_wrote_it(
+def test_a_damaged_checkpoint_is_not_read_whoever_wrote_it(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, processor: str
 ) -> None:
     if processor:
         by_another(tmp_path / "m", processor=processor)
-    path = file_of(tmp_path / "m", SNAPSHOT)
+    path = file_of(tmp_path / "m", CHECKPOINT)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
@@ -290,16 +290,16 @@ def test_vectors_of_another_width_leave_the_estimate_and_r_is_computed_anew(
     true_load = Solver.load
     monkeypatch.setattr(Solver, "load", lambda solver, state: true_load(solver, {**state, "lanes": 0}))
     session = reopen()
-    assert (session.recovered.from_record, session.recovered.records) == (SNAPSHOT, INSERTS - SNAPSHOT)
+    assert (session.recovered.from_record, session.recovered.records) == (CHECKPOINT, INSERTS - CHECKPOINT)
     assert session.row()["reason"].startswith(
-        f"R was computed anew: snapshot {SNAPSHOT} has it for vectors of another width"
+        f"R was computed anew: checkpoint {CHECKPOINT} has it for vectors of another width"
     )
     assert len(session.kept.header.epochs) == 2
     assert session.map_solver.revision == INSERTS
     for key, row in session.values().items():
         assert np.frombuffer(row) == pytest.approx(np.frombuffer(values[key]), abs=1e-3)
     session.insert(*BATCHES[INSERTS:])
-    session.close(snapshot=True)
+    session.close(checkpoint=True)
     monkeypatch.undo()
     session = reopen()
     assert (session.recovered.from_record, session.recovered.same) == (len(BATCHES), True)
@@ -315,7 +315,7 @@ def test_a_step_more_or_less_by_another_build_keeps_no_map_closed(
         reopen()
     by_another(tmp_path / "m", processor="elsewhere")
     session = reopen()
-    assert (session.recovered.from_record, session.recovered.same) == (SNAPSHOT, False)
+    assert (session.recovered.from_record, session.recovered.same) == (CHECKPOINT, False)
     assert session.map_solver.revision == INSERTS + 1
     session.close()
     changed(tmp_path / "m", "DELETE FROM entry WHERE record = 11")

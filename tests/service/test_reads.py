@@ -12,7 +12,7 @@ from factorbus.proto import asking, asking_codec, codec
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.service.bus.delivery import Delivery
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Applied, Arrived, Asked, Effect, InsertBatch, Read
+from factorbus.service.core.events import Applied, Arrived, ArrivedQuestion, Effect, InsertBatch, Read
 from factorbus.service.core.map_state import MapCore
 from factorbus.service.core.pending_questions import Reads
 from factorbus.service.questions.answers import Question, QuestionCopies, answer, parse, snapshot
@@ -68,9 +68,9 @@ def test_questions_that_take_a_copy_go_together_and_the_others_keep_their_order(
 
 def test_inserts_are_taken_between_them() -> None:
     core = MapCore("m", "bayes-tree", 5, Limits(), now=0.0)
-    run = run_of(core.ask(Asked(0, "covariance", covariance(8)), 1.0))
+    run = run_of(core.ask(ArrivedQuestion(0, "covariance", covariance(8)), 1.0))
     for n in range(1, 100):
-        core.ask(Asked(n, "covariance", covariance(8)), 1.0)
+        core.ask(ArrivedQuestion(n, "covariance", covariance(8)), 1.0)
     core.insert(Arrived(["a1"], "a", 1, 0, 10, 1, Insert(1, Batch()), 1.0))
     run = run_of(core.applied(Applied(3, 4, 0.5, 2.0)))
     assert ([read.asker for read in run.reads], [insert.sequence for insert in run.inserts]) == ([1], [1])

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorbus.proto import codec
-from factorbus.proto.limits import Limits as MessageLimits
+from factorbus.proto.limits import MessageLimits as MessageLimits
 from factorbus.proto.messages import Accepted, Batch, Factors, Insert, Variables
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import BadMessage, Problem

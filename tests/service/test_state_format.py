@@ -1,4 +1,4 @@
-"""A snapshot's layout changes only together with `solver.state.FORMAT`, so no solver goes on from what it misreads.
+"""A checkpoint's layout changes only together with `solver.state.FORMAT`, so no solver goes on from what it misreads.
 
 `state_format.json` has the layout that goes with the number: the parts of a state in every mode, with the type of each
 and the rows of its arrays, and the constants by which kernels find their way in these.  Where this test fails, raise

@@ -62,13 +62,13 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
 
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
     monkeypatch.setattr(together, "core_count", lambda: 2)
-    before, told = together.compiled_seconds(), []
+    before, told = together.seconds_compiling(), []
     together.warm(told.append)
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
     assert {tuple(command[:4]) for command in asked} == {
         (sys.executable, "-P", "-m", "factorbus.service.operations.warm")
     }
-    assert together.compiled_seconds() > before, "who waits for them says so"
+    assert together.seconds_compiling() > before, "who waits for them says so"
 
 
 @pytest.mark.parametrize(("gigabytes", "collects"), [(7, True), (8, False)])

@@ -23,7 +23,7 @@ class Two(Arenas):
 
 
 def rows(thing: Arenas) -> list[tuple[int, ...]]:
-    return [tuple(row) for row in thing.places.reshape(-1, WIDTH).tolist()]
+    return [tuple(row) for row in thing.array_table.reshape(-1, WIDTH).tolist()]
 
 
 def of(array: np.ndarray) -> tuple[int, ...]:
@@ -33,14 +33,14 @@ def of(array: np.ndarray) -> tuple[int, ...]:
 def test_it_has_address_and_shape_of_each() -> None:
     two = Two()
     assert rows(two) == [of(two.first), of(two.second)]
-    assert two.places is two.places
+    assert two.array_table is two.array_table
 
 
 def test_it_follows_an_assignment() -> None:
     two = Two()
-    table = two.places
+    table = two.array_table
     two.other = np.zeros(5)
-    assert two.places is table
+    assert two.array_table is table
     two.second = np.ones((8, 2))
     assert rows(two) == [of(two.first), of(two.second)]
 
@@ -69,7 +69,7 @@ def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
     tree = solver._stepper.tree
     for thing, names in ((solver._graph, model.Graph._fields), (tree, bayes_tree.Tree._fields)):
         assert rows(thing) == [of(getattr(thing, name)) for name in names]
-    graph, looked_up = model.graph_at(solver._graph.places), bayes_tree.tree_at(tree.places)
+    graph, looked_up = model.graph_at(solver._graph.array_table), bayes_tree.tree_at(tree.array_table)
     assert all(np.shares_memory(getattr(graph, name), getattr(solver._graph, name)) for name in graph._fields)
     assert all(np.shares_memory(getattr(looked_up, name), getattr(tree, name)) for name in looked_up._fields)
 

@@ -16,6 +16,7 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.bayes_tree.steps import TreeSteps
+from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
 from factorbus.solver.divergence import copied
@@ -137,11 +138,11 @@ def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: in
             before = bits(solver), rows_of(solver)
             refused, came = "", None
             try:
-                anew, _, _, counted = solver.with_changes(changes)
+                anew, _, _, counted = with_changes(solver, changes)
             except errors.SolverError as problem:
                 refused = str(problem)
             try:
-                came = solver.try_change(changes)
+                came = try_change(solver, changes)
             except errors.SolverError as problem:
                 assert_is_said(problem, refused)
             if refused:
@@ -187,13 +188,13 @@ def bars() -> tuple[Solver, int]:
 def test_what_the_numbers_alone_say_is_free_is_left_as_it_was_to_the_bit() -> None:
     solver, first = bars()
     other, _ = bars()
-    done = solver.try_change([Change("remove_factors", np.array([first]))])
+    done = try_change(solver, [Change("remove_factors", np.array([first]))])
     assert done is not None
-    assert other.try_change([Change("remove_factors", np.array([first]))]) is not None
+    assert try_change(other, [Change("remove_factors", np.array([first]))]) is not None
     gone = [Change("remove_factors", np.array([first + 2])), Change("weigh", np.array([first + 1]), weight=np.ones(1))]
-    assert solver.try_change(gone) is None, "one bearing does not hold a point"
+    assert try_change(solver, gone) is None, "one bearing does not hold a point"
     with pytest.raises(errors.Underconstrained):
-        solver.with_changes(gone)
+        with_changes(solver, gone)
     assert rows_of(solver) == rows_of(other)
     near = Factors("prior_point2", np.array([[10]]), np.array([[2.1, 5.2]]), np.array([[1.0, 0, 1.0]]))
     for each in (solver, other):
@@ -201,7 +202,7 @@ def test_what_the_numbers_alone_say_is_free_is_left_as_it_was_to_the_bit() -> No
         each.step()
         assert_is_whole(each, each.chi2())
     assert bits(solver) == bits(other)
-    assert solver.try_change(gone) is not None, "now it is held"
+    assert try_change(solver, gone) is not None, "now it is held"
 
 
 def test_what_nothing_joins_to_the_map_is_not_changed() -> None:
@@ -214,9 +215,9 @@ def test_what_nothing_joins_to_the_map_is_not_changed() -> None:
             each.step()
     key = int(solver._graph.keys[49])
     at_end = [each for each in rows_of(solver) if key in np.frombuffer(rows_of(solver)[each][1], np.int64)]
-    assert solver.try_change([Change("remove_factors", np.array(at_end))]) is None
+    assert try_change(solver, [Change("remove_factors", np.array(at_end))]) is None
     with pytest.raises(errors.Underconstrained):
-        solver.with_changes([Change("remove_factors", np.array(at_end))])
+        with_changes(solver, [Change("remove_factors", np.array(at_end))])
     for batch in batches[50:]:
         for each in (solver, other):
             each.stage(batch)
@@ -230,14 +231,14 @@ def test_a_batch_that_is_refused_has_the_change_undone() -> None:
     halved = Change("weigh", np.array([first]), weight=np.array([0.5]))
     change = [halved, Change("remove_factors", np.array([first + 1]))]
     floating = Batch((Variables("point2", np.array([11]), np.zeros((1, 2))),))
-    assert solver.try_change(change, floating) is None
+    assert try_change(solver, change, floating) is None
     unknown = Batch(factors=(Factors("prior_point2", np.array([[99]]), np.zeros((1, 2)), np.array([[1.0, 0, 1]])),))
     with pytest.raises(errors.UnknownVariable):
-        solver.try_change(change, unknown)
+        try_change(solver, change, unknown)
     assert rows_of(solver) == rows_of(other)
     held = Batch((Variables("point2", np.array([11])),), (
         Factors("landmark_se2", np.array([[0, 11]]), np.array([[1.0, 1.0]]), np.array([[1.0, 0, 1]])),))  # fmt: skip
-    results = [each.try_change(change, held) for each in (solver, other)]
+    results = [try_change(each, change, held) for each in (solver, other)]
     assert results[0] is not None
     assert results[1] is not None
     assert results[0][0] == results[1][0] == first + 3
@@ -256,17 +257,17 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
     with monkeypatch.context() as broken:
         if what == "soundness":
             broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
-            assert solver.try_change(change) is None
+            assert try_change(solver, change) is None
         else:
             assert isinstance(solver._stepper, TreeSteps)
             broken.setattr(type(solver._stepper.tree), "step", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
-                solver.try_change(change)
+                try_change(solver, change)
     assert rows_of(solver) == before[1]
     assert solver.chi2() == pytest.approx(before[2], abs=1e-12)
     for key, (_, row) in values(solver).items():
         np.testing.assert_allclose(row, before[0][key][1], rtol=0, atol=1e-12)
-    came = solver.try_change(change)
+    came = try_change(solver, change)
     assert came is not None
     assert_is_whole(solver, came[1].chi2)
 
@@ -287,10 +288,10 @@ def drive(count: int, seed: int) -> tuple[Solver, list[int]]:
 def test_a_change_costs_what_it_touches() -> None:
     """Flops and cliques of single changes beside those of the whole map."""
     solver, loops = drive(600, 5)
-    _, _, whole, _ = solver.with_changes([Change("weigh", np.array(loops[:1]), weight=np.array([0.5]))])
+    _, _, whole, _ = with_changes(solver, [Change("weigh", np.array(loops[:1]), weight=np.array([0.5]))])
     flops, eliminated = [], []
     for each in loops[-40:]:
-        came = solver.try_change([Change("loss", np.array([each]), loss="huber", scale=np.ones(1))])
+        came = try_change(solver, [Change("loss", np.array([each]), loss="huber", scale=np.ones(1))])
         assert came is not None
         flops.append(came[1].flops)
         eliminated.append(came[1].eliminated)
@@ -309,7 +310,7 @@ def test_a_false_loop_taken_out_of_a_large_map_leaves_its_optimum() -> None:
     first = solver.stage(Batch(factors=(false,)))
     bent = solver.step()
     assert bent.chi2 > 10 * settled.chi2()
-    came = solver.try_change([Change("remove_factors", np.array([first]))])
+    came = try_change(solver, [Change("remove_factors", np.array([first]))])
     assert came is not None
     report = came[1]
     for _ in range(50):
@@ -328,10 +329,10 @@ def test_holes_are_packed_before_they_are_most_of_all() -> None:
     packed = False
     for n in range(2000):
         used, holes = int(solver._graph.counts[at.PAYLOAD]), solver._graph.holes
-        came = solver.try_change(change[n % 2 : n % 2 + 1])
+        came = try_change(solver, change[n % 2 : n % 2 + 1])
         if came is None:
             assert holes > 0.5 * used
-            solver, *_ = solver.with_changes(change[n % 2 : n % 2 + 1])
+            solver, *_ = with_changes(solver, change[n % 2 : n % 2 + 1])
             packed = True
             assert solver._graph.holes == 0
             break
@@ -345,11 +346,11 @@ def test_a_changed_solver_goes_on_from_its_state_with_the_same_bits() -> None:
     solver, loops = drive(300, 2)
     ids = np.array(loops)
     robust = Change("loss", ids[2:4], loss="dcs", scale=np.ones(2))
-    assert solver.try_change([Change("remove_factors", ids[:2]), robust])
+    assert try_change(solver, [Change("remove_factors", ids[:2]), robust])
     again = copied(solver)
     for each in (solver, again):
-        assert each.try_change([Change("weigh", ids[3:5], weight=np.array([0.5, 2.0]))])
-        came = each.try_change([Change("remove_factors", ids[4:6]), Change("loss", ids[2:3])])
+        assert try_change(each, [Change("weigh", ids[3:5], weight=np.array([0.5, 2.0]))])
+        came = try_change(each, [Change("remove_factors", ids[4:6]), Change("loss", ids[2:3])])
         assert came is not None
     assert bits(solver) == bits(again)
     assert rows_of(solver) == rows_of(again)
@@ -365,7 +366,7 @@ def test_diagonal_blocks_are_kept_up_over_changes() -> None:
     upkeep.update()
     for n, each in enumerate(loops[:12]):
         what = [Change("remove_factors", np.array([each])), Change("weigh", np.array([each]), weight=np.array([0.1]))]
-        assert solver.try_change(what[n % 2 : n % 2 + 1]) is not None
+        assert try_change(solver, what[n % 2 : n % 2 + 1]) is not None
         upkeep.update()
         wanted = CovarianceBlocks(solver.covariances.factored()).diagonal()
         np.testing.assert_allclose(upkeep.diagonal()[:, :3, :3], wanted, rtol=1e-7, atol=1e-12)
@@ -378,4 +379,4 @@ def test_other_modes_make_all_changes_anew(mode: str) -> None:
     for batch in random_steps(1, steps=5):
         solver.stage(batch)
         solver.step()
-    assert solver.try_change([Change("weigh", np.array([3]), weight=np.array([0.5]))]) is None
+    assert try_change(solver, [Change("weigh", np.array([3]), weight=np.array([0.5]))]) is None

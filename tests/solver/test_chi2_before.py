@@ -6,6 +6,7 @@ from naive.dense_least_squares import DenseGraph
 
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.solver import Options, Solver
+from factorbus.solver.changing import with_changes
 from factorbus.solver.report import StepReport
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
@@ -48,14 +49,14 @@ CHANGES: dict[str, tuple[Change, ...]] = {
 @pytest.mark.parametrize("change", sorted(CHANGES))
 def test_of_changes_it_is_that_of_the_estimate(mode: str, change: str) -> None:
     solver = driven(mode)
-    made, _, report, _ = solver.with_changes(CHANGES[change])
+    made, _, report, _ = with_changes(solver, CHANGES[change])
     assert_is_before(report, dense(made, solver))
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_of_placed_variables_it_is_that_of_their_places(mode: str) -> None:
     solver, placed = driven(mode), np.array([[2.0, 0.7, 0.4]])
-    made, _, report, _ = solver.with_changes([Change("place", kind="se2", keys=KEYS[2:3], values=placed)])
+    made, _, report, _ = with_changes(solver, [Change("place", kind="se2", keys=KEYS[2:3], values=placed)])
     before = dense(made, solver)
     before.values[2] = placed[0]
     assert_is_before(report, before)
@@ -64,7 +65,7 @@ def test_of_placed_variables_it_is_that_of_their_places(mode: str) -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_of_a_map_that_goes_on_in_another_solver_it_is_that_of_the_estimate(mode: str) -> None:
     solver = driven(mode)
-    solver.with_changes(CHANGES["weigh"])
+    with_changes(solver, CHANGES["weigh"])
     renewed, eliminated = Solver(Options(mode=mode)), Solver(Options(mode=mode))
     reports = (
         renewed.renew(solver, solver.variable_count, solver.factor_count),
@@ -78,7 +79,7 @@ def test_of_a_map_that_goes_on_in_another_solver_it_is_that_of_the_estimate(mode
 @pytest.mark.parametrize("mode", MODES[:2])
 def test_what_comes_afterwards_is_placed_as_ever(mode: str) -> None:
     """A pose that odometry and a loop hold begins between what the two want."""
-    made = driven(mode).with_changes(CHANGES["weigh"])[0]
+    made = with_changes(driven(mode), CHANGES["weigh"])[0]
     made.stage(Batch((Variables("se2", np.array([4])),), (between(3, 4, ODOMETRY), between(2, 4, LOOP))))
     first = dense(made)
     assert made.step().chi2_before < 0.9 * first.chi2()

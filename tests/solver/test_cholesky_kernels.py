@@ -8,8 +8,8 @@ from naive.elimination import partial_cholesky
 
 from factorbus.solver.kernels.jit import compile as _jit
 from factorbus.solver.kernels.jit import simd_plain
-from factorbus.solver.kernels.jit.simd import LANES, add_run, six, solve_rows, tile, zero
-from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, padded, update_row, update_size
+from factorbus.solver.kernels.jit.simd import LANES, Block, Panel, add_run, six, solve_tile, tile, zero
+from factorbus.solver.kernels.sparse.fronts import GROUP, SCRATCH, Front, padded_size, update_row, update_size
 from factorbus.solver.kernels.sparse.panels import DEPTH
 from factorbus.solver.kernels.sparse.partial_cholesky import factor_front
 from factorbus.solver.sparse.worker_threads import TASK_QUEUE
@@ -45,7 +45,7 @@ def test_floors_are_the_least_pivots():
 @pytest.mark.parametrize("depth", [0, 1, 5])
 def test_tile(rows, vectors, depth):
     arena = np.random.default_rng(rows).normal(size=900)
-    expected, args = arena.copy(), (rows, vectors, 3, 41, 300, 500, 29, depth)
+    expected, args = arena.copy(), (rows, vectors, Block(3, 41), Panel(300, 29, depth), 500)
     simd_plain.tile(expected, *args)
     _tile(arena, *args)
     np.testing.assert_allclose(arena, expected, atol=1e-13)
@@ -53,11 +53,11 @@ def test_tile(rows, vectors, depth):
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 4])
 @pytest.mark.parametrize("vectors", [0, 1, 5])
-def test_solve_rows(rows, vectors):
+def test_solve_tile(rows, vectors):
     arena = np.random.default_rng(rows).normal(size=900)
     expected, args = arena.copy(), (rows, vectors, 30, 101, 2)
-    simd_plain.solve_rows(expected, *args)
-    _solve_rows(arena, *args)
+    simd_plain.solve_tile(expected, *args)
+    _solve_tile(arena, *args)
     np.testing.assert_allclose(arena, expected, atol=1e-13)
 
 
@@ -68,7 +68,7 @@ def test_six(depth, stride):
     x, y, out = random.normal(size=50), random.normal(size=60), random.normal(size=20)
     expected = out.copy()
     expected[9:15] = x[7 : 7 + depth * stride : stride] @ y[11 : 11 + 6 * depth].reshape(depth, 6)
-    _six(x, 7, stride, depth, y, 11, out, 9)
+    _six(x, Panel(7, stride, depth), y, 11, out, 9)
     np.testing.assert_allclose(out, expected, atol=1e-13)
 
 
@@ -102,7 +102,7 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
     """Put a front into an arena as `fronts` says, everything around it NaN, and factorize it."""
     n = len(front)
     m, lead = n - p, -p % LANES
-    ld, width = lead + p + m + -m % LANES, padded(m)
+    ld, width = lead + p + m + -m % LANES, padded_size(m)
     start, size = SCRATCH + p * ld, update_size(m, width)
     arena = np.full(start + size + 8, np.nan)
     rows = arena[SCRATCH:start].reshape(p, ld)
@@ -118,7 +118,7 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
         put += width - first
     assert put == start + size
     floors = np.zeros(p) if floors is None else floors
-    failed = factor_front(arena, SCRATCH + lead, ld, p, m, start, width, floors, 0, 0, TASK_QUEUE)
+    failed = factor_front(arena, Front(SCRATCH + lead, ld, p, m, start, width), floors, 0, TASK_QUEUE)
     assert np.isnan(arena[-8:]).all()
     result = np.zeros((m, m))
     for i, row in enumerate(update):
@@ -127,18 +127,18 @@ def run(front: np.ndarray, p: int, floors: np.ndarray | None = None) -> tuple[in
 
 
 @_jit.kernel
-def _tile(a, rows, vectors, c, ldc, x, y, ld, depth):
-    tile(a, rows, vectors, c, ldc, x, y, ld, depth)
+def _tile(a, rows, vectors, C, X, y):
+    tile(a, rows, vectors, C, X, y)
 
 
 @_jit.kernel
-def _six(x, i, stride, depth, y, j, out, to):
-    six(x, i, stride, depth, y, j, out, to)
+def _six(x, X, y, j, out, to):
+    six(x, X, y, j, out, to)
 
 
 @_jit.kernel
-def _solve_rows(a, rows, vectors, c, ld, t):
-    solve_rows(a, rows, vectors, c, ld, t)
+def _solve_tile(a, rows, vectors, c, ld, t):
+    solve_tile(a, rows, vectors, c, ld, t)
 
 
 @_jit.kernel

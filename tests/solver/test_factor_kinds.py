@@ -53,7 +53,7 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Gra
 
 def evaluate(kind: FactorKind, graph: Graph) -> tuple[np.ndarray, list[np.ndarray]]:
     r, A, B, W = (np.full((1, *shape), np.nan) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
-    evaluate_factors(0, 1, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    evaluate_factors(np.arange(1), graph.array_table, graph.values, r, A, B, W)
     return r[0, : kind.dim], [J[0, : kind.dim, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
 
 

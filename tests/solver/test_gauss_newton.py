@@ -6,9 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from factorbus.solver.optimize.gauss_newton import Rule, minimize
+from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 
-SETTLE = Rule(tolerance=1e-14, floor=1e-20, limit=200)
+SETTLE = StoppingRule(tolerance=1e-14, floor=1e-20, limit=200)
 
 
 class Curve:
@@ -123,14 +123,14 @@ def test_steps_that_never_lead_down_are_taken_back(damping: float) -> None:
 
 def test_what_another_step_would_take_off_is_told() -> None:
     problem = rosenbrock([0.0, 0.0])
-    course = minimize(problem, problem.chi2s[0], 0.0, Rule(1e-6, 1e-12, limit=1))
+    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=1))
     assert course.left == pytest.approx(problem.decrease())
-    assert minimize(arctan([30.0]), 2.4, 1.0, Rule(1e-6, 1e-12, limit=1)).left == np.inf
+    assert minimize(arctan([30.0]), 2.4, 1.0, StoppingRule(1e-6, 1e-12, limit=1)).left == np.inf
 
 
 def test_a_limit_stops_and_the_damping_is_handed_on() -> None:
     problem = arctan([1e3])
-    course = minimize(problem, problem.chi2s[0], 0.0, Rule(1e-6, 1e-12, limit=2))
+    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=2))
     assert (course.converged, course.factorizations) == (False, 2)
     assert course.damping > 0.0
     again = minimize(problem, problem.chi2s[-1], course.damping, SETTLE)
@@ -139,7 +139,7 @@ def test_a_limit_stops_and_the_damping_is_handed_on() -> None:
 
 def test_the_loop_ends_where_another_step_would_gain_nothing() -> None:
     problem = rosenbrock([1.0 + 1e-9, 1.0])
-    course = minimize(problem, problem.chi2s[0], 0.0, Rule(1e-6, floor=1e-12, limit=10))
+    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, floor=1e-12, limit=10))
     assert (course.iterations, course.converged) == (0, True)
 
 

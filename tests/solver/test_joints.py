@@ -12,9 +12,10 @@ from factorbus.pieces import MOST, Pieces, cut
 from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Change, Factors, Insert, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.simulate import manhattan
+from factorbus.simulate import LoopClosures, manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.repair import find_loops, repair
+from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
 from factorbus.solver.covariance.why import why_variable
@@ -220,7 +221,7 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
     estimate, gone = values(solver), list(range(8))
     names = list(range(8, 16))
     sure = covariance(solver, *names)
-    after, _, report, counted = solver.with_changes(marginalize(*gone), settle=True)
+    after, _, report, counted = with_changes(solver, marginalize(*gone), settle=True)
     assert counted["removed_variables"] == 8
     (joint,) = find_joints(after._graph)
     assert len(joint.variables) >= 3, "else it shows nothing"
@@ -259,10 +260,10 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
 def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
     """What is known of many poses goes whole into the next marginal, and leaves no pieces behind."""
     solver = solved(loopy(kind, 18, 5))
-    at_once, *_ = solver.with_changes(marginalize(*range(10)), settle=True)
+    at_once, *_ = with_changes(solver, marginalize(*range(10)), settle=True)
     slowly = solver
     for n in range(10):
-        slowly, *_ = slowly.with_changes(marginalize(n), settle=True)
+        slowly, *_ = with_changes(slowly, marginalize(n), settle=True)
     assert apart(at_once, slowly) < 1e-9
     a, b = covariance(at_once, *range(10, 18)), covariance(slowly, *range(10, 18))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * np.abs(a).max())
@@ -273,7 +274,7 @@ def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
 
 def window() -> tuple[Solver, list[int]]:
     """A map with one form in pieces, and the ids of these."""
-    solver, *_ = solved(loopy("se2", 16, 1)).with_changes(marginalize(*range(8)), settle=True)
+    solver, *_ = with_changes(solved(loopy("se2", 16, 1)), marginalize(*range(8)), settle=True)
     (joint,) = find_joints(solver._graph)
     return solver, solver._graph.ids_of(np.array(joint.rows)).tolist()
 
@@ -291,16 +292,16 @@ def test_pieces_stay_together_or_go_together() -> None:
         [Change("loss", np.array([pair]), loss="huber", scale=np.ones(1))],
     ):
         with pytest.raises(errors.Apart) as refused:
-            solver.with_changes(changes)
+            with_changes(solver, changes)
         assert refused.value.code == "not_positive_definite"
         assert set(refused.value.detail["factors"]) <= set(ids)
     assert all(np.array_equal(row, before[key][1]) for key, (_, row) in values(solver).items())
-    heavier, *_ = solver.with_changes([Change("weigh", np.array(ids), weight=np.full(len(ids), 2.0))])
+    heavier, *_ = with_changes(solver, [Change("weigh", np.array(ids), weight=np.full(len(ids), 2.0))])
     assert len(find_joints(heavier._graph)) == 1
-    without, *_ = solver.with_changes([Change("remove_factors", np.array(ids))])
+    without, *_ = with_changes(solver, [Change("remove_factors", np.array(ids))])
     assert not find_joints(without._graph)
-    held, *_ = solver.with_changes([Change("fix", keys=x(10))], settle=True)
-    freed, *_ = held.with_changes([Change("free", keys=x(10))], settle=True)
+    held, *_ = with_changes(solver, [Change("fix", keys=x(10))], settle=True)
+    freed, *_ = with_changes(held, [Change("free", keys=x(10))], settle=True)
     assert apart(freed, solver) < 1e-9
 
 
@@ -350,7 +351,7 @@ def test_the_kept_up_covariance_is_that_from_scratch() -> None:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", SIZE)
 def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> None:
-    solver, *_ = solved(loopy(kind, 16, 1)).with_changes(marginalize(*range(8)), settle=True)
+    solver, *_ = with_changes(solved(loopy(kind, 16, 1)), marginalize(*range(8)), settle=True)
     variables, factors = solver.graph()
     sent = Batch(
         tuple(Variables(g.kind, g.keys, g.values, g.fixed) for g in variables),
@@ -382,7 +383,7 @@ def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
-    solver, *_ = solved(loopy("se2", 16, 1), mode).with_changes(marginalize(*range(8)))
+    solver, *_ = with_changes(solved(loopy("se2", 16, 1), mode), marginalize(*range(8)))
     again = Solver(Options(mode=mode))
     again.load(solver.dump())
     for n in (16, 17):
@@ -396,7 +397,7 @@ def test_a_state_goes_on_bit_for_bit(mode: str) -> None:
             each.stage(Batch((Variables("se2", x(n)),), (edge, loop)))
             each.step()
         assert all(np.array_equal(row, values(again)[key][1]) for key, (_, row) in values(solver).items())
-    ones, others = solver.with_changes(marginalize(8, 9))[0], again.with_changes(marginalize(8, 9))[0]
+    ones, others = with_changes(solver, marginalize(8, 9))[0], with_changes(again, marginalize(8, 9))[0]
     assert all(np.array_equal(row, values(others)[key][1]) for key, (_, row) in values(ones).items())
 
 
@@ -422,9 +423,9 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
     )
     solver = solved(Batch((Variables("se2", x(*range(count))),), (*star, loopy("se2", 2, 1).factors[-2])))
     with pytest.raises(errors.TooConnected) as refused:
-        solver.with_changes(marginalize(0))
+        with_changes(solver, marginalize(0))
     assert refused.value.detail["border"] == x(*range(1, count)).tolist()
-    after, *_ = solver.with_changes(marginalize(0, 1), settle=True)
+    after, *_ = with_changes(solver, marginalize(0, 1), settle=True)
     assert len(find_joints(after._graph)[0].variables) == MOST
     assert apart(after, solver) < 1e-9
     l = np.array([symbol("l", 1)])
@@ -435,7 +436,7 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
     solver.stage(Batch((Variables("point2", l),), tuple(seen)))
     solver.step()
     with pytest.raises(errors.TooConnected):
-        solver.with_changes(marginalize(0))
+        with_changes(solver, marginalize(0))
 
 
 @pytest.mark.timeout(600)
@@ -450,7 +451,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
             each.step()
         loops += step.factor_count - 1
         if n - first == keep + every:
-            solver, *_ = solver.with_changes(marginalize(*range(first, first + every)))
+            solver, *_ = with_changes(solver, marginalize(*range(first, first + every)))
             first += every
             sizes.append(solver.memory_bytes())
             widest = max([widest, *(len(joint.variables) for joint in find_joints(solver._graph))])
@@ -471,7 +472,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
 
 def _steps(poses: int, keep: int) -> Iterator[Batch]:
     """A pose a step, with the factors to those at most `keep` before it."""
-    for step in manhattan(poses=poses, seed=3, loop_gap=8, block_m=3, loop_share=0.8, sigma_theta_rad=0.005):
+    for step in manhattan(poses=poses, seed=3, loops=LoopClosures(share=0.8, gap=8), block_m=3, sigma_theta_rad=0.005):
         near = []
         for g in step.batch.factors:
             cut = np.ptp(g.keys, axis=1) <= keep

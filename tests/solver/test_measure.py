@@ -62,7 +62,7 @@ def found(solver: Solver, tree: CliqueTree, moved: np.ndarray, bent: float, vari
     copied = copy.copy(tree)
     copied.node, copied.stiff, copied.pending, copied.moved = node, stiff, pending, listed
     copied.state, copied.account = state, account
-    most = evaluate_moved(graph_at(graph.places), tree_at(copied.places), bent)
+    most = evaluate_moved(graph_at(graph.array_table), tree_at(copied.array_table), bent)
     assert account[tl.A_CHI2] == pytest.approx(stiff[:, tl.B_CHI2].sum())
     assert account[tl.A_ERROR] == pytest.approx(stiff[:, tl.B_ERROR].sum())
     waiting = np.sort(pending[: state[tl.S_PENDING]])

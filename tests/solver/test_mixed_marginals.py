@@ -16,8 +16,9 @@ from naive.solver_parts import graph_in
 from factorbus.pieces import MOST
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
-from factorbus.simulate import city_trees
+from factorbus.simulate import TreeSensor, city_trees
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.kernels.model import layout as at
@@ -50,7 +51,7 @@ def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:
-    return solver.with_changes([Change("marginalize", keys=np.array(keys))], settle=True)[0]
+    return with_changes(solver, [Change("marginalize", keys=np.array(keys))], settle=True)[0]
 
 
 def assert_same(solver: Solver, after: Solver, gone: list[int], settled: float = 1e-9) -> None:
@@ -179,7 +180,7 @@ class Window:
         for tree in [tree for tree, last in self.seen.items() if last < self.first]:
             gone.append(self.names.pop(tree))
             del self.seen[tree]
-        self.solver = self.solver.with_changes([Change("marginalize", keys=np.array(gone))])[0]
+        self.solver = with_changes(self.solver, [Change("marginalize", keys=np.array(gone))])[0]
         self.sizes.append(self.solver.memory_bytes())
         self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(graph_in(self.solver))), 0)
 
@@ -189,8 +190,8 @@ class Window:
 def test_a_window_past_trees_takes_constant_memory_and_is_where_the_whole_map_has_it(poses: int) -> None:
     window = Window(keep=30, every=10)
     # What was linearized once and for all is off by the square of the noise, which no window can help.
-    calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sigma_sight_m=0.03)
-    for n, step in enumerate(calm(poses, seed=2, tree_share=0.6, sight_share=0.6)):
+    calm = partial(city_trees, sigma_xy_m=0.006, sigma_theta_rad=0.003, sensor=TreeSensor(sigma_m=0.03, share=0.6))
+    for n, step in enumerate(calm(poses, seed=2, tree_share=0.6)):
         window.take(n, step.batch)
     assert window.widest >= 8, "there are trees in the border"
     half = len(window.sizes) // 2

@@ -22,7 +22,7 @@ ROOTS = ("proto", "service", "clients", "workers")
 BEHIND = {
     "FACTOR_KINDS": "FACTOR_KINDS = {\n    kind.name: kind\n    for kind in (\n",
     "FACTOR_MODELS": "FACTOR_MODELS = {\n",
-    "the imports": "from factorbus.solver.kernels.model.camera import sight\n",
+    "the imports": "from factorbus.solver.kernels.model.camera import observation\n",
     "residual": 'Raises KeyError: it has no twin yet."""\n',
 }
 USED = """

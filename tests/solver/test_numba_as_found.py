@@ -66,7 +66,7 @@ list(_jit.iter_compile(open_gaps))
 assert inside() == found
 between = compiled()
 list(_jit.iter_compile(hold))
-assert _jit.compiled_seconds() > 0
+assert _jit.compile_seconds() > 0
 show(before, between, compiled())
 """
 )

@@ -8,7 +8,7 @@ from naive.dense_factors import TANGENT, boxminus, boxplus, residual
 from naive.dense_least_squares import full
 from naive.random_graphs import random_value
 
-from factorbus.pieces import Pieces, as_pieces, cut, dims_of
+from factorbus.pieces import Pieces, as_pieces, cut, tangent_dims
 from factorbus.proto.kinds import FACTOR_KINDS
 
 SPACES = {"plane": ("se2", "point2"), "space": ("se3", "point3", "idp")}
@@ -47,7 +47,7 @@ def test_the_pieces_sum_to_the_form_wherever_its_variables_are(space: str, seed:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 9))
     kinds, y = drawn(space, n, rng)
-    width = sum(dims_of(kinds))
+    width = sum(tangent_dims(kinds))
     units = 10.0 ** rng.uniform(-2, 3, width)
     A = rng.normal(size=(int(rng.integers(1, width + 1)), width)) * units
     A[:, rng.integers(width)] = 0.0  # something of which nothing is known
@@ -70,7 +70,7 @@ def test_any_rows_of_any_variables_are_sent_whole(space: str, seed: int) -> None
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(1, 7)), int(rng.integers(1, 20))
     kinds, y = drawn(space, n, rng)
-    dims = dims_of(kinds)
+    dims = tangent_dims(kinds)
     H, b = rng.normal(size=(m, sum(dims))), rng.normal(size=m)
     groups = as_pieces(kinds, np.arange(n), y, H, b)
     if n <= 2:
@@ -85,6 +85,6 @@ def test_any_rows_of_any_variables_are_sent_whole(space: str, seed: int) -> None
 
 def test_what_is_of_no_one_space_is_refused() -> None:
     with pytest.raises(ValueError, match="all of the plane"):
-        dims_of(["se2", "point3"])
+        tangent_dims(["se2", "point3"])
     with pytest.raises(ValueError, match="no kind of variable"):
-        dims_of(["se4"])
+        tangent_dims(["se4"])

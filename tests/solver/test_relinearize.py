@@ -35,7 +35,7 @@ def test_the_factors_of_some_variables_are_linearized(driven: Solver, picked: li
         assert np.ptp(around) >= SPARSE * around.size, "far apart: found by walking"
     right, wrong, copied = tree.hessian.copy(), np.full(tree.hessian.size, np.nan), copy.copy(tree)
     copied.hessian = wrong
-    linearize_around(graph_at(graph.places), tree_at(copied.places), np.array(picked))
+    linearize_around(graph_at(graph.array_table), tree_at(copied.array_table), np.array(picked))
     starts = np.append(tree.link[:count, tl.L_AT], tree.state[tl.S_HESSIAN])
     done = [
         f for f in range(count) if np.array_equal(wrong[starts[f] : starts[f + 1]], right[starts[f] : starts[f + 1]])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.step import reluctance
+from factorbus.solver.kernels.bayes_tree.thresholds import reluctance
 
 
 def test_so_soon_after_a_relinearization_more_has_to_be_bent() -> None:

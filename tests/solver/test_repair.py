@@ -8,9 +8,10 @@ import pytest
 
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Change, Factors
-from factorbus.simulate import manhattan
+from factorbus.simulate import LoopClosures, manhattan
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.changes.repair import find_loops, repair, weigh
+from factorbus.solver.changing import with_changes
 from factorbus.solver.kernels.jit.compile import DISABLED
 
 POSES = 60 if DISABLED else 400
@@ -19,7 +20,7 @@ POSES = 60 if DISABLED else 400
 def streets(seed: int, share: float, poses: int = POSES) -> Iterator[tuple[Batch, dict[int, np.ndarray], list[int]]]:
     """(batch, true values of what is new, which of its factors are false); `share` of the closures are."""
     rng = np.random.default_rng(seed)
-    for number, step in enumerate(manhattan(poses, seed, loop_gap=20)):
+    for number, step in enumerate(manhattan(poses, seed, loops=LoopClosures(gap=20))):
         truth = {k: row for g in step.truth for k, row in zip(g.keys.tolist(), g.values, strict=True)}
         groups, count = list(step.batch.factors), step.batch.factor_count
         loops = sum(int((np.abs(g.keys[:, 1] - g.keys[:, 0]) != 1).sum()) for g in groups)
@@ -69,7 +70,7 @@ def test_three_of_ten_closures_false_are_found_and_the_drive_is_as_good_as_witho
     assert found.after < found.before
     assert (found.distance > 0).all()
     placed = [Change("place", keys=g.keys, kind=g.kind, values=g.values) for g in found.groups]
-    repaired, *_ = solver.with_changes([Change("remove_factors", found.false), *placed], settle=True)
+    repaired, *_ = with_changes(solver, [Change("remove_factors", found.false), *placed], settle=True)
     assert error_of(repaired, truth) < 1.2 * right
 
 
@@ -163,7 +164,7 @@ def test_intel_with_three_of_ten_closures_false_is_intel_again(datasets: Path) -
     off = error_of(solver, best)
     found = repair(solver.content())
     placed = [Change("place", keys=g.keys, kind=g.kind, values=g.values) for g in found.groups]
-    repaired, *_ = solver.with_changes([Change("remove_factors", found.false), *placed], settle=True)
+    repaired, *_ = with_changes(solver, [Change("remove_factors", found.false), *placed], settle=True)
     taken = set(found.false.tolist())
     print(f"{len(false)} false of {found.suspects}, {len(false - taken)} missed, {len(taken - false)} right ones taken")
     print(f"{off:.3g} m off, repaired {error_of(repaired, best):.3g} m off")

@@ -9,7 +9,7 @@ from naive.tree_records import cliques, tree_of
 from scipy.linalg import expm
 
 from factorbus.proto.messages import Batch, Factors
-from factorbus.simulate import city_trees, manhattan, sphere
+from factorbus.simulate import Spiral, city_trees, manhattan, sphere
 from factorbus.solver import Options, Solver
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -24,7 +24,7 @@ FAR = {
 WORLDS: dict[str, Callable[[], Iterator[Batch]]] = {
     "poses": lambda: (step.batch for step in manhattan(500, 5)),
     "landmarks": lambda: (step.batch for step in city_trees(500, seed=5)),
-    "space": lambda: (step.batch for step in sphere(400, 5, ring=20, rings=20)),
+    "space": lambda: (step.batch for step in sphere(400, 5, spiral=Spiral(20, 20))),
     "positions": lambda: with_positions(step.batch for step in manhattan(500, 5)),
 }
 

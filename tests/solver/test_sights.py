@@ -15,11 +15,12 @@ from factorbus.proto.kinds import LOSSES
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
+from factorbus.solver.changing import with_changes, with_converted
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import ASLEEP
+from factorbus.solver.kernels.model.camera import INACTIVE_CHI2
 from factorbus.solver.kernels.model.candidates import evaluate_factors
 
 X, F, P = symbol("x", 0), symbol("f", 0), symbol("p", 0)
@@ -55,7 +56,7 @@ def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, 
     """r, A, B, whole."""
     graph = solver._graph
     r, A, B, W = (np.zeros((1, *shape)) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
-    evaluate_factors(factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    evaluate_factors(np.array([factor]), graph.array_table, graph.values, r, A, B, W)
     return r[0], A[0], B[0]
 
 
@@ -227,13 +228,13 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     weak, strong = np.array([0.0, 0, 2]), BEHIND
     place = (weak + 1e6 * strong) / (1e6 + 1)
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
-    assert solver.chi2() == pytest.approx(ASLEEP + 16.0, rel=1e-3)
+    assert solver.chi2() == pytest.approx(INACTIVE_CHI2 + 16.0, rel=1e-3)
     accounts = why_variable(
         CovarianceBlocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False
     ).factors
     assert [account.inactive for account in accounts] == ["", why, ""]
-    assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, ASLEEP)
-    assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], ASLEEP)
+    assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, INACTIVE_CHI2)
+    assert (accounts[1].residual.tolist(), accounts[1].without) == ([0.0, 0.0], INACTIVE_CHI2)
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -371,7 +372,7 @@ def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
     assert set(found.tolist()) <= set(features.keys.tolist())
     assert solver.convertible(1e9).size == 12
     assert solver.convertible(0.0).size == 0
-    made, report = solver.with_points(features.keys)
+    made, report = with_converted(solver, features.keys)
     settled = made.step(settle=True)
     assert (made.variable_count, made.factor_count) == (solver.variable_count, solver.factor_count)
     assert settled.chi2 == pytest.approx(before.chi2, rel=0.05)
@@ -397,9 +398,9 @@ def test_features_become_points_and_the_estimate_stays(mode: str) -> None:
     counts = {(group.kind, group.loss): len(group.keys) for group in made.graph()[1]}
     assert counts == {("point_seen", ""): 1, ("point_seen", "huber"): 12 * 8, ("prior_se3", ""): 6}
     with pytest.raises(errors.KindMismatch, match="idp"):
-        made.with_points(points.keys)
+        with_converted(made, points.keys)
     with pytest.raises(errors.UnknownVariable):
-        solver.with_points(np.array([symbol("f", 99)]))
+        with_converted(solver, np.array([symbol("f", 99)]))
 
 
 def test_a_feature_with_a_linear_factor_stays_one() -> None:
@@ -408,12 +409,12 @@ def test_a_feature_with_a_linear_factor_stays_one() -> None:
     drive_past(solver)
     before = solver.step(settle=True)
     assert solver.convertible(1e9).size == 12
-    after, _, report, _ = solver.with_changes([Change("marginalize", keys=np.array([symbol("x", 0)]))], settle=True)
+    after, _, report, _ = with_changes(solver, [Change("marginalize", keys=np.array([symbol("x", 0)]))], settle=True)
     assert sum(len(g.keys) for g in after.graph()[1] if g.kind == "linear_idp") == 12
     assert report.chi2 <= before.chi2 * (1 + 1e-9)
     assert after.convertible(1e9).size == 0
     with pytest.raises(errors.KindMismatch, match="linear factor"):
-        after.with_points(np.array([symbol("f", 3)]))
+        with_converted(after, np.array([symbol("f", 3)]))
 
 
 def test_the_linearity_index_is_the_papers() -> None:

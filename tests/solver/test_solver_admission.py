@@ -12,7 +12,7 @@ from factorbus.solver import Options, Solver, errors
 from factorbus.solver.inc_l.steps import IncrementalSteps
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 I3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 I2 = np.array([[1.0, 0, 1]])
@@ -185,7 +185,7 @@ def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.n
     return (var, fac) if isinstance(solver._stepper, IncrementalSteps) else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
 
 
-def normal_equations(blocks: Blocks, scalars: int) -> list[bytes]:
+def normal_equations(blocks: HessianBlocks, scalars: int) -> list[bytes]:
     kept = (blocks.table.nonzero()[0], blocks.fill, blocks.rows, blocks.cols, blocks.offsets)
     return [a.tobytes() for a in (*kept, blocks.data[: blocks.fill[1]], blocks.eta[:scalars])]
 

@@ -12,7 +12,7 @@ from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver, solve_batch
-from factorbus.solver.kernels.bayes_tree.step import LEAST_CHI2
+from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 
 # χ² at the optimum in g2o's convention, vertex 0 held fixed: file → (optimum, relative, absolute tolerance).
 OPTIMA = {

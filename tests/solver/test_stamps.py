@@ -13,19 +13,12 @@ from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.graph.packing import Packing
+from factorbus.solver.changing import with_changes, with_converted
 from factorbus.solver.kernels.model import layout as at
 
 MODES = ["bayes-tree", "inc-l", "all-batch"]
 seeds = st.integers(0, 9999)
 T0 = 1_403_636_579_763_555_584
-
-
-class Never(Packing):
-    """Packs nothing: every batch goes the long way."""
-
-    def pack(self, batch: object) -> None:
-        return None
 
 
 def stamps(groups: Iterable[Any]) -> dict[int, int]:
@@ -78,11 +71,9 @@ def test_the_wire_and_the_solver_agree_on_what_none_is() -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 @settings(max_examples=8)
-@given(seed=seeds, packed=st.booleans())
-def test_every_answer_has_the_stamps_that_came_in(mode: str, seed: int, packed: bool) -> None:
+@given(seed=seeds)
+def test_every_answer_has_the_stamps_that_came_in(mode: str, seed: int) -> None:
     solver, wanted = Solver(Options(mode=mode)), {}
-    if not packed:
-        solver._packing = Never()
     for batch in random_steps(seed):
         wanted |= stamps(batch.variables)
         solver.stage(batch)
@@ -116,11 +107,8 @@ def test_where_no_variable_of_a_group_has_one_there_is_no_column() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.array([1, 2]), np.array([1.0]), np.array([[1]]), [1], np.array([1], np.int32)])
-@pytest.mark.parametrize("packs", [True, False])
-def test_stamps_of_another_shape_or_type_are_refused(wrong: Any, packs: bool) -> None:
+def test_stamps_of_another_shape_or_type_are_refused(wrong: Any) -> None:
     solver = fed(line())
-    if not packs:
-        solver._packing = Never()
     before = kept(solver)
     with pytest.raises(errors.BadShape, match="stamps"):
         solver.stage(Batch((pose(6)._replace(stamps=wrong),), (edge(5, 6),)))
@@ -167,7 +155,7 @@ def test_removed_and_back_with_another_or_none(stamp: int | None) -> None:
     solver, last = fed(line()), symbol("x", 5)
     wanted = {key: each for key, each in kept(solver).items() if key != last}
     removed = [Change("remove_variables", keys=np.array([last]))]
-    changed, *_ = solver.with_changes(removed, Batch((pose(5, stamp),), (edge(4, 5),)))
+    changed, *_ = with_changes(solver, removed, Batch((pose(5, stamp),), (edge(4, 5),)))
     assert kept(changed) == wanted | ({} if stamp is None else {last: stamp})
 
 
@@ -176,7 +164,7 @@ def test_what_goes_takes_its_stamp(change: str) -> None:
     solver = fed(line())
     gone = np.array([symbol("x", 2), symbol("x", 3)])
     held = [Change("fix", keys=np.array([symbol("x", 4)]))] if change == "remove_variables" else []
-    changed, *_ = solver.with_changes([Change(change, keys=gone), *held])
+    changed, *_ = with_changes(solver, [Change(change, keys=gone), *held])
     left = {symbol("x", n): T0 + n for n in (0, 1, 4, 5)}
     assert kept(changed) == left
     changed.stage(Batch((pose(2, -2),), (edge(1, 2),)))
@@ -195,7 +183,7 @@ def test_what_goes_takes_its_stamp(change: str) -> None:
 )
 def test_what_is_changed_keeps_its_stamp(change: Change) -> None:
     solver = fed([*line(), Batch((), (edge(0, 5), edge(0, 2)))])
-    changed, *_ = solver.with_changes([change])
+    changed, *_ = with_changes(solver, [change])
     assert kept(changed) == kept(solver)
 
 
@@ -206,7 +194,7 @@ def test_a_feature_that_becomes_a_point_keeps_it() -> None:
         solver.stage(batch._replace(variables=own))
         solver.step()
     features = np.concatenate([group.keys for group in solver.estimate() if group.kind == "idp"])
-    points, _ = solver.with_points(features)
+    points, _ = with_converted(solver, features)
     assert kept(points) == kept(solver)
 
 

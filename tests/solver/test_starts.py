@@ -13,7 +13,7 @@ from naive.random_others import other_steps
 
 from factorbus.formats import read
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.simulate import manhattan, sphere
+from factorbus.simulate import Spiral, manhattan, sphere
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import Graph
@@ -240,7 +240,7 @@ def gtsam_chordal(batch: Batch) -> tuple[float, float]:
 @pytest.mark.parametrize("noise", [0.02, 0.1, 0.2])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_on_spheres_the_start_is_as_good_as_gtsams(seed: int, noise: float) -> None:
-    theirs, ours = gtsam_chordal(whole(sphere(poses=300, seed=seed, ring=25, rings=8, sigma_rotation_rad=noise)))
+    theirs, ours = gtsam_chordal(whole(sphere(poses=300, seed=seed, spiral=Spiral(25, 8), sigma_rotation_rad=noise)))
     assert ours <= 1.05 * theirs
 
 
@@ -270,7 +270,7 @@ def gtsam_ends(batch: Batch) -> list[tuple[Variables, ...]]:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_on_spheres_of_much_noise_no_end_of_gtsams_is_lower(seed: int, noise: float) -> None:
     """Nor do the values that are given make it worse, wherever they are."""
-    batch = whole(sphere(poses=300, seed=seed, ring=25, rings=12, sigma_rotation_rad=noise))
+    batch = whole(sphere(poses=300, seed=seed, spiral=Spiral(25, 12), sigma_rotation_rad=noise))
     found = solve_batch(batch.variables, batch.factors)
     for values in (*gtsam_ends(batch), scattered(batch, seed).variables):
         assert solve_batch(values, batch.factors).chi2 == pytest.approx(found.chi2, rel=1e-6)

@@ -4,23 +4,18 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.allocator import (
-    AHEAD,
     FOLLOWING,
-    PAGE,
     SIZE,
     give_numbers,
     join_free,
     take_numbers,
-    write_ahead,
 )
-from factorbus.solver.kernels.bayes_tree.step import LIGHT
 from factorbus.solver.kernels.sparse import fronts as fr
 
 ROOM = 1 << 16
@@ -111,84 +106,3 @@ def test_what_a_drive_leaves_free_is_used_again() -> None:
     assert most < 2.1
     kept = solver.dump()["_stepper"]["_tree"]["numbers"]
     assert kept.size == tree.state[tl.S_NUMBERS] < tree.numbers.size
-
-
-def test_pages_ahead_are_written_to_a_few_at_a_time() -> None:
-    numbers, state = np.full(1024 * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
-    state[tl.S_NUMBERS] = fr.SCRATCH
-    start, size = take_numbers(256 * PAGE, numbers, state)
-    end = start + size
-    written = 0
-    while (missing := (end - PAGE * written) // PAGE) >= AHEAD:
-        write_ahead(numbers, state)
-        found = np.flatnonzero(numbers == 0.0)
-        assert AHEAD <= found.size - written <= AHEAD + missing // AHEAD
-        written = found.size
-        assert np.array_equal(found, end + PAGE * np.arange(written))
-    write_ahead(numbers, state)
-    assert (numbers == 0.0).sum() == written
-    assert end + PAGE * written <= 2 * end  # as much again as the cliques have
-
-
-def test_no_pages_ahead_where_as_much_is_free() -> None:
-    numbers, state = np.full(4 * AHEAD * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
-    state[tl.S_NUMBERS] = fr.SCRATCH
-    first = take_numbers(AHEAD * PAGE, numbers, state)
-    take_numbers(AHEAD * PAGE, numbers, state)
-    give_numbers(*first, numbers, state)
-    before = np.isnan(numbers[state[tl.S_NUMBERS] :]).sum()
-    write_ahead(numbers, state)
-    assert np.isnan(numbers[state[tl.S_NUMBERS] :]).sum() == before
-
-
-def test_pages_ahead_end_with_the_arena() -> None:
-    numbers, state = np.full(3 * AHEAD * PAGE, np.nan), np.zeros(tl.S_SIZE, np.int64)
-    state[tl.S_NUMBERS] = 2 * AHEAD * PAGE
-    write_ahead(numbers, state)
-    assert np.array_equal(np.flatnonzero(numbers == 0.0), PAGE * np.arange(2 * AHEAD, 3 * AHEAD))
-
-
-def test_a_drive_has_its_pages_before_it_needs_them() -> None:
-    solver = Solver(Options())
-    assert isinstance(solver._stepper, TreeSteps)
-    tree = solver._stepper.tree
-    for step in manhattan(1500, 3):
-        solver.stage(step.batch)
-        solver.step()
-    cliques = int(tree.state[tl.S_NUMBERS] - tree.state[tl.S_IDLE])
-    assert tree.state[tl.S_FRESH] > min(2 * cliques, tree.numbers.size) - AHEAD * PAGE
-
-
-def test_a_step_of_many_flops_has_no_time_for_pages() -> None:
-    solver = Solver(Options())
-    assert isinstance(solver._stepper, TreeSteps)
-    state = solver._stepper.tree.state
-    for step in manhattan(3000, 3):
-        solver.stage(step.batch)
-    assert solver.step(settle=True).flops >= LIGHT
-    assert state[tl.S_FRESH] == 0
-    solver.stage(known_pose(-1))
-    assert solver.step().flops < LIGHT
-    assert state[tl.S_FRESH] >= state[tl.S_NUMBERS]
-
-
-def test_what_only_the_original_has_written_to_is_written_to_again() -> None:
-    solver, copied = Solver(Options()), Solver(Options())
-    for step in manhattan(2100, 3):
-        solver.stage(step.batch)
-        solver.step()
-    copied.load(solver.dump())
-    assert isinstance(copied._stepper, TreeSteps)
-    tree = copied._stepper.tree
-    had, pose = tree.numbers.size, 0
-    assert tree.state[tl.S_FRESH] > had + 2 * AHEAD * PAGE
-    while tree.numbers.size == had:
-        pose -= 1
-        copied.stage(known_pose(pose))
-        copied.step()
-    assert tree.state[tl.S_FRESH] < max(had, tree.state[tl.S_NUMBERS]) + 2 * AHEAD * PAGE
-
-
-def known_pose(key: int) -> Batch:
-    prior = Factors("prior_se2", np.array([[key]]), np.zeros((1, 3)), np.eye(3)[np.triu_indices(3)][None])
-    return Batch((Variables("se2", np.array([key]), np.zeros((1, 3))),), (prior,))

@@ -84,11 +84,11 @@ def test_no_two_living_numbers_share_a_place(analysis):
     taken[: fr.SCRATCH] = 1
     for front in symbolic.fronts:
         p, m = front[fr.PIVOTS], front[fr.BORDER]
-        lead = fr.padded(p) - p
+        lead = fr.padded_size(p) - p
         rows = slice(front[fr.ROWS] - lead, front[fr.ROWS] - lead + p * front[fr.LD_ROWS])
         update = slice(front[fr.UPDATE], front[fr.UPDATE] + fr.update_size(m, front[fr.WIDTH_UPDATE]))
         assert rows.stop <= symbolic.stored <= update.start
-        assert lead + p + fr.padded(m) <= front[fr.LD_ROWS]
+        assert lead + p + fr.padded_size(m) <= front[fr.LD_ROWS]
         assert not taken[rows].any()
         assert not taken[update].any()
         taken[rows], taken[update] = 1, 1

@@ -6,6 +6,7 @@ import pytest
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Solver
+from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import FactorAccount, why_factor
 
@@ -34,7 +35,7 @@ def held_and_pulled(loss: str, apart: float, hold: float) -> Solver:
 
 def fall(solver: Solver, factor: int) -> float:
     """By how much χ² falls where the map is solved again without the factor."""
-    without, *_ = solver.with_changes([Change("remove_factors", np.array([factor]))], Batch(), True)
+    without, *_ = with_changes(solver, [Change("remove_factors", np.array([factor]))], Batch(), True)
     return solver.chi2() - without.chi2()
 
 
@@ -62,7 +63,7 @@ def test_without_is_what_solving_again_gains(loss: str, apart: float) -> None:
     """Also where the others give way: they hold about as firmly as it pulls."""
     solver = held_and_pulled(loss, apart, 0.5) if loss else held_and_pulled("huber", apart, 0.5)
     if not loss:
-        solver, *_ = solver.with_changes([Change("loss", np.array([4]))], Batch(), True)
+        solver, *_ = with_changes(solver, [Change("loss", np.array([4]))], Batch(), True)
     account = account_of(solver, 4)
     assert account.loss == loss
     assert account.without == pytest.approx(fall(solver, 4), rel=1e-7, abs=1e-12)

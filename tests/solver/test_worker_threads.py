@@ -90,14 +90,19 @@ def test_a_front_has_the_same_bits(p: int, m: int, count: int) -> None:
 
 def factorized(p: int, m: int) -> bytes:
     """A front, zeros between what is its own."""
-    rng, lead, ld, width = np.random.default_rng(p), -p % fr.LANES, fr.padded(p) + fr.padded(m), fr.padded(m)
+    rng, lead, ld, width = (
+        np.random.default_rng(p),
+        -p % fr.LANES,
+        fr.padded_size(p) + fr.padded_size(m),
+        fr.padded_size(m),
+    )
     start = fr.SCRATCH + p * ld
     arena = np.zeros(start + fr.update_size(m, width) + fr.LANES)
     rows = arena[fr.SCRATCH : start].reshape(p, ld)[:, lead : lead + p + m]
     rows[:] = rng.normal(size=(p, p + m))
     rows[:, :p] = np.triu(rows[:, :p] @ rows[:, :p].T + (p + m) * np.eye(p))
-    at = fr.SCRATCH + lead
-    assert factor_front(arena, at, ld, p, m, start, width, np.zeros(p), 0, 0, TASK_QUEUE) == -1
+    front = fr.Front(fr.SCRATCH + lead, ld, p, m, start, width)
+    assert factor_front(arena, front, np.zeros(p), 0, TASK_QUEUE) == -1
     return arena[fr.SCRATCH :].tobytes()
 
 

@@ -15,7 +15,7 @@ import threading
 from factorbus import idp, solver
 from factorbus.proto.problems import Problem
 from factorbus.service.app import serve
-from factorbus.service.config import Config, checked
+from factorbus.service.config import Config, checked_config
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
         if os.fork() == 0:
             os.close(0)
             say("born", os.getpid())  # before anything else it says, which a parent's word of it might come after
-            run(checked(Config(**{"listen": (endpoint,), "warm": False, "create": ("m",), **given})))
+            run(checked_config(Config(**{"listen": (endpoint,), "warm": False, "create": ("m",), **given})))
 
 
 def run(config: Config) -> None:

@@ -46,7 +46,7 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
     services: Callable[..., Services], tmp_path: Path
 ) -> None:
     """Each of these changes is made anew, which takes longer than an exchange: they are told apart by revisions."""
-    endpoint = services(tmp_path / "journal", "snapshot_s=1000", 'durability="group"').start()
+    endpoint = services(tmp_path / "journal", "checkpoint_s=1000", 'durability="group"').start()
     with (
         connect(endpoint, client="changer", timeout_s=PATIENCE_S) as one,
         connect(endpoint, client="bystander", timeout_s=PATIENCE_S) as two,
@@ -69,14 +69,14 @@ def test_a_bystander_waits_for_no_more_than_the_change_under_way(
         stats = bystander.stats()
         assert stats["inserts"]["accepted"] == 20 + BURST + 10
         assert stats["inserts"]["busy"] > 0, "of the burst no more than `limits.changes` wait at a time"
-        assert stats["journal"]["snapshot_record"] == 0, "no change has a snapshot of its own"
+        assert stats["journal"]["checkpoint_record"] == 0, "no change has a checkpoint of its own"
 
 
 @pytest.mark.timeout(900)
-def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
+def test_changes_of_factors_tell_what_moved_and_write_no_checkpoints(
     services: Callable[..., Services], tmp_path: Path
 ) -> None:
-    endpoint = services(tmp_path / "journal", "snapshot_s=1000").start()
+    endpoint = services(tmp_path / "journal", "checkpoint_s=1000").start()
     with (
         connect(endpoint, client="changer", timeout_s=PATIENCE_S) as one,
         connect(endpoint, client="viewer", timeout_s=PATIENCE_S) as two,
@@ -98,7 +98,7 @@ def test_changes_of_factors_tell_what_moved_and_write_no_snapshots(
         for group in asked.variables:
             for key, row in zip(group.keys.tolist(), group.values, strict=True):
                 assert viewer.estimate[key].tobytes() == row.tobytes()
-        assert viewer.stats()["journal"]["snapshot_record"] == 0
+        assert viewer.stats()["journal"]["checkpoint_record"] == 0
 
 
 @pytest.mark.timeout(900)
@@ -107,7 +107,7 @@ def test_killed_in_the_middle_of_changes_none_that_was_answered_is_lost_and_none
 ) -> None:
     """Each change doubles or halves one weight, which two of them would tell from one; loops are given losses, too."""
     chance = random.Random(5)
-    running = services(tmp_path / "journal", "snapshot_s=0.1")
+    running = services(tmp_path / "journal", "checkpoint_s=0.1")
     with (
         connect(running.start(), client="changer", timeout_s=PATIENCE_S) as bus,
         bus.map("m", window=16) as changer,

@@ -14,7 +14,7 @@ from processes import Process
 
 from factorbus.client import Changes, Draft, Map, Refused, aio, connect
 from factorbus.proto.messages import Accepted, Factors
-from factorbus.simulate import manhattan
+from factorbus.simulate import LoopClosures, manhattan
 
 SIGMAS = (0.1, 0.1, 0.02)
 
@@ -191,7 +191,7 @@ def test_the_command_line_changes_and_repairs(endpoint: str, square: Map) -> Non
     at = ("--connect", endpoint, "--json")
     rng = np.random.default_rng(1)
     false = []
-    for number, step in enumerate(manhattan(120, 4, loop_gap=20)):
+    for number, step in enumerate(manhattan(120, 4, loops=LoopClosures(gap=20))):
         groups, batch = step.batch.factors, step.batch
         if number > 40 and number % 10 == 0:
             last = int(groups[0].keys[0].max())

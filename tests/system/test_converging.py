@@ -184,7 +184,7 @@ def test_killed_while_it_goes_on_it_comes_to_the_same_bits(
 ) -> None:
     """Against one that was never stopped. With durability none it is stopped in order: a crash may take steps back."""
     end = signal.SIGKILL if durability == "commit" else signal.SIGTERM
-    settings = ("snapshot_s=0.2", f'durability="{durability}"')
+    settings = ("checkpoint_s=0.2", f'durability="{durability}"')
     ends: list[tuple[int, dict[int, bytes]]] = []
     written: list[int] = []  # further steps, whenever it was stopped
     for name in ("whole", "stopped"):

@@ -17,7 +17,7 @@ from factorbus import idp
 from factorbus.client import aio, connect
 from factorbus.idp import minimal
 from factorbus.proto import keys
-from factorbus.proto.features import Answer, Ask, Segment, Sighting
+from factorbus.proto.features import Ask, FeaturesAnswer, Segment, Sighting
 from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
 from factorbus.proto.segments import PAGE, Memory
@@ -52,7 +52,7 @@ def measured(client: Bare, name: str) -> None:
     assert next(row for table in rows for row in table if row["name"] == name and "latency_ms" in row)
 
 
-def answer(client: Bare, ask: Ask) -> Answer:
+def answer(client: Bare, ask: Ask) -> FeaturesAnswer:
     came = client.ask(keys.features_key("s"), encode_ask(ask))
     assert isinstance(came, bytes), came
     return decode_answer(came)
@@ -64,11 +64,11 @@ def question() -> Question:
     sighting = random_sighting(31, N, 3)[0]
     seen = idp.see(sighting)
     rows = np.empty((6 * N, sighting.width + 6 * N))
-    minimal.NewRows(sighting, seen).rows(0, N, rows)
+    minimal.FeatureRows(sighting, seen).rows(0, N, rows)
     return sighting, seen.y, rows
 
 
-def put_together(got: Answer) -> bytes:
+def put_together(got: FeaturesAnswer) -> bytes:
     """y of all features, which come once each and in order."""
     edges = [(done.shard.first, done.shard.last) for done in got.shards]
     assert [first for first, _ in edges] == [0, *(last for _, last in edges[:-1])]

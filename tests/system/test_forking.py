@@ -145,7 +145,7 @@ def test_a_fork_is_there_after_a_kill_bit_for_bit(
     services: Callable[..., Services], tmp_path: Path, durability: str
 ) -> None:
     journal, batches = tmp_path / "journal", drafts(160)
-    running = services(journal, f'durability="{durability}"', "snapshot_s=0.001")
+    running = services(journal, f'durability="{durability}"', "checkpoint_s=0.001")
     with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("hall", window=8) as hall:
         stream = Stream(hall, batches)
         stream.start()

@@ -30,7 +30,7 @@ def test_killed_at_any_moment_nothing_answered_is_lost_and_nothing_is_done_twice
     services: Callable[..., Services], tmp_path: Path, mode: str, window: int, kills: int
 ) -> None:
     chance, batches, back_s = random.Random(kills), drafts(EACH * kills + 1), list[float]()
-    running = services(tmp_path / "journal", "snapshot_s=0.15")
+    running = services(tmp_path / "journal", "checkpoint_s=0.15")
     with (
         connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
         bus.map("m2", mode, window=window) as driven,

@@ -111,7 +111,7 @@ def test_nothing_is_lost_when_the_disk_takes_nothing_for_a_while(
 ) -> None:
     disk = request.getfixturevalue("disk") if how == "full" else None
     folder = (disk.path if disk else tmp_path) / "journal"
-    running = services(folder, f'durability="{durability}"', "snapshot_s=0.1")
+    running = services(folder, f'durability="{durability}"', "checkpoint_s=0.1")
     batches, endpoint = drafts(BEFORE + AFTER), running.start()
     with connect(endpoint, client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m2", "inc-l") as driven:
         events, stream = Events(endpoint, "m2"), Stream(driven, batches)

@@ -135,11 +135,11 @@ def test_a_fork_and_a_merged_map_have_them(endpoint: str, joined: Map) -> None:
             everywhere(endpoint, into, {"y0": -9} | {f"z{key[1:]}": stamp for key, stamp in wanted.items()})
 
 
-@pytest.mark.parametrize("settings", [("snapshot_s=1000",), ("snapshot_s=0.01",)])
+@pytest.mark.parametrize("settings", [("checkpoint_s=1000",), ("checkpoint_s=0.01",)])
 def test_killed_and_started_again_they_are_there(
     services: Callable[..., Services], tmp_path: Path, settings: tuple[str, ...]
 ) -> None:
-    """From the journal alone, and from a snapshot and what came after it."""
+    """From the journal alone, and from a checkpoint and what came after it."""
     running = services(tmp_path / "journal", *settings)
     batches, wanted = drafts(60), driven(60)
     with connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus, bus.map("m") as joined:

@@ -34,7 +34,7 @@ def test_killed_amid_the_traffic_of_others_it_comes_to_the_same_bits(
 ) -> None:
     folder = tmp_path / "journal"
     prepare(folder, "m2", mode)
-    running = services(folder, "snapshot_s=0.2")
+    running = services(folder, "checkpoint_s=0.2")
     with (
         connect(running.start(), client="robot", timeout_s=PATIENCE_S) as bus,
         bus.map("m2", create=False) as robot,

@@ -148,13 +148,13 @@ def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int,
     seen = idp.see(sighting)
     m = sighting.width
     whole = minimal.covariance(P, sighting, seen).P
-    parts = minimal.NewRows(sighting, seen)
+    parts = minimal.FeatureRows(sighting, seen)
     cuts = sorted({0, n, *data.draw(st.lists(st.integers(0, n), max_size=4))})
     for first, last in pairwise(cuts):
         out = np.full((6 * (last - first), m + 6 * n), np.nan)
         parts.rows(first, last, out)
         assert out.tobytes() == whole[m + 6 * first : m + 6 * last].tobytes()
-        half = minimal.NewRows(sighting, seen, first).half(first, last)
+        half = minimal.FeatureRows(sighting, seen, first).half(first, last)
         assert half.cross.tobytes() == np.ascontiguousarray(out[:, :m]).tobytes()
         at = 0
         for i in range(first, last):

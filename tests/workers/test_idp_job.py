@@ -10,7 +10,7 @@ from naive.random_sightings import random_sighting
 from factorbus import idp
 from factorbus.idp import job, minimal
 from factorbus.proto import segments
-from factorbus.proto.features import Ask, Segment, Shard, ShardDone, Sighting, rows_size
+from factorbus.proto.features import Ask, Segment, Shard, ShardDone, Sighting, new_rows_size
 from factorbus.proto.features_codec import decode_shard_done, encode_ask, encode_shard
 from factorbus.proto.problems import BadMessage, Problem, TooLarge
 from factorbus.proto.segments import PAGE, Memory
@@ -31,7 +31,7 @@ def done(ask: Ask, first: int = 0, last: int = N) -> ShardDone:
 def whole(sighting: Sighting) -> np.ndarray:
     """All new rows."""
     rows = np.empty((6 * N, M + 6 * N))
-    minimal.NewRows(sighting, idp.see(sighting)).rows(0, N, rows)
+    minimal.FeatureRows(sighting, idp.see(sighting)).rows(0, N, rows)
     return rows
 
 
@@ -51,7 +51,7 @@ def test_shards_put_together_are_the_whole_in_every_form(sighting: Sighting) -> 
 
 
 def test_a_shard_in_shared_memory_is_the_same_and_the_memory_goes(sighting: Sighting) -> None:
-    with Memory(PAGE + rows_size(N, M)) as memory:
+    with Memory(PAGE + new_rows_size(N, M)) as memory:
         array = memory.array(PAGE, (6 * N, M + 6 * N))
         ask = Ask(sighting, "rows", memory.segment(PAGE))
         for cut in ((0, 5), (5, 12)):
@@ -68,9 +68,9 @@ def test_rows_go_where_the_asker_wants_them() -> None:
     n = 70
     large = random_sighting(22, n)[0]
     expected = np.empty((6 * n, 13 + 6 * n))
-    minimal.NewRows(large, idp.see(large)).rows(0, n, expected)
+    minimal.FeatureRows(large, idp.see(large)).rows(0, n, expected)
     for offset in (PAGE, PAGE + 8, 3 * PAGE - 8):
-        with Memory(offset + rows_size(n, 13)) as memory:
+        with Memory(offset + new_rows_size(n, 13)) as memory:
             array = memory.array(offset, expected.shape)
             ask = Ask(large, "rows", memory.segment(offset))
             for cut in ((0, 1), (1, 64), (64, n)):
@@ -79,7 +79,7 @@ def test_rows_go_where_the_asker_wants_them() -> None:
 
 
 def test_a_file_that_is_not_what_it_says_is_not_written_to(sighting: Sighting, tmp_path: Path) -> None:
-    size = PAGE + rows_size(N, M)
+    size = PAGE + new_rows_size(N, M)
     content = ("0" * 32).encode() + bytes(size - 32)
     (tmp_path / "victim").write_bytes(content)
     with Memory(size) as memory, (tmp_path / "victim").open("r+b") as victim:
@@ -106,7 +106,7 @@ def test_a_file_that_is_not_what_it_says_is_not_written_to(sighting: Sighting, t
 
 def test_a_file_that_could_be_cut_short_is_not_mapped(sighting: Sighting) -> None:
     """Writing to a mapping beyond its file's end would end the worker."""
-    size = PAGE + rows_size(N, M)
+    size = PAGE + new_rows_size(N, M)
     descriptor = os.memfd_create("not sealed", os.MFD_ALLOW_SEALING)
     try:
         os.truncate(descriptor, size)

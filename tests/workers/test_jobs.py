@@ -9,11 +9,11 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service.jobs.running import do_in_place
-from factorbus.simulate import sphere
+from factorbus.simulate import Spiral, sphere
 from factorbus.solver import SolverError
 from factorbus.solver.starts import descent
 from factorbus.workers import jobs
-from factorbus.workers.config import WorkerConfig, checked_config
+from factorbus.workers.config import WorkerConfig, checked_worker_config
 
 INFORMATION = np.array([[100.0, 0, 0, 100, 0, 400]] * 3)
 
@@ -43,7 +43,7 @@ def test_the_service_in_place_finds_the_same_bits() -> None:
 
 def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Much noise of rotation and few loops: some 800 iterations, where 500 tries are made."""
-    world = sphere(200, 1, ring=20, rings=20, sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
+    world = sphere(200, 1, spiral=Spiral(20, 20), sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
     payload = codec.encode_graph(Graph(1, 1, merged(step.batch for step in world)))
     early = codec.decode_optimum(jobs.run_job("batch", payload))
     assert not early.converged
@@ -83,4 +83,4 @@ def test_what_cannot_be_done_has_a_code() -> None:
 @pytest.mark.parametrize("config", [WorkerConfig(connect=()), WorkerConfig(slots=0), WorkerConfig(name="a/b")])
 def test_a_configuration_that_cannot_work_is_refused(config: WorkerConfig) -> None:
     with pytest.raises(Problem):
-        checked_config(config)
+        checked_worker_config(config)

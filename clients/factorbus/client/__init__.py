@@ -14,8 +14,9 @@ from factorbus.client.features import Features, Growing
 from factorbus.client.filter_state import Factored, Grown
 from factorbus.client.map import Map, MapRow
 from factorbus.client.merging import AbsoluteFactors, CannotMerge, KeyCollision, Merged, NoAnchor
-from factorbus.client.mirror import Mirror, Snapshot
+from factorbus.client.mirror import Mirror
 from factorbus.client.pending_insert import NoAnswerYet, PendingInsert
+from factorbus.client.snapshot import Snapshot
 from factorbus.proto.camera import BadCamera, Camera
 from factorbus.proto.problems import NotConverged, Problem, Refused, Unavailable
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client import bus as sync
 from factorbus.client.aio_uncertainty import Uncertainty
-from factorbus.client.arguments import of_type, seconds
+from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft
 from factorbus.client.features import Features as SyncFeatures
@@ -158,7 +158,7 @@ class Map:
         timeout_s: float | None = None,
     ) -> Accepted:
         """Make `changes`, add `batch` and wait for the answer.  Raises Refused, NoAnswerYet (an Unavailable)."""
-        timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)  # refused before anything is sent
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._map.timeout_s)  # refused before anything is sent
         sent = await self.send(batch, settle=settle, convert_below=convert_below, changes=changes)
         return await self.result(sent, timeout_s)
 
@@ -211,7 +211,7 @@ class Map:
 
     async def result(self, pending_insert: PendingInsert, timeout_s: float | None = None) -> Accepted:
         """The answer to what was sent.  Raises Refused, NoAnswerYet."""
-        timeout_s = seconds("timeout_s", timeout_s, self._map.timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._map.timeout_s)
         try:
             return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(pending_insert.future)), timeout_s)
         except TimeoutError:

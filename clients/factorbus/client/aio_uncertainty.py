@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key
-from factorbus.client.uncertainty import UncertaintyQuestions, asked_why, factors_of, matrix_of, paired, sightings
+from factorbus.client.uncertainty import UncertaintyQuestions, factors_of, matrix_of, paired, sightings, why_question
 from factorbus.proto.arrays import F64
 from factorbus.proto.asking import Associated, Covariances, Gained, Gated, Why
 from factorbus.proto.messages import Batch, Factors
@@ -72,4 +72,4 @@ class Uncertainty:
 
     async def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
         """What holds a variable, or what a factor does, and what the map's last step did and why."""
-        return await asyncio.wrap_future(self._ask.why(asked_why(key, factor), timeout_s))
+        return await asyncio.wrap_future(self._ask.why(why_question(key, factor), timeout_s))

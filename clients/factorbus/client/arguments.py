@@ -20,14 +20,14 @@ def of_type(what: str, given: Any, kind: type[T], wanted: str) -> T:
     return given
 
 
-def flag(what: str, given: Any) -> bool:
+def checked_flag(what: str, given: Any) -> bool:
     """True or False, numpy's too; no other value is taken for one of the two.  Raises BadOption."""
     if not isinstance(given, (bool, np.bool_)):
         raise BadOption(what, seen(given), "True or False")
     return bool(given)
 
 
-def seconds(what: str, given: Any, usual: float) -> float:
+def checked_seconds(what: str, given: Any, usual: float) -> float:
     """How long to wait; None: as long as usual.  Raises BadOption."""
     if given is None:
         return usual

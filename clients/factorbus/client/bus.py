@@ -6,7 +6,7 @@ from numbers import Integral
 from os import PathLike
 from typing import Any
 
-from factorbus.client.arguments import flag, of_type, seconds
+from factorbus.client.arguments import checked_flag, checked_seconds, of_type
 from factorbus.client.features import Features
 from factorbus.client.link import Link, open_link
 from factorbus.client.map import SUFFIX_LENGTH, Map, MapRow
@@ -35,12 +35,12 @@ def connect(
     endpoint: "tcp/127.0.0.1:7447", or several to choose from.  client: 1 to 55 of A-Z a-z 0-9 _ -; who we are in
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
-    listening_s: give up after so long, and not `timeout_s`, where nobody listens at all; None: wait for whoever comes.
+    listening_s: give up after this, and not `timeout_s`, where nobody listens at all; None: wait for a service to come.
     Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
-    timeout_s = seconds("timeout_s", timeout_s, timeout_s)
-    listening_s = None if listening_s is None else seconds("listening_s", listening_s, listening_s)
+    timeout_s = checked_seconds("timeout_s", timeout_s, timeout_s)
+    listening_s = None if listening_s is None else checked_seconds("listening_s", listening_s, listening_s)
     endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
     return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh), listening_s), client, timeout_s)
 
@@ -68,7 +68,7 @@ class Bus:
         it is there.  Raises Refused, Unavailable, BadName, UnknownMap.
         """
         keys.checked_name("map", name)
-        mirror, create = flag("mirror", mirror), flag("create", create)
+        mirror, create = checked_flag("mirror", mirror), checked_flag("create", create)
         if of_type("window", window, Integral, "a whole number, 1 or more") < 1:
             raise BadOption("window", str(window), "a whole number, 1 or more")
         joined = Map(
@@ -113,7 +113,7 @@ class Bus:
 
     def maps(self, timeout_s: float | None = None) -> list[MapRow]:
         """The maps there are: of the service, or at a router of all services.  Raises Refused, Unavailable."""
-        told = query_all(self._link, "maps", seconds("timeout_s", timeout_s, self.timeout_s))
+        told = query_all(self._link, "maps", checked_seconds("timeout_s", timeout_s, self.timeout_s))
         return [row for each in told for row in _rows(each)]
 
     def stats(self, timeout_s: float | None = None) -> list[dict[str, Any]]:
@@ -121,7 +121,7 @@ class Bus:
 
         Raises Refused, Unavailable.
         """
-        told = query_all(self._link, "stats", seconds("timeout_s", timeout_s, self.timeout_s))
+        told = query_all(self._link, "stats", checked_seconds("timeout_s", timeout_s, self.timeout_s))
         return [codec.decode_map(each) for each in told]
 
     def create(self, name: str, mode: str = "auto", timeout_s: float | None = None) -> MapRow:
@@ -159,8 +159,8 @@ class Bus:
         """
         asked: dict[str, Any] = {"map": keys.checked_name("map", name)}
         asked |= {} if revision is None else {"revision": revision}
-        asked |= {"damaged": True} if flag("damaged", damaged) else {}
-        missing_ok = flag("missing_ok", missing_ok)
+        asked |= {"damaged": True} if checked_flag("damaged", damaged) else {}
+        missing_ok = checked_flag("missing_ok", missing_ok)
         try:
             self._admin("drop", asked, codec.decode_map, timeout_s)
         except Refused as refused:
@@ -193,7 +193,7 @@ class Bus:
             return UnknownMap(name)
 
     def _admin(self, operation: str, question: dict[str, Any], decode: Any, timeout_s: float | None) -> Any:
-        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         what = f"the service, asked for admin/{operation},"
         request = Request(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
         return self._sender.carry(request).future.result()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping
-from typing import TypedDict
+from typing import Required, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,6 +58,31 @@ class Certainty(TypedDict, total=False):
     loss: tuple[str, float] | str | None
 
 
+class FeatureCertainty(TypedDict, total=False):
+    """How certain the first observation of an inverse-depth feature is.
+
+    sigma_rho: of the inverse distance, 1/metre; without a default.  sigma_pixel: of u and of v, pixels (1.0).
+    sigma_anchor: how well the feature's anchor is held to the pose, metres (1e-4).  loss: as in `Certainty`.
+    """
+
+    sigma_rho: Required[float]
+    sigma_pixel: float
+    sigma_anchor: float
+    loss: tuple[str, float] | str | None
+
+
+def feature_sigmas(where: str, certainty: FeatureCertainty) -> list[float]:
+    """Standard deviations (6,) of the residual of `idp_first`: anchor, pixel, 1/distance.  Raises BadInformation."""
+    wanted = tuple(FeatureCertainty.__annotations__)
+    for name in certainty:
+        if name not in wanted:
+            raise BadInformation(where, f"there is no keyword {name!r}", f"{', '.join(wanted)}{nearest(name, wanted)}")
+    if "sigma_rho" not in certainty:
+        raise BadInformation(where, "no sigma_rho", "sigma_rho, the standard deviation of rho in 1/metre")
+    pixel, anchor = certainty.get("sigma_pixel", 1.0), certainty.get("sigma_anchor", 1e-4)
+    return [anchor] * 3 + [pixel] * 2 + [certainty["sigma_rho"]]
+
+
 def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F64:
     """The upper triangle of Ω, dim × dim, of a factor of `kind`.  Raises BadShape, BadInformation."""
     _check_names(where, certainty)
@@ -70,7 +95,7 @@ def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F
     raise BadInformation(where, seen, "one of the two: how certain it is")
 
 
-def carried(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
+def transform_certainty(where: str, dim: int, certainty: Certainty, A: F64, kind: str) -> Certainty:
     """The certainty of r' where this is that of r = A r', both of a factor of `kind`."""
     W = full(triangle_of(where, dim, certainty, kind), dim)
     return {"information": (A.T @ W @ A)[np.triu_indices(dim)], "loss": certainty.get("loss")}

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import flag, of_type
+from factorbus.client.arguments import checked_flag, of_type
 from factorbus.client.certainty import loss_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
@@ -38,7 +38,7 @@ class Changes:
 
     def remove_variables(self, *keys: Key | Sequence[Key], alone: bool = False) -> Changes:
         """These variables go, with every factor on them; with `alone` it is refused (in_use) if there is any left."""
-        return self._add(Change("remove_variables", keys=_keys(keys), alone=flag("changes: alone", alone)))
+        return self._add(Change("remove_variables", keys=_keys(keys), alone=checked_flag("changes: alone", alone)))
 
     def undo(self, batch: Batch | Draft, accepted: Accepted) -> Changes:
         """What an insert brought goes again; refused (in_use) where something that came later rests on it."""
@@ -90,7 +90,7 @@ class Changes:
 
         carry: what is not in `groups`, and not fixed, goes along with what it hangs on.
         """
-        carry, wanted = flag("changes: carry", carry), "groups of variables, as `variables` of an Estimate"
+        carry, wanted = checked_flag("changes: carry", carry), "groups of variables, as `variables` of an Estimate"
         listed = [
             of_type("changes: place", each, Variables, wanted)
             for each in of_type("changes: place", groups, Iterable, wanted)

@@ -11,8 +11,15 @@ from typing import TypeAlias, TypeVar, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorbus.client.arguments import flag, of_type
-from factorbus.client.certainty import Certainty, carried, loss_of, triangle_of
+from factorbus.client.arguments import checked_flag, of_type
+from factorbus.client.certainty import (
+    Certainty,
+    FeatureCertainty,
+    feature_sigmas,
+    loss_of,
+    transform_certainty,
+    triangle_of,
+)
 from factorbus.client.key_numbers import Key, key_number, key_numbers, stamp_number
 from factorbus.client.lever_arm import transform_se2, transform_se3
 from factorbus.client.linear import linear_pieces
@@ -103,9 +110,9 @@ class Draft:
         carried over to first order in the error (`factorbus.client.lever_arm`, MATH §3.7).
         """
         if mount is not None:
-            where = self._between(first, second, "between_se2")
+            where = self._joins(first, second, "between_se2")
             measured, A = transform_se2(_row(f"{where}: measured", measured, 3), _row(f"{where}: mount", mount, 3))
-            certainty = carried(where, 3, certainty, A, "between_se2")
+            certainty = transform_certainty(where, 3, certainty, A, "between_se2")
         return self.factor("between_se2", (first, second), measured, **certainty)
 
     def between_se3(
@@ -125,11 +132,11 @@ class Draft:
         mount: where on the robot the sensor is, x y z qx qy qz qw, if it has measured its own way; as in `between_se2`.
         """
         if mount is not None:
-            where = self._between(first, second, "between_se3")
+            where = self._joins(first, second, "between_se3")
             measured, A = transform_se3(
                 where, _row(f"{where}: measured", measured, 7), _row(f"{where}: mount", mount, 7)
             )
-            certainty = carried(where, 6, certainty, A, "between_se3")
+            certainty = transform_certainty(where, 6, certainty, A, "between_se3")
         return self.factor("between_se3", (first, second), measured, **certainty)
 
     def landmark_se2(
@@ -236,19 +243,16 @@ class Draft:
         camera: Camera,
         pixel: ArrayLike,
         rho: float,
-        *,
-        sigma_rho: float,
-        sigma_pixel: float = 1.0,
-        sigma_anchor: float = 1e-4,
-        loss: tuple[str, float] | str | None = None,
+        **certainty: Unpack[FeatureCertainty],
     ) -> Draft:
         """A feature where the pose's camera (x right, y down, z forward) saw it first, about 1/rho metres away.
 
-        sigma_rho: of that guess, 1/metre; sigma_anchor: how well the feature's anchor is held to the pose, metres.
+        sigma_rho=, of that guess, 1/metre; sigma_pixel=, sigma_anchor= and loss= where the usual ones do not do
+        (`factorbus.client.certainty.FeatureCertainty`).
         """
         measured = [*_row("pixel", pixel, 2), rho, *_lens(camera)]
-        sigmas = [sigma_anchor] * 3 + [sigma_pixel] * 2 + [sigma_rho]
-        return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=loss)
+        sigmas = feature_sigmas(self._joins(pose, feature, "idp_first"), certainty)
+        return self.factor("idp_first", (pose, feature), measured, sigmas=sigmas, loss=certainty.get("loss"))
 
     def idp_seen(
         self, pose: Key, feature: Key, camera: Camera, pixel: ArrayLike, **certainty: Unpack[Certainty]
@@ -276,7 +280,7 @@ class Draft:
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
         row = None if value is None else _row(where, value, size)
-        time, held = stamp_number(where, stamp), flag(f"{where}: fixed", fixed)
+        time, held = stamp_number(where, stamp), checked_flag(f"{where}: fixed", fixed)
         keys, rows, stamps = self._variables.setdefault((kind, row is not None, held), ([], [], []))
         keys.append(number)
         stamps.append(time)
@@ -307,7 +311,7 @@ class Draft:
         all_triangles.append(triangle)
         return self
 
-    def _between(self, first: Key, second: Key, kind: str) -> str:
+    def _joins(self, first: Key, second: Key, kind: str) -> str:
         """What an error says it is about."""
         return " ".join([kind, *(format_symbol(key_number(key)) for key in (first, second))])
 

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import seconds
+from factorbus.client.arguments import checked_seconds
 from factorbus.client.filter_state import Factored, Grown, factored, grown
 from factorbus.client.link import Link
 from factorbus.client.request_sender import Request, RequestSender
@@ -24,7 +24,7 @@ from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import keys
 from factorbus.proto.arrays import F64
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import CAMERA_STATE, FEATURE, Answer, Ask, Sighting, answer_size, rows_size
+from factorbus.proto.features import CAMERA_STATE, FEATURE, Ask, FeaturesAnswer, Sighting, answer_size, new_rows_size
 from factorbus.proto.features_codec import decode_answer, encode_ask
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadShape, Refused, TooLarge, Unavailable
@@ -86,7 +86,7 @@ class Features:
         sighting = self._sighting(state, covariance, pixels)
         m, n = sighting.width, sighting.count
         allocation = None
-        if self._shared and rows_size(n, m) >= _SHARED_FROM_BYTES:
+        if self._shared and new_rows_size(n, m) >= _SHARED_FROM_BYTES:
             allocation = self._pool.try_allocate(PAGE, (m + FEATURE * n, m + FEATURE * n), m)
         ask = Ask(sighting, "rows", allocation.segment) if allocation else Ask(sighting, "half")
         return Growing(self, state, covariance, ask, allocation, self._ask(ask, timeout_s))
@@ -97,7 +97,7 @@ class Features:
         Of P, its first 13 rows will do.  Raises as `grow`.
         """
         sighting = self._sighting(np.asarray(x, np.float64), np.asarray(P, np.float64), pixels)
-        answer: Answer = self._ask(Ask(sighting, "factored"), timeout_s).future.result()
+        answer: FeaturesAnswer = self._ask(Ask(sighting, "factored"), timeout_s).future.result()
         return factored(sighting, answer)
 
     def close(self) -> None:
@@ -126,7 +126,7 @@ class Features:
 
     def _ask(self, ask: Ask, timeout_s: float | None) -> Request:
         self._link.check_open("features")
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         if answer_size(ask) > ANSWER_LIMITS.max_bytes:
             raise TooLarge("the answer", answer_size(ask), ANSWER_LIMITS.max_bytes, "bytes")
         started = time.monotonic()
@@ -162,7 +162,7 @@ class Growing:
         self._result: Grown | None = None
 
     @property
-    def future(self) -> Future[Answer]:
+    def future(self) -> Future[FeaturesAnswer]:
         """For callbacks and asyncio: it is done when `result` need not wait for the bus."""
         return self._request.future
 

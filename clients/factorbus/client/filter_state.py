@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.proto.arrays import F64
-from factorbus.proto.features import FEATURE, Answer, Done, ShardDone, Sighting
+from factorbus.proto.features import FEATURE, Done, FeaturesAnswer, ShardDone, Sighting
 from factorbus.proto.problems import BadMessage
 
 _TILE = 64 * FEATURE  # rows and columns transposed at a time
@@ -70,7 +70,7 @@ class Factored:
         return np.array([[a, 1.0, b], [c, 0.0, -d]])
 
 
-def factored(sighting: Sighting, answer: Answer) -> Factored:
+def factored(sighting: Sighting, answer: FeaturesAnswer) -> Factored:
     """An answer in the form `factored`.  Raises BadMessage."""
     done = [each.shard for each in _in_order(answer, sighting.count)]
     U, S = _there("U", done[0].U), _there("S", done[0].S)
@@ -79,7 +79,7 @@ def factored(sighting: Sighting, answer: Answer) -> Factored:
     return Factored(np.concatenate([shard.y for shard in done]), U, S, turn, own, sighting.sigma_rho)
 
 
-def grown(x: F64, P: F64, sighting: Sighting, answer: Answer, matrix: F64 | None) -> Grown:
+def grown(x: F64, P: F64, sighting: Sighting, answer: FeaturesAnswer, matrix: F64 | None) -> Grown:
     """State and covariance with the features of an answer in the form `rows` or `half`.  Raises BadMessage.
 
     matrix (m + 6 n, m + 6 n): where stored rows are, and everything else is put; None: nothing is stored.
@@ -129,7 +129,7 @@ def _mirror(square: F64) -> None:
             corner[i : i + FEATURE, :i] = corner[:i, i : i + FEATURE].T
 
 
-def _in_order(answer: Answer, n: int) -> Sequence[Done]:
+def _in_order(answer: FeaturesAnswer, n: int) -> Sequence[Done]:
     """The shards, if they are all features once and in order."""
     at = 0
     for done in answer.shards:

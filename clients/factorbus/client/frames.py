@@ -15,20 +15,20 @@ SPACES = {"se2": 3, "point2": 3, "se3": 7, "point3": 7, "idp": 7}
 def compose(T_a_b: F64, poses: F64) -> F64:
     """T_a_b ∘ poses, (n, 3) or (n, 7)."""
     if poses.shape[1] == 3:
-        turned = poses[:, :2] @ rotation(T_a_b).T + T_a_b[:2]
+        turned = poses[:, :2] @ rotation_of(T_a_b).T + T_a_b[:2]
         return np.column_stack([turned, _wrapped(poses[:, 2] + T_a_b[2])])
-    turned = poses[:, :3] @ rotation(T_a_b).T + T_a_b[:3]
+    turned = poses[:, :3] @ rotation_of(T_a_b).T + T_a_b[:3]
     return np.column_stack([turned, _product(T_a_b[3:], poses[:, 3:])])
 
 
 def inverse(T_a_b: F64) -> F64:
     """T_b_a."""
     if T_a_b.size == 3:
-        return np.array([*(-rotation(T_a_b).T @ T_a_b[:2]), -T_a_b[2]])
-    return np.array([*(-rotation(T_a_b).T @ T_a_b[:3]), *-T_a_b[3:6], T_a_b[6]])
+        return np.array([*(-rotation_of(T_a_b).T @ T_a_b[:2]), -T_a_b[2]])
+    return np.array([*(-rotation_of(T_a_b).T @ T_a_b[:3]), *-T_a_b[3:6], T_a_b[6]])
 
 
-def rotation(pose: F64) -> F64:
+def rotation_of(pose: F64) -> F64:
     """R of a pose, (2, 2) or (3, 3)."""
     if pose.size == 3:
         c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -54,12 +54,12 @@ def moved_values(kind: str, values: F64, T_a_b: F64) -> F64:
     if kind in ("se2", "se3"):
         return compose(T_a_b, values)
     size = values.shape[1] if kind != "idp" else 3
-    points = values[:, :size] @ rotation(T_a_b).T + T_a_b[:size]
+    points = values[:, :size] @ rotation_of(T_a_b).T + T_a_b[:size]
     if kind != "idp":
         return points
     theta, phi = values[:, 3], values[:, 4]
     rays = np.stack([np.cos(phi) * np.sin(theta), -np.sin(phi), np.cos(phi) * np.cos(theta)], axis=1)
-    x, y, z = (rays @ rotation(T_a_b).T).T
+    x, y, z = (rays @ rotation_of(T_a_b).T).T
     return np.column_stack([points, np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z)), values[:, 5]])
 
 

@@ -21,7 +21,7 @@ of a degree and a lever of a metre 0.15 mm.  MATH §3.7.
 
 import numpy as np
 
-from factorbus.client.frames import compose, inverse, rotation
+from factorbus.client.frames import compose, inverse, rotation_of
 from factorbus.proto.arrays import F64
 from factorbus.proto.problems import BadShape
 
@@ -31,7 +31,7 @@ _TOLERANCE = 1e-3
 
 def transform_se2(measured: F64, mount: F64) -> tuple[F64, F64]:
     """(z', A) of z and L, both x y (metres) theta (radians); A (3, 3): r = A r'."""
-    Q, A = rotation(mount), np.eye(3)
+    Q, A = rotation_of(mount), np.eye(3)
     A[:2, :2], A[:2, 2] = Q.T, Q.T @ (-mount[1], mount[0])
     return _carried(measured, mount), A
 
@@ -41,7 +41,7 @@ def transform_se3(where: str, measured: F64, mount: F64) -> tuple[F64, F64]:
     _check_unit(f"{where}: mount", mount)
     _check_unit(f"{where}: measured", measured)
     x, y, z = mount[:3]
-    Q, A = rotation(mount), np.zeros((6, 6))
+    Q, A = rotation_of(mount), np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = Q.T
     A[:3, 3:] = -2.0 * Q.T @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return _carried(measured, mount), A

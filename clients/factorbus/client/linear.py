@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
-from factorbus.pieces import MOST, as_pieces, dims_of
+from factorbus.pieces import MOST, as_pieces, tangent_dims
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import VARIABLE_KINDS
 from factorbus.proto.messages import Factors
@@ -73,7 +73,7 @@ def _checked_dims(where: str, names: Sequence[str], y: Sequence[F64]) -> list[in
         if value.shape != (VARIABLE_KINDS[name].size,):
             raise BadShape(f"{where}: value of a {name}", f"shape {value.shape}", f"({VARIABLE_KINDS[name].size},)")
     try:
-        return dims_of(names)
+        return tangent_dims(names)
     except ValueError as problem:
         wanted = "all of the plane (se2, point2), or all of space (se3, point3, idp)"
         raise BadShape(f"{where}: kinds", ", ".join(names), wanted) from problem

@@ -13,7 +13,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import flag, of_type, seconds
+from factorbus.client.arguments import checked_flag, checked_seconds, of_type
 from factorbus.client.changes import Changes
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key
@@ -133,7 +133,7 @@ class Map:
 
         Raises Refused: the map is as it was.  Raises Unavailable: see `PendingInsert.result`.  Raises as `send`.
         """
-        end = time.monotonic() + seconds("timeout_s", timeout_s, self.timeout_s)
+        end = time.monotonic() + checked_seconds("timeout_s", timeout_s, self.timeout_s)
         left = max(end - time.monotonic(), 0.0)
         pending_insert = self.send(batch, settle=settle, convert_below=convert_below, changes=changes, timeout_s=left)
         accepted = pending_insert.result(max(end - time.monotonic(), 0.0))
@@ -194,10 +194,10 @@ class Map:
 
         Raises Unavailable if the window stays full for `timeout_s`, TooLarge, NotSupported, BadOption: nothing is sent.
         """
-        batch, settle = batch_of("batch", batch), flag("settle", settle)
+        batch, settle = batch_of("batch", batch), checked_flag("settle", settle)
         listed = () if changes is None else of_type("changes", changes, Changes, "a Changes").listed()
         check_stamps(self._protocol, batch)
-        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._sending:  # keeps the order of the numbers on the wire; callbacks of the bus never take it
             with self._lock:
                 self._wait_for_room(timeout_s)
@@ -214,7 +214,7 @@ class Map:
 
         Raises Unavailable when time is up, and the first refusal that nobody has looked at with `result`.
         """
-        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         with self._lock:
             if not self._changed.wait_for(lambda: self._window.idle, timeout_s):
                 left = len(self._window.unanswered)
@@ -237,7 +237,7 @@ class Map:
         Raises NotConverged when time is up, or at once where the map gave up before it had converged; as `flush` does;
         Unavailable for a map opened with mirror=False.
         """
-        end = time.monotonic() + seconds("timeout_s", timeout_s, self.timeout_s)
+        end = time.monotonic() + checked_seconds("timeout_s", timeout_s, self.timeout_s)
         self.flush(max(end - time.monotonic(), 0.0))
         self.estimate.wait_converged(max(end - time.monotonic(), 0.0))
 
@@ -286,7 +286,7 @@ class Map:
         """Names of the clients that have joined the map and not left it, of those that tell; this one is among them."""
         self._link.check_open(f"map {self.name!r}, asked for its clients")
         came: SimpleQueue[set[str]] = SimpleQueue()
-        timeout_s = seconds("timeout_s", timeout_s, self.timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self.timeout_s)
         self._link.ask_tokens(keys.any_client_token(self.name), timeout_s, came.put)
         return set(map(keys.client_of, came.get()))
 

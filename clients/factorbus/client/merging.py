@@ -24,7 +24,7 @@ from factorbus.client.frames import (
     moved_values,
 )
 from factorbus.client.transform_factors import transform_factors
-from factorbus.client.transform_linear import is_relative, says_nothing
+from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
@@ -206,7 +206,7 @@ def _joint(batch: Batch) -> I64:
 
 def _stays(group: Factors, joint: I64) -> np.ndarray:
     if group.kind in LINEAR_PAIRS:
-        return is_relative(group) & ~np.isin(group.keys, joint).all(axis=1)
+        return are_relative(group) & ~np.isin(group.keys, joint).all(axis=1)
     return np.full(len(group.keys), group.kind not in _OF_THE_WORLD)
 
 

@@ -6,23 +6,22 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
-from factorbus.client.arguments import of_type, seconds
+from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.following import Following, tables_of
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
 from factorbus.client.replies import AnswerReply, Reply, TimedOut, pause
+from factorbus.client.snapshot import Snapshot
 from factorbus.proto import fields, keys
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_asked
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
-from factorbus.proto.messages import Delta, Variables
+from factorbus.proto.messages import Delta
 from factorbus.proto.problems import BadSymbol, ClosedHere, NotConverged, Unavailable
-from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -36,24 +35,6 @@ _GRACE_S = 0.1
 _BACKLOG = 4096
 # A waiting reader has the owner asked this soon.
 _IMPATIENT_S = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """An estimate at one revision: {kind: (keys (n,), values (n, size))}, ordered by key.
-
-    stamps: {kind: (n,)}, the time stamps in the same order, nanoseconds; NO_STAMP (-2^63) of a variable without.
-    """
-
-    epoch: int
-    revision: int
-    columns: dict[str, tuple[I64, F64]]
-    stamps: dict[str, I64]
-
-    def variables(self) -> tuple[Variables, ...]:
-        """The same as groups of a message, one for each kind."""
-        groups = (Variables(kind, *columns, stamps=self.stamps[kind]) for kind, columns in self.columns.items())
-        return tuple(g if (g.stamps != NO_STAMP).any() else g._replace(stamps=None) for g in groups)
 
 
 class Mirror:
@@ -156,7 +137,7 @@ class Mirror:
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
         """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         of_type("revision", revision, Integral, "a whole number")
         self._try_wait(lambda: self._there(revision), timeout_s)
         if self._there(revision):
@@ -172,7 +153,7 @@ class Mirror:
         That is at its optimum to 1e-6 of χ², or within a thousandth where it gave up the rest (`gave_up` of its stats).
         Raises NotConverged when time is up, at once where it gave up before; Unavailable, at once, on a closed map.
         """
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         self._try_wait(lambda: self._is_at_rest, timeout_s)
         if self._is_at_rest and self.converged:
             return

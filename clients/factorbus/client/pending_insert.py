@@ -2,7 +2,7 @@
 
 from concurrent.futures import Future
 
-from factorbus.client.arguments import seconds
+from factorbus.client.arguments import checked_seconds
 from factorbus.client.request_sender import Request
 from factorbus.proto.messages import Accepted
 from factorbus.proto.problems import Unavailable
@@ -38,7 +38,7 @@ class PendingInsert:
         NoAnswerYet does not take the insert back: it goes on being sent with its number.  Wait again, or `flush`;
         do not insert it anew.
         """
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         try:
             return self.future.result(timeout_s)
         except TimeoutError:

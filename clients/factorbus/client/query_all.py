@@ -4,7 +4,7 @@ import time
 from queue import SimpleQueue
 
 from factorbus.client.link import Link
-from factorbus.client.replies import Again, Reply, Silence, judge
+from factorbus.client.replies import Again, Reply, Silence, interpret_reply
 from factorbus.client.versions import refuse_other_protocol
 from factorbus.proto import codec, keys
 from factorbus.proto.problems import Problem, Unavailable
@@ -23,7 +23,7 @@ def query_all(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         attempt += 1
         came: SimpleQueue[list[Reply]] = SimpleQueue()
         link.ask_all(key, payload, left, came.put)
-        verdicts = [judge(reply, attempt) for reply in came.get() or [Silence()]]
+        verdicts = [interpret_reply(reply, attempt) for reply in came.get() or [Silence()]]
         if answers := [verdict for verdict in verdicts if isinstance(verdict, bytes)]:
             return answers
         link.check_open(what)

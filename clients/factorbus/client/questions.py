@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-from factorbus.client.arguments import flag, seconds
+from factorbus.client.arguments import checked_flag, checked_seconds
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
@@ -38,9 +38,9 @@ class Questions:
 
     def chi2(self, batch: bool, timeout_s: float | None, values: bool = False) -> Future[Chi2]:
         """Σ rᵀΩr; with `batch` also of the optimum from scratch, for which a worker gets `timeout_s`; or all of it."""
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
-        question = {"batch": flag("batch", batch), "timeout_s": timeout_s}
-        question |= {"values": True} if flag("values", values) else {}
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
+        question = {"batch": checked_flag("batch", batch), "timeout_s": timeout_s}
+        question |= {"values": True} if checked_flag("values", values) else {}
         return self._ask("chi2", codec.encode_map(question), codec.decode_chi2, timeout_s)
 
     def graph(self, timeout_s: float | None) -> Future[Graph]:
@@ -60,7 +60,7 @@ class Questions:
         ids: str = "auto",
     ) -> Future[Exported]:
         """The map as the text of a file, and what was left out of it."""
-        question: dict[str, Any] = {"format": format, "strict": flag("strict", strict), "ids": ids}
+        question: dict[str, Any] = {"format": format, "strict": checked_flag("strict", strict), "ids": ids}
         question |= {} if robot is None else {"robot": robot}
         return self._ask("export", codec.encode_map(question), _exported, timeout_s)
 
@@ -75,7 +75,7 @@ class Questions:
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         return self._sender.carry(Request(what, key, payload, decode, timeout_s)).future
 
 

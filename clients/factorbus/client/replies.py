@@ -52,7 +52,9 @@ class Again:
     because: str
 
 
-def judge(reply: Reply, attempt: int, passing: Callable[[Refused], bool] | None = None) -> bytes | Problem | Again:
+def interpret_reply(
+    reply: Reply, attempt: int, passing: Callable[[Refused], bool] | None = None
+) -> bytes | Problem | Again:
     """What `reply` to the `attempt`-th try (from 1) means: the answer, a final problem, or another try.
 
     passing: which refusals will not last, besides busy and shutting_down.

@@ -16,7 +16,7 @@ from typing import Any
 
 from factorbus.client.interruptible_future import InterruptibleFuture
 from factorbus.client.link import Link
-from factorbus.client.replies import Again, Reply, Silence, judge
+from factorbus.client.replies import Again, Reply, Silence, interpret_reply
 from factorbus.client.versions import LOOK_S, other_protocol
 from factorbus.proto.problems import ClosedHere, Problem, Refused, Unavailable
 from factorbus.wording import counted
@@ -119,7 +119,7 @@ class RequestSender:
     def _take(self, request: Request, attempt: int, reply: Reply) -> None:
         """On zenoh's thread: only decode, hand over, or put back."""
         self._heard = self._heard or not isinstance(reply, Silence)
-        verdict = judge(reply, attempt, request.passing)
+        verdict = interpret_reply(reply, attempt, request.passing)
         if isinstance(verdict, bytes):
             try:
                 self._finish(request, request.decode(verdict))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.client.frames import rotation
+from factorbus.client.frames import rotation_of
 from factorbus.client.transform_linear import transform_linear
 from factorbus.proto.arrays import F64
 from factorbus.proto.linear import LINEAR_PAIRS
@@ -20,7 +20,7 @@ def _transform_first(group: Factors, T_a_b: F64) -> Factors:
     """`idp_first`: the first three rows of the residual are along the map's axes: Ω turns with them."""
     rows, columns = np.triu_indices(6)
     turn = np.eye(6)
-    turn[:3, :3] = rotation(T_a_b)
+    turn[:3, :3] = rotation_of(T_a_b)
     full = np.zeros((len(group.keys), 6, 6))
     full[:, rows, columns] = full[:, columns, rows] = group.information
     return group._replace(information=np.ascontiguousarray((turn @ full @ turn.T)[:, rows, columns]))

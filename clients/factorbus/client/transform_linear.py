@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from factorbus.client.frames import moved_values, rotation
+from factorbus.client.frames import moved_values, rotation_of
 from factorbus.proto.arrays import F64
 from factorbus.proto.linear import parts_of
 from factorbus.proto.messages import Factors
@@ -13,7 +13,7 @@ from factorbus.proto.messages import Factors
 _ROUNDING = 1e-6
 
 
-def is_relative(group: Factors) -> np.ndarray:
+def are_relative(group: Factors) -> np.ndarray:
     """Of each of the linear factors of two variables, whether it says nothing of where the two are together.
 
     With x_i ⊟ y_i after a small motion ξ of the whole frame being G_i ξ, it says nothing if H₁ G₁ + H₂ G₂ = 0.
@@ -51,7 +51,7 @@ def transform_linear(group: Factors, T_a_b: F64) -> Factors:
 
 def _turned(kind: str, before: F64, after: F64, H: F64, T_a_b: F64) -> F64:
     """H of increments after the motion.  Of a feature's direction that is so to first order."""
-    R = rotation(T_a_b)
+    R = rotation_of(T_a_b)
     if kind in ("se2", "se3"):
         return H
     if kind != "idp":
@@ -68,7 +68,7 @@ def _carried(kind: str, y: F64) -> F64:
     if kind == "point2":
         return np.array([[1.0, 0.0, -y[1]], [0.0, 1.0, y[0]]])
     if kind == "se2":
-        R = rotation(y)
+        R = rotation_of(y)
         return np.block([[R.T, (R.T @ [-y[1], y[0]])[:, None]], [np.zeros((1, 2)), np.ones((1, 1))]])
     moved = np.column_stack([np.eye(3), -_cross(y)])
     if kind == "point3":
@@ -76,7 +76,7 @@ def _carried(kind: str, y: F64) -> F64:
     if kind == "idp":
         turn = np.column_stack([np.zeros((2, 3)), -_angles(y) @ _cross(_ray(y)[0])])
         return np.concatenate([moved, turn, np.zeros((1, 6))])
-    R = rotation(y)
+    R = rotation_of(y)
     return np.concatenate([R.T @ moved, np.column_stack([np.zeros((3, 3)), R.T])])
 
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import of_type, seconds
+from factorbus.client.arguments import checked_seconds, of_type
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
@@ -82,7 +82,7 @@ class UncertaintyQuestions:
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:
         what = f"map {self._map!r}, asked for its {question},"
         key = keys.ask_key(self._map, question)
-        timeout_s = seconds("timeout_s", timeout_s, self._timeout_s)
+        timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         return self._sender.carry(Request(what, key, payload, decode, timeout_s)).future
 
 
@@ -146,7 +146,7 @@ class Uncertainty:
 
     def why(self, key: Key | None = None, *, factor: int | None = None, timeout_s: float | None = None) -> Why:
         """What holds a variable, or what a factor (by its id) does, and what the map's last step did and why."""
-        return self.ask.why(asked_why(key, factor), timeout_s).result()
+        return self.ask.why(why_question(key, factor), timeout_s).result()
 
 
 def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
@@ -178,7 +178,7 @@ def matrix_of(answer: Covariances) -> F64:
     return answer.covariance
 
 
-def asked_why(key: Key | None, factor: int | None) -> AskWhy:
+def why_question(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")

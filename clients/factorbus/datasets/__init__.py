@@ -3,26 +3,26 @@
 `find("intel")` is what everything that takes a data set by name needs.
 """
 
-from factorbus.datasets.catalogue import Dataset, Source, named
-from factorbus.datasets.checksum import ChecksumResult, check
+from factorbus.datasets.catalogue import Dataset, Source, dataset_named
+from factorbus.datasets.checksum import ChecksumResult, check_dataset
 from factorbus.datasets.convert import convert
 from factorbus.datasets.errors import DatasetProblem
-from factorbus.datasets.fetch import fetch
+from factorbus.datasets.fetch import fetch_dataset
 from factorbus.datasets.known import CATALOGUE
-from factorbus.datasets.places import Place, Places, find, locate
+from factorbus.datasets.places import FoundFile, Places, find, locate
 
 __all__ = [
     "CATALOGUE",
     "ChecksumResult",
     "Dataset",
     "DatasetProblem",
-    "Place",
+    "FoundFile",
     "Places",
     "Source",
-    "check",
+    "check_dataset",
     "convert",
-    "fetch",
+    "dataset_named",
+    "fetch_dataset",
     "find",
     "locate",
-    "named",
 ]

@@ -59,7 +59,7 @@ class Dataset:
         return f"{self.name}.g2o"
 
 
-def named(name: str, catalogue: Sequence[Dataset]) -> Dataset:
+def dataset_named(name: str, catalogue: Sequence[Dataset]) -> Dataset:
     """The data set of that name, with or without .g2o.  Raises UnknownDataset."""
     for each in catalogue:
         if name in (each.name, each.file):

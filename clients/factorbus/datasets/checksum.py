@@ -22,7 +22,7 @@ class ChecksumResult:
         return self.seen == self.wanted
 
 
-def check(dataset: Dataset, path: Path) -> ChecksumResult:
+def check_dataset(dataset: Dataset, path: Path) -> ChecksumResult:
     """Hold the file at `path` against the catalogue.  Raises CannotRead."""
     return ChecksumResult(dataset.name, path, sha256_of(path), dataset.sha256)
 

@@ -17,7 +17,7 @@ from factorbus.datasets.errors import BadChecksum, CannotRead, NotShipped, canno
 Watch = Callable[[str, int, int | None], None]
 
 
-def fetch(
+def fetch_dataset(
     dataset: Dataset,
     cache: Path,
     *,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from factorbus.datasets.catalogue import Dataset, named
+from factorbus.datasets.catalogue import Dataset, dataset_named
 from factorbus.datasets.checksum import sha256_of
 from factorbus.datasets.fetch import from_wheel
 from factorbus.datasets.known import CATALOGUE
@@ -29,7 +29,7 @@ class Places:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class FoundFile:
     """where: "own", "cache" or "wheel"; from the wheel the file at `path` is a source still to be converted."""
 
     where: str
@@ -43,24 +43,24 @@ def find(name: str, places: Places | None = None, catalogue: Sequence[Dataset] =
     Raises UnknownDataset; for the wheel also BadChecksum, CannotRead and CannotWrite.
     """
     places = places or Places.of_this_machine()
-    dataset = named(name, catalogue)
+    dataset = dataset_named(name, catalogue)
     place = locate(dataset, places)
     if place is None or place.where != "wheel":
         return place.path if place else None
     return from_wheel(dataset, place.path.parent, places.cache)
 
 
-def locate(dataset: Dataset, places: Places) -> Place | None:
+def locate(dataset: Dataset, places: Places) -> FoundFile | None:
     """Where `dataset` is; nothing is converted or changed.  Raises CannotRead for a file of the wheel."""
     for where, folder in (("own", places.own), ("cache", places.cache)):
         if folder is not None and (folder / dataset.file).is_file():
-            return Place(where, folder / dataset.file)
+            return FoundFile(where, folder / dataset.file)
     if dataset.wheel is None or places.wheel is None:
         return None
     path = places.wheel / dataset.wheel.paths[0]
     # Another release of gtsam may ship another file under the name.
     if path.is_file() and sha256_of(path) == dataset.wheel.sha256[0]:
-        return Place("wheel", path)
+        return FoundFile("wheel", path)
     return None
 
 

@@ -35,7 +35,7 @@ def _finite(content: Any) -> Any:
 def groups(variables: Iterable[Variables]) -> list[dict[str, Any]]:
     """[{kind, keys, values}] of the groups that have values; with stamps where any of a group has one.
 
-    A stamp is text: JavaScript rounds numbers of so many digits.  null: none.
+    A stamp is text: JavaScript rounds numbers of that many digits.  null: none.
     """
     return [
         {"kind": g.kind, "keys": [format_symbol(key) for key in g.keys.tolist()], "values": g.values.tolist()}

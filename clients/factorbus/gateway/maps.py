@@ -44,7 +44,7 @@ class JoinedMaps:
             await asyncio.to_thread(self._leave, name, joined)
 
     async def graph(self, joined: "Joined") -> Graph:
-        """Variables and factors; asked for once a revision, whoever wants them.  Raises Refused, Unavailable."""
+        """Variables and factors; asked for once a revision, for all clients.  Raises Refused, Unavailable."""
         async with joined.asking:
             mirror, have = joined.map.estimate, joined.graph
             if have is None or (have.epoch, have.revision) != (mirror.epoch, mirror.revision):

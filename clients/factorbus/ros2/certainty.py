@@ -57,7 +57,7 @@ class Checked:
         )
 
 
-def checked(topic: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
+def checked_covariance(topic: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
     """The 6 × 6 covariance of a ROS message, of the axes that count.  Raises BadRosMessage."""
     whole = np.asarray(numbers, np.float64).reshape(6, 6)
     if not np.isfinite(whole[np.ix_(axes, axes)]).all():

@@ -15,7 +15,7 @@ import numpy as np
 from factorbus.client.draft import Draft
 from factorbus.proto.arrays import F64
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
-from factorbus.ros2.certainty import Checked, checked, floored, information
+from factorbus.ros2.certainty import Checked, checked_covariance, floored, information
 from factorbus.ros2.geometry import FARTHEST_M, Transform, carried, from_pose, local
 from factorbus.ros2.messages import LATEST_S, Stamp
 from factorbus.ros2.problems import BadRosMessage
@@ -30,7 +30,7 @@ _ALL_AXES = (0, 1, 2, 3, 4, 5)
 
 class FrontEnd:
     """One robot's.  `refused` collects what was not used and why, `remarks` what was taken otherwise than it came, as
-    (topic, what was done); whoever drives this empties both.
+    (topic, what was done); the bridge empties both.
 
     first: index of the first key.  landmarks: keys that the map has already.  wait_for_pose: begin with a pose.
     """
@@ -63,7 +63,7 @@ class FrontEnd:
 
     @property
     def waits_for_pose(self) -> bool:
-        """Nothing goes into the map before a pose is told."""
+        """Nothing goes into the map before a pose is received."""
         return self._wait_for_pose and self._track.keyframe is None
 
     def try_correction(self, value_of: Callable[[int], F64 | None]) -> Transform | None:
@@ -234,7 +234,7 @@ class FrontEnd:
 
     def _checked(self, topic: str, what: str, numbers: F64, axes: tuple[int, ...]) -> Checked:
         """A covariance that can be one; what was done with it is noted.  Raises BadRosMessage."""
-        made = checked(topic, numbers, axes)
+        made = checked_covariance(topic, numbers, axes)
         if made.unknown:
             self.remarks.append((topic, f"{what}: {made.remark()}"))
         return made

@@ -98,7 +98,7 @@ def rotation_vector(R: F64) -> F64:
     return v * (2.0 if s < 1e-9 else 2.0 * math.atan2(s, w) / s)
 
 
-def rotation(vector: F64) -> F64:
+def rotation_exp(vector: F64) -> F64:
     """The exponential of a rotation vector (3, 3)."""
     angle = float(np.linalg.norm(vector))
     half = 0.5 if angle < 1e-9 else math.sin(0.5 * angle) / angle
@@ -109,7 +109,7 @@ def rotation(vector: F64) -> F64:
 def between(a: Transform, b: Transform, share: float) -> Transform:
     """Where `share` (0 to 1) of the way from a to b is: rotation and translation each at constant speed."""
     turn = rotation_vector(a.R.T @ b.R)
-    return Transform(a.R @ rotation(share * turn), a.t + share * (b.t - a.t))
+    return Transform(a.R @ rotation_exp(share * turn), a.t + share * (b.t - a.t))
 
 
 def adjoint(T: Transform) -> F64:

@@ -1,4 +1,4 @@
-"""What a bridge is told: topics, frames, when there is a keyframe, how certain anything may be."""
+"""The settings of a bridge: topics, frames, when there is a keyframe, how certain anything may be."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +29,7 @@ class Floors:
 @dataclass(frozen=True, slots=True)
 class Settings:
     """space: "plane" (se2, point2) or "space" (se3, point3).  letter, landmark_letter: of the keys.
-    start: "odometry": the map begins where odometry does; "pose": with the first pose that is told.
+    start: "odometry": the map begins where odometry does; "pose": with the first pose that is received.
     keyframe_m, keyframe_rad: a keyframe when that far or that much turned since the last.
     mounts: frame of a sensor to T_base_sensor.  tolerance_s: by how much transforms are stamped ahead.
     display_s: least time between paths.
@@ -54,45 +54,53 @@ class Settings:
     floors: Floors = field(default_factory=Floors)
 
 
-def from_options(
-    *,
-    odom: str,
-    poses: Sequence[str],
-    landmarks: Sequence[str],
-    tf: str,
-    path: str,
-    markers: str,
-    map_frame: str,
-    space: bool,
-    letter: str,
-    start: str,
-    keyframe: tuple[float, float],
-    mounts: Sequence[str],
-    drift: tuple[float, float],
-    tolerance: float,
-    display: float,
-) -> Settings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BridgeOptions:
+    """The options of `factorbus ros2` that are about the map, under the command line's names.
+
+    odom, poses, landmarks, tf, path, markers: topics.  space: poses in space.  keyframe: metres, radians.
+    mounts: FRAME=x,y,z,qx,qy,qz,qw.  drift: per metre, per radian.  tolerance, display: seconds.
+    """
+
+    odom: str
+    poses: Sequence[str]
+    landmarks: Sequence[str]
+    tf: str
+    path: str
+    markers: str
+    map_frame: str
+    space: bool
+    letter: str
+    start: str
+    keyframe: tuple[float, float]
+    mounts: Sequence[str]
+    drift: tuple[float, float]
+    tolerance: float
+    display: float
+
+
+def from_options(options: BridgeOptions) -> Settings:
     """From the options of the command.  Raises BadRosName, BadSymbol."""
-    symbol(letter, 0)
+    symbol(options.letter, 0)
     given = Settings(
-        odometry=odom,
-        path=path,
-        markers=markers,
-        transforms=tf,
-        map_frame=map_frame,
-        space="space" if space else "plane",
-        letter=letter,
-        start=start,
-        keyframe_m=keyframe[0],
-        keyframe_rad=keyframe[1],
-        tolerance_s=tolerance,
-        display_s=display,
-        mounts=dict(map(_mount, mounts)),
-        floors=Floors(drift_m=drift[0], drift_rad=drift[0] / 2, turn_rad=drift[1]),
+        odometry=options.odom,
+        path=options.path,
+        markers=options.markers,
+        transforms=options.tf,
+        map_frame=options.map_frame,
+        space="space" if options.space else "plane",
+        letter=options.letter,
+        start=options.start,
+        keyframe_m=options.keyframe[0],
+        keyframe_rad=options.keyframe[1],
+        tolerance_s=options.tolerance,
+        display_s=options.display,
+        mounts=dict(map(_mount, options.mounts)),
+        floors=Floors(drift_m=options.drift[0], drift_rad=options.drift[0] / 2, turn_rad=options.drift[1]),
     )
     # Without these options the usual topics are read.
-    given = replace(given, poses=tuple(poses)) if poses else given
-    return replace(given, landmarks=tuple(landmarks)) if landmarks else given
+    given = replace(given, poses=tuple(options.poses)) if options.poses else given
+    return replace(given, landmarks=tuple(options.landmarks)) if options.landmarks else given
 
 
 def _mount(text: str) -> tuple[str, Transform]:

@@ -6,11 +6,11 @@ Each world is a function of (poses, seed, ...) and gives a `Step` a pose.  A lon
 
 from collections.abc import Callable, Iterator, Mapping
 
-from factorbus.simulate.city_trees import city_trees
-from factorbus.simulate.manhattan import manhattan
+from factorbus.simulate.city_trees import TreeSensor, city_trees
+from factorbus.simulate.manhattan import LoopClosures, manhattan
 from factorbus.simulate.monocular import Frame, MonocularWorld, monocular
 from factorbus.simulate.parameters import BadParameter
-from factorbus.simulate.sphere import sphere
+from factorbus.simulate.sphere import Spiral, sphere
 from factorbus.simulate.step import Step
 
 WORLDS: Mapping[str, Callable[..., Iterator[Step]]] = {
@@ -23,8 +23,11 @@ __all__ = [
     "WORLDS",
     "BadParameter",
     "Frame",
+    "LoopClosures",
     "MonocularWorld",
+    "Spiral",
     "Step",
+    "TreeSensor",
     "city_trees",
     "manhattan",
     "monocular",

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 from random import Random
 from typing import Literal
@@ -13,54 +14,70 @@ from factorbus.simulate.manhattan import true_poses
 from factorbus.simulate.noise import diagonal_information, noisy_se2, relative_se2, seen_from, wrapped
 from factorbus.simulate.parameters import BadParameter, checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POINT, POSE, FactorBlock, PointBlock, Step, steps_of
-from factorbus.simulate.walk import Place, drive
+from factorbus.simulate.walk import GridPose, walk_streets
 
 _KERB_M = 1.0  # trees stand at least that far from the middle of the street
 
-Sensor = Literal["landmark_se2", "bearing_range_se2"]
+
+@dataclass(frozen=True, slots=True)
+class TreeSensor:
+    """What sees the trees.  Raises BadParameter.
+
+    kind: "landmark_se2" (x, y in the frame of the pose; sigma_m each, metres) or "bearing_range_se2"
+    (sigma_bearing_rad, radians, and sigma_m).  share: the share of trees within reach_m (metres) that a pose sees.
+    """
+
+    kind: Literal["landmark_se2", "bearing_range_se2"] = "landmark_se2"
+    sigma_m: float = 0.1
+    sigma_bearing_rad: float = 0.02
+    share: float = 0.35
+    reach_m: float = 8.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("landmark_se2", "bearing_range_se2"):
+            raise BadParameter("TreeSensor.kind", self.kind, "landmark_se2 or bearing_range_se2")
+        checked_sigma("TreeSensor.sigma_m", self.sigma_m, _KERB_M / 8)  # so that no range is drawn below 0
+        checked_sigma("TreeSensor.sigma_bearing_rad", self.sigma_bearing_rad, 0.5)
+        checked_share("TreeSensor.share", self.share)
+        checked_at_least("TreeSensor.reach_m", self.reach_m, _KERB_M)
+
+    @property
+    def sigmas(self) -> F64:
+        """Standard deviations (2,) of a measurement, in its units."""
+        return np.array([self.sigma_bearing_rad if self.kind == "bearing_range_se2" else self.sigma_m, self.sigma_m])
+
+
+_USUAL = TreeSensor()
 
 
 def city_trees(
     poses: int = 10000,
     seed: int = 1,
     *,
-    sensor: Sensor = "landmark_se2",
     sigma_xy_m: float = 0.02,
     sigma_theta_rad: float = 0.01,
-    sigma_sight_m: float = 0.1,
-    sigma_bearing_rad: float = 0.02,
+    sensor: TreeSensor = _USUAL,
     tree_share: float = 0.2,
-    sight_share: float = 0.35,
-    reach_m: float = 8.0,
     block_m: int = 5,
 ) -> Iterator[Step]:
     """A drive past trees: `se2` poses a metre apart with `between_se2` odometry, `point2` trees, and sightings.
 
-    sensor: "landmark_se2" (x, y in the frame of the pose; sigma_sight_m each) or "bearing_range_se2"
-    (sigma_bearing_rad, sigma_sight_m).  tree_share: the share of blocks with a tree; sight_share: the share of trees
-    within reach_m that a pose sees.  As they stand, densities and noise are like those of the citytrees10000 data
-    set, with somewhat more sightings.  Raises BadParameter.
+    tree_share: the share of blocks with a tree.  Without arguments, densities and noise are like those of the
+    citytrees10000 data set, with somewhat more sightings.  Raises BadParameter.
     """
     checked_run(poses, seed)
-    if sensor not in ("landmark_se2", "bearing_range_se2"):
-        raise BadParameter("sensor", sensor, "landmark_se2 or bearing_range_se2")
     checked_sigma("sigma_xy_m", sigma_xy_m)
     checked_sigma("sigma_theta_rad", sigma_theta_rad, 0.5)
-    checked_sigma("sigma_sight_m", sigma_sight_m, _KERB_M / 8)  # so that no range is drawn below 0
-    checked_sigma("sigma_bearing_rad", sigma_bearing_rad, 0.5)
     checked_share("tree_share", tree_share)
-    checked_share("sight_share", sight_share)
-    checked_at_least("reach_m", reach_m, _KERB_M)
     checked_at_least("block_m", block_m, 3)
-    places = drive(Random(f"streets {seed}"), block_m, straight=0.5)
-    trees = _Trees(seed, tree_share, sight_share, reach_m, block_m)
+    places = walk_streets(Random(f"streets {seed}"), block_m, straight=0.5)
+    trees = _Trees(seed, tree_share, sensor, block_m)
     odometry = np.array([sigma_xy_m, sigma_xy_m, sigma_theta_rad])
-    sight = np.array([sigma_bearing_rad if sensor == "bearing_range_se2" else sigma_sight_m, sigma_sight_m])
-    return islice(_blocks(places, trees, np.random.default_rng([seed, 2]), odometry, sensor, sight), poses)
+    return islice(_blocks(places, trees, np.random.default_rng([seed, 2]), odometry, sensor), poses)
 
 
 def _blocks(
-    places: Iterator[Place], trees: "_Trees", rng: np.random.Generator, odometry: F64, sensor: Sensor, sight: F64
+    places: Iterator[GridPose], trees: "_Trees", rng: np.random.Generator, odometry: F64, sensor: TreeSensor
 ) -> Iterator[Step]:
     first, before = 0, None
     while True:
@@ -73,13 +90,13 @@ def _blocks(
         pairs = POSE + np.stack([numbers - 1, numbers], axis=1)
         ends = np.arange(len(block)) + (len(z) == len(block))
         edges = FactorBlock("between_se2", pairs, z, diagonal_information(odometry, len(z)), ends)
-        sightings, points = _sightings(trees, rng, first, block, truth, sensor, sight)
+        sightings, points = _sightings(trees, rng, first, block, truth, sensor)
         yield from steps_of("se2", first, truth, [edges, sightings], points)
         first, before = first + len(block), truth[-1:]
 
 
 def _sightings(
-    trees: "_Trees", rng: np.random.Generator, first: int, block: list[Place], truth: F64, sensor: Sensor, sight: F64
+    trees: "_Trees", rng: np.random.Generator, first: int, block: list[GridPose], truth: F64, sensor: TreeSensor
 ) -> tuple[FactorBlock, PointBlock]:
     known = trees.count
     seen, ends, new_ends = [], [], []
@@ -90,14 +107,14 @@ def _sightings(
     table = np.array(seen, float).reshape(-1, 4)
     rows, numbers = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     exact = seen_from(truth[rows], table[:, 2:])
-    if sensor == "bearing_range_se2":
+    if sensor.kind == "bearing_range_se2":
         exact = np.stack([np.arctan2(exact[:, 1], exact[:, 0]), np.hypot(exact[:, 0], exact[:, 1])], axis=1)
-    z = exact - rng.normal(size=exact.shape) * sight
-    if sensor == "bearing_range_se2":
+    z = exact - rng.normal(size=exact.shape) * sensor.sigmas
+    if sensor.kind == "bearing_range_se2":
         z[:, 0] = wrapped(z[:, 0])
     keys = np.stack([POSE + first + rows, POINT + numbers], axis=1)
     points = PointBlock("point2", known, _new_trees(numbers, table[:, 2:], known, trees.count), np.array(new_ends))
-    return FactorBlock(sensor, keys, z, diagonal_information(sight, len(z)), np.array(ends)), points
+    return FactorBlock(sensor.kind, keys, z, diagonal_information(sensor.sigmas, len(z)), np.array(ends)), points
 
 
 def _new_trees(numbers: np.ndarray, where: F64, known: int, count: int) -> F64:
@@ -111,8 +128,8 @@ def _new_trees(numbers: np.ndarray, where: F64, known: int, count: int) -> F64:
 class _Trees:
     """Where the trees are (a matter of the seed and the block alone), and the numbers of those seen so far."""
 
-    def __init__(self, seed: int, share: float, sight_share: float, reach: float, block: int) -> None:
-        self._seed, self._share, self._sight_share, self._reach, self._block = seed, share, sight_share, reach, block
+    def __init__(self, seed: int, share: float, sensor: TreeSensor, block: int) -> None:
+        self._seed, self._share, self._sensor, self._block = seed, share, sensor, block
         self._chance = Random(f"sightings {seed}")
         self._planted: dict[tuple[int, int], tuple[float, float] | None] = {}
         self._numbers: dict[tuple[int, int], int] = {}
@@ -124,14 +141,18 @@ class _Trees:
 
     def seen_from(self, x: int, y: int) -> list[tuple[int, tuple[float, float]]]:
         """Numbers and places of the trees seen from (x, y); new ones get the next numbers."""
-        reach, block = self._reach, self._block
+        reach, block = self._sensor.reach_m, self._block
         columns = range(math.floor((x - reach) / block), math.floor((x + reach) / block) + 1)
         rows = range(math.floor((y - reach) / block), math.floor((y + reach) / block) + 1)
         seen = []
         for column in columns:
             for row in rows:
                 tree = self._tree((column, row))
-                if tree and math.hypot(tree[0] - x, tree[1] - y) <= reach and self._chance.random() < self._sight_share:
+                if (
+                    tree
+                    and math.hypot(tree[0] - x, tree[1] - y) <= reach
+                    and self._chance.random() < self._sensor.share
+                ):
                     seen.append((self._numbers.setdefault((column, row), self.count), tree))
         return seen
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 from random import Random
 
@@ -11,9 +12,32 @@ from factorbus.proto.arrays import F64
 from factorbus.simulate.noise import diagonal_information, noisy_se2, relative_se2
 from factorbus.simulate.parameters import checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POSE, FactorBlock, Step, steps_of
-from factorbus.simulate.walk import Place, drive
+from factorbus.simulate.walk import GridPose, walk_streets
 
 _VISITS = 2  # visits a place remembers: the first, for loops over the whole drive, and the last
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosures:
+    """Which loops a drive closes.  Raises BadParameter.
+
+    share: the share of poses that look for a place within radius_m (metres) which they passed gap or more poses ago;
+    most: closures that such a pose finds at most.
+    """
+
+    share: float = 0.5
+    most: int = 2
+    radius_m: float = 2.0
+    gap: int = 40
+
+    def __post_init__(self) -> None:
+        checked_share("LoopClosures.share", self.share)
+        checked_at_least("LoopClosures.most", self.most, 0)
+        checked_at_least("LoopClosures.radius_m", self.radius_m, 0)
+        checked_at_least("LoopClosures.gap", self.gap, 2)
+
+
+_USUAL = LoopClosures()
 
 
 def manhattan(
@@ -22,33 +46,25 @@ def manhattan(
     *,
     sigma_xy_m: float = 0.0225,
     sigma_theta_rad: float = 0.0225,
-    loop_share: float = 0.5,
-    loops: int = 2,
-    loop_radius_m: float = 2.0,
-    loop_gap: int = 40,
+    loops: LoopClosures = _USUAL,
     block_m: int = 5,
 ) -> Iterator[Step]:
     """A drive on a grid of streets: `se2` poses a metre apart, `between_se2` odometry and loop closures.
 
-    loop_share: the share of poses that look for a place within loop_radius_m which they passed loop_gap or more poses
-    ago; loops: closures such a pose finds at most.  Noise is independent in x, y (metres) and theta (radians).  As
-    they stand, densities and noise are like those of the manhattan3500 data set.  Raises BadParameter.
+    Noise is independent in x, y (metres) and theta (radians).  Without arguments, densities and noise are like those
+    of the manhattan3500 data set.  Raises BadParameter.
     """
     checked_run(poses, seed)
     checked_sigma("sigma_xy_m", sigma_xy_m)
     checked_sigma("sigma_theta_rad", sigma_theta_rad, 0.5)
-    checked_share("loop_share", loop_share)
-    checked_at_least("loops", loops, 0)
-    checked_at_least("loop_radius_m", loop_radius_m, 0)
-    checked_at_least("loop_gap", loop_gap, 2)
     checked_at_least("block_m", block_m, 1)
-    places = drive(Random(f"streets {seed}"), block_m, straight=0.5)
-    closures = _Closures(Random(f"closures {seed}"), loop_share, loops, loop_radius_m, loop_gap)
+    places = walk_streets(Random(f"streets {seed}"), block_m, straight=0.5)
+    closures = _Closures(Random(f"closures {seed}"), loops)
     sigmas = np.array([sigma_xy_m, sigma_xy_m, sigma_theta_rad])
     return islice(_blocks(places, closures, np.random.default_rng([seed, 1]), sigmas), poses)
 
 
-def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Generator, sigmas: F64) -> Iterator[Step]:
+def _blocks(places: Iterator[GridPose], closures: "_Closures", rng: np.random.Generator, sigmas: F64) -> Iterator[Step]:
     first, before = 0, None
     while True:
         block = list(islice(places, BLOCK))
@@ -57,7 +73,7 @@ def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Gener
             if before is not None:
                 pairs.append((number - 1, number))
                 starts.append(before)
-            for partner, where in closures.at(number, place):
+            for partner, where in closures.found_from(number, place):
                 pairs.append((partner, number))
                 starts.append(where)
             ends.append(len(pairs))
@@ -71,7 +87,7 @@ def _blocks(places: Iterator[Place], closures: "_Closures", rng: np.random.Gener
         first += len(block)
 
 
-def true_poses(places: list[Place]) -> F64:
+def true_poses(places: list[GridPose]) -> F64:
     """Poses (n, 3) of places; headings in [-π, π)."""
     table = np.array(places, float).reshape(-1, 3)
     table[:, 2] = ((table[:, 2] + 2) % 4 - 2) * (math.pi / 2)
@@ -81,18 +97,18 @@ def true_poses(places: list[Place]) -> F64:
 class _Closures:
     """Remembers what a closure needs: per place of the grid its first and last visit."""
 
-    def __init__(self, chance: Random, share: float, most: int, radius: float, gap: int) -> None:
-        self._chance, self._share, self._most, self._gap = chance, share, most, gap
+    def __init__(self, chance: Random, loops: LoopClosures) -> None:
+        self._chance, self._loops, radius = chance, loops, loops.radius_m
         reach = range(-int(radius), int(radius) + 1)
         self._around = [(dx, dy) for dx in reach for dy in reach if dx * dx + dy * dy <= radius * radius]
         self._visits: dict[tuple[int, int], list[tuple[int, int]]] = {}
 
-    def at(self, number: int, place: Place) -> list[tuple[int, Place]]:
+    def found_from(self, number: int, place: GridPose) -> list[tuple[int, GridPose]]:
         """Earlier poses that pose `number` recognizes, with their places; `number` is remembered from now on."""
         x, y, heading = place
-        found: list[tuple[int, Place]] = []
-        if self._chance.random() < self._share:
-            latest = number - self._gap
+        found: list[tuple[int, GridPose]] = []
+        if self._chance.random() < self._loops.share:
+            latest = number - self._loops.gap
             for dx, dy in self._around:
                 for visitor, turned in self._visits.get((x + dx, y + dy), ()):
                     if visitor <= latest:
@@ -103,9 +119,9 @@ class _Closures:
         visits.append((number, heading))
         return found
 
-    def _some(self, found: list[tuple[int, Place]]) -> list[tuple[int, Place]]:
-        """At most so many of those found, by chance, oldest first; no pose twice."""
-        picked: list[tuple[int, Place]] = []
-        while found and len(picked) < self._most:
+    def _some(self, found: list[tuple[int, GridPose]]) -> list[tuple[int, GridPose]]:
+        """At most `most` of those found, by chance, oldest first; no pose twice."""
+        picked: list[tuple[int, GridPose]] = []
+        while found and len(picked) < self._loops.most:
             picked.append(found.pop(int(self._chance.random() * len(found))))
         return sorted(picked)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.camera import Camera
 from factorbus.simulate.lens import seen_by
-from factorbus.simulate.noise import conjugate, product, rotated
+from factorbus.simulate.noise import conjugate, quaternion_product, rotated
 from factorbus.simulate.parameters import BadParameter, checked_at_least, checked_run, checked_share, checked_sigma
 
 # The wide lens of Civera's program, with its distortion.
@@ -111,7 +111,7 @@ def _camera_at(time_s: float) -> tuple[F64, F64]:
     step = 1e-4
     (r, quat), (ahead, quat_ahead) = _place(time_s), _place(time_s + step)
     behind, quat_behind = _place(time_s - step)
-    turn = product(conjugate(quat_behind[None]), quat_ahead[None])[0]
+    turn = quaternion_product(conjugate(quat_behind[None]), quat_ahead[None])[0]
     omega = 2 * turn[:3] / (2 * step) * np.sign(turn[3])
     return np.concatenate([r, quat]), np.concatenate([(ahead - behind) / (2 * step), omega])
 
@@ -121,7 +121,7 @@ def _place(time_s: float) -> tuple[F64, F64]:
     t = time_s
     r = np.array([0.9 * np.sin(1.1 * t), 0.15 * np.sin(1.7 * t), 0.12 * t + 0.05 * np.sin(0.8 * t)])
     yaw, pitch, roll = -0.22 * np.sin(1.1 * t), 0.06 * np.sin(1.3 * t), 0.05 * np.sin(0.9 * t)
-    quat = product(product(_about(1, yaw), _about(0, pitch)), _about(2, roll))[0]
+    quat = quaternion_product(quaternion_product(_about(1, yaw), _about(0, pitch)), _about(2, roll))[0]
     return r, quat
 
 

@@ -34,7 +34,7 @@ def noisy_se2(T: F64, r: F64) -> F64:
 def relative_se3(start: F64, end: F64) -> F64:
     """T = start⁻¹ end of poses (n, 7): x y z (metres), qx qy qz qw."""
     back = conjugate(start[:, 3:])
-    return np.concatenate([rotated(back, (end - start)[:, :3]), product(back, end[:, 3:])], axis=1)
+    return np.concatenate([rotated(back, (end - start)[:, :3]), quaternion_product(back, end[:, 3:])], axis=1)
 
 
 def noisy_se3(T: F64, r: F64) -> F64:
@@ -44,7 +44,7 @@ def noisy_se3(T: F64, r: F64) -> F64:
     """
     vector = r[:, 3:]
     scalar = np.sqrt(1 - np.sum(vector * vector, axis=1, keepdims=True))
-    quat = product(T[:, 3:], np.concatenate([-vector, scalar], axis=1))
+    quat = quaternion_product(T[:, 3:], np.concatenate([-vector, scalar], axis=1))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     quat = np.where(quat[:, 3:] < 0, -quat, quat)
     return np.concatenate([T[:, :3] - rotated(quat, r[:, :3]), quat], axis=1)
@@ -62,7 +62,7 @@ def wrapped(angle: F64) -> F64:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def product(p: F64, q: F64) -> F64:
+def quaternion_product(p: F64, q: F64) -> F64:
     """Quaternions p q, (n, 4) as qx qy qz qw."""
     pv, pw, qv, qw = p[:, :3], p[:, 3:], q[:, :3], q[:, 3:]
     vector = pw * qv + qw * pv + np.cross(pv, qv)

@@ -1,15 +1,33 @@
 """A spiral over a sphere and back, with odometry and closures to the ring below and to the pass before."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 from random import Random
 
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
-from factorbus.simulate.noise import diagonal_information, noisy_se3, product, relative_se3
+from factorbus.simulate.noise import diagonal_information, noisy_se3, quaternion_product, relative_se3
 from factorbus.simulate.parameters import checked_at_least, checked_run, checked_share, checked_sigma
 from factorbus.simulate.step import BLOCK, POSE, FactorBlock, Step, steps_of
+
+
+@dataclass(frozen=True, slots=True)
+class Spiral:
+    """A way over a sphere: `rings` turns with `ring` poses each, on a radius in metres.  Raises BadParameter."""
+
+    ring: int = 50
+    rings: int = 50
+    radius_m: float = 50.0
+
+    def __post_init__(self) -> None:
+        checked_at_least("Spiral.ring", self.ring, 3)
+        checked_at_least("Spiral.rings", self.rings, 1)
+        checked_sigma("Spiral.radius_m", self.radius_m)
+
+
+_USUAL = Spiral()
 
 
 def sphere(
@@ -20,16 +38,14 @@ def sphere(
     sigma_rotation_rad: float = 0.02,
     loop_share: float = 1.0,
     revisit_share: float = 0.1,
-    ring: int = 50,
-    rings: int = 50,
-    radius_m: float = 50.0,
+    spiral: Spiral = _USUAL,
 ) -> Iterator[Step]:
-    """A spiral of `rings` turns with `ring` poses each over a sphere, up and down again: `se3` poses, `between_se3`.
+    """A spiral over a sphere, up and down again: `se3` poses, `between_se3`.
 
     loop_share: the share of poses with an edge to the pose one turn earlier; revisit_share: from the second pass on,
     the share with an edge to the last pose at the same place.  x points along the way (east), z away from the
     centre.  sigma_rotation_rad is the standard deviation of the rotation vector about each axis; the information
-    sent is that of the quaternion's vector part, which is half of it.  As they stand, densities and noise are like
+    sent is that of the quaternion's vector part, which is half of it.  Without arguments, densities and noise are like
     those of the sphere2500 data set.  Raises BadParameter.
     """
     checked_run(poses, seed)
@@ -37,10 +53,7 @@ def sphere(
     checked_sigma("sigma_rotation_rad", sigma_rotation_rad, 0.25)
     checked_share("loop_share", loop_share)
     checked_share("revisit_share", revisit_share)
-    checked_at_least("ring", ring, 3)
-    checked_at_least("rings", rings, 1)
-    checked_sigma("radius_m", radius_m)
-    way = _Way(ring, rings, radius_m)
+    way = _Way(spiral)
     sigmas = np.array([sigma_xyz_m] * 3 + [sigma_rotation_rad / 2] * 3)
     chance = Random(f"closures {seed}")
     return islice(_blocks(way, chance, loop_share, revisit_share, np.random.default_rng([seed, 3]), sigmas), poses)
@@ -75,8 +88,8 @@ class _Way:
     Places 0 .. ring·rings − 1 go from pole to pole; a pass visits all of them, the next one backwards.
     """
 
-    def __init__(self, ring: int, rings: int, radius: float) -> None:
-        self._ring, self._places, self._radius = ring, ring * rings, radius
+    def __init__(self, spiral: Spiral) -> None:
+        self._ring, self._places, self._radius = spiral.ring, spiral.ring * spiral.rings, spiral.radius_m
 
     def ring_below(self, number: int) -> int:
         """The pose one turn of the spiral earlier in the same pass, or -1."""
@@ -98,8 +111,8 @@ class _Way:
             [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=1
         )
         east_north_up = np.tile([0.5, 0.5, 0.5, 0.5], (len(numbers), 1))  # at longitude 0, latitude 0: x→y→z→x
-        quat = product(_about("z", longitude), product(_about("y", -latitude), east_north_up))
-        quat = product(quat, _about("z", np.where(backwards, np.pi, 0.0)))
+        quat = quaternion_product(_about("z", longitude), quaternion_product(_about("y", -latitude), east_north_up))
+        quat = quaternion_product(quat, _about("z", np.where(backwards, np.pi, 0.0)))
         return np.concatenate([self._radius * up, np.where(quat[:, 3:] < 0, -quat, quat)], axis=1)
 
 

@@ -8,10 +8,10 @@ HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # east, north, west, south: quart
 _FIRST_LIMIT_M = 20.0  # how far the town reaches at first in each direction ...
 _GROWTH = 0.35  # ... and how it grows with the square root of the way: 55 m at 10,000 poses, 370 m at a million
 
-Place = tuple[int, int, int]
+GridPose = tuple[int, int, int]
 
 
-def drive(chance: Random, block_m: int, straight: float) -> Iterator[Place]:
+def walk_streets(chance: Random, block_m: int, straight: float) -> Iterator[GridPose]:
     """Places (x, y, heading) in metres and quarter turns, without end, from (0, 0, 0).
 
     At a crossing the car goes straight on with that share, else turns left or right, and stays inside the town; it

@@ -1,17 +1,18 @@
 """Pictures of maps.  Needs the extra `viz` (matplotlib), which is imported when the first picture is drawn."""
 
-from factorbus.viz.course import Course
 from factorbus.viz.drive import drive_figure
 from factorbus.viz.ellipses import Spread, spread_of
 from factorbus.viz.files import BadPicture, checked_ending, save
+from factorbus.viz.history import DriveHistory
 from factorbus.viz.odometry import Odometry, loops_of
-from factorbus.viz.picture import map_figure, save_map
+from factorbus.viz.picture import MapLayers, map_figure, save_map
 from factorbus.viz.sparsity import Pattern, sparsity_figure
 from factorbus.viz.tree import tree_figure
 
 __all__ = [
     "BadPicture",
-    "Course",
+    "DriveHistory",
+    "MapLayers",
     "Odometry",
     "Pattern",
     "Spread",

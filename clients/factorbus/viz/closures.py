@@ -9,7 +9,7 @@ from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.viz.odometry import loops_of
-from factorbus.viz.residuals import Values, factor_chi2
+from factorbus.viz.residuals import Values, chi2_of_factors
 
 # Sky blue, yellow, vermilion of Okabe and Ito, at a misfit of 0, 1.5 and 3 and above.
 _COLOURS = np.array([[86, 180, 233], [240, 228, 66], [213, 94, 0]]) / 255.0
@@ -35,7 +35,7 @@ def closures_of(variables: Sequence[Variables], factors: Sequence[Factors]) -> C
             chosen = np.fromiter((tuple(pair) in loops for pair in group.keys.tolist()), bool, len(group.keys))
             some = Factors(group.kind, group.keys[chosen], group.measured[chosen], group.information[chosen])
             keys.append(some.keys)
-            misfits.append(np.sqrt(factor_chi2(some, values) / FACTOR_KINDS[group.kind].dim))
+            misfits.append(np.sqrt(chi2_of_factors(some, values) / FACTOR_KINDS[group.kind].dim))
     return Closures(np.concatenate(keys), np.concatenate(misfits))
 
 

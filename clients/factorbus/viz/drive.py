@@ -7,7 +7,7 @@ import numpy as np
 
 from factorbus.proto.arrays import F64
 from factorbus.viz import style
-from factorbus.viz.course import Course
+from factorbus.viz.history import DriveHistory
 from factorbus.viz.panels import chi2_panel
 
 if TYPE_CHECKING:
@@ -24,23 +24,23 @@ _LOOKS = (
 )
 
 
-def drive_figure(course: Course, strategies: Sequence[str], title: str = "", subtitle: str = "") -> "Figure":
+def drive_figure(history: DriveHistory, strategies: Sequence[str], title: str = "", subtitle: str = "") -> "Figure":
     """χ², times of steps, their sum, and the work along a drive, as a matplotlib figure of its own.
 
-    strategies: what each step did, one word for each of `course.step_ms`.
+    strategies: what each step did, one word for each of `history.step_ms`.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     with mpl.rc_context(style.SETTINGS):
-        figure = Figure(figsize=(9.5, 10.6 if len(course.work) else 8.6), layout="constrained")
-        heights = [1.0, 1.25, 0.7, 0.9] if len(course.work) else [1.0, 1.25, 0.7]
+        figure = Figure(figsize=(9.5, 10.6 if len(history.work) else 8.6), layout="constrained")
+        heights = [1.0, 1.25, 0.7, 0.9] if len(history.work) else [1.0, 1.25, 0.7]
         panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-        chi2_panel(panels[0], course)
-        _times(panels[1], course.step_ms, np.asarray(strategies))
-        _sum(panels[2], course.step_ms)
-        if len(course.work):
-            _work(panels[3], course.work)
+        chi2_panel(panels[0], history)
+        _times(panels[1], history.step_ms, np.asarray(strategies))
+        _sum(panels[2], history.step_ms)
+        if len(history.work):
+            _work(panels[3], history.work)
         for axes in panels[:-1]:
             axes.set_xlabel("")
         figure.suptitle(f"{title}   {subtitle}".strip(), x=0.012, ha="left", fontsize=12)

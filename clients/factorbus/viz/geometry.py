@@ -33,7 +33,7 @@ def points_of(variables: Sequence[Variables]) -> Track:
     return _positions(variables, "point")
 
 
-def rays_of(variables: Sequence[Variables], horizon_m: float = 50.0) -> Track:
+def feature_rays(variables: Sequence[Variables], horizon_m: float = 50.0) -> Track:
     """Inverse-depth features as rays: places (n, 2, 3), from the camera of their first sight to where they are thought
     to be, and no further than the horizon.
 

@@ -18,7 +18,7 @@ from factorbus.proto.messages import Delta
 from factorbus.viz import style
 from factorbus.viz.closures import closures_of, colours_of
 from factorbus.viz.ellipses import outlines
-from factorbus.viz.geometry import Track, points_of, rays_of, segments_of, track_of, view_of
+from factorbus.viz.geometry import Track, feature_rays, points_of, segments_of, track_of, view_of
 from factorbus.viz.map_follower import Look
 from factorbus.viz.viewer_process import Viewer
 
@@ -123,7 +123,7 @@ class LiveView:
             _in_space(track.places[touched]), colors=_rgb(style.ODOMETRY), radii=rr.Radius.ui_points(2.5)
         )
         self._to.log("map/last_step", last)
-        self._log_lines("map/rays", rays_of(look.variables).places, _rgb(style.SPREAD))
+        self._log_lines("map/rays", feature_rays(look.variables).places, _rgb(style.SPREAD))
         closures = closures_of(look.variables, look.factors)
         colours = (255 * colours_of(closures.misfit)).astype(np.uint8)
         known = np.isin(closures.keys, track.keys).all(axis=1)

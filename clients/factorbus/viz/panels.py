@@ -6,14 +6,14 @@ import numpy as np
 
 from factorbus.proto.arrays import F64
 from factorbus.viz import style
-from factorbus.viz.course import Course
+from factorbus.viz.history import DriveHistory
 
 
-def chi2_panel(axes: Any, course: Course) -> None:
+def chi2_panel(axes: Any, history: DriveHistory) -> None:
     """χ² after every step, with the batch optimum where it was computed."""
-    steps = np.arange(1, len(course.chi2) + 1)
-    axes.plot(steps, course.chi2, color=style.ESTIMATE, linewidth=1.4, label="after the step")
-    shown = (course.optimum, "o", "batch optimum"), (course.not_converged, "X", "batch, not converged")
+    steps = np.arange(1, len(history.chi2) + 1)
+    axes.plot(steps, history.chi2, color=style.ESTIMATE, linewidth=1.4, label="after the step")
+    shown = (history.optimum, "o", "batch optimum"), (history.not_converged, "X", "batch, not converged")
     for optima, marker, label in shown:
         if len(optima):
             axes.plot(
@@ -32,9 +32,9 @@ def chi2_panel(axes: Any, course: Course) -> None:
     axes.margins(x=0.01)
 
 
-def time_panel(axes: Any, course: Course) -> None:
+def time_panel(axes: Any, history: DriveHistory) -> None:
     """The time of every step, with its median and 99th percentile."""
-    times = np.maximum(course.step_ms, 1e-3)
+    times = np.maximum(history.step_ms, 1e-3)
     steps = np.arange(1, len(times) + 1)
     axes.plot(
         steps,

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,10 +10,10 @@ import numpy as np
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Variables
 from factorbus.viz import style
-from factorbus.viz.course import Course
 from factorbus.viz.ellipses import Spread, draw_outlines
 from factorbus.viz.files import BadPicture, checked_ending, save
 from factorbus.viz.geometry import Track, View, limits, line_of, points_of, segments_of, track_of, view_of
+from factorbus.viz.history import DriveHistory
 from factorbus.viz.panels import chi2_panel, time_panel
 
 if TYPE_CHECKING:
@@ -22,75 +23,67 @@ _MOST_LOOPS = 150_000  # more would take minutes and show nothing new; the legen
 _MANY = 3000  # things of one kind above which an svg or pdf gets them as pixels
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MapLayers:
+    """What is drawn of a map.
+
+    estimate, odometry, truth: groups of variables with values; poses become lines in the order of their keys, one
+    for each letter; points become marks.  loops (m, 2): keys of poses joined by loop closures, drawn between their
+    estimates.  spread: where variables may be.
+    """
+
+    estimate: Sequence[Variables]
+    odometry: Sequence[Variables] = ()
+    truth: Sequence[Variables] = ()
+    loops: I64 | None = None
+    spread: Spread | None = None
+
+
 def save_map(
     path: str | os.PathLike[str],
+    layers: MapLayers,
     *,
-    estimate: Sequence[Variables],
-    odometry: Sequence[Variables] = (),
-    truth: Sequence[Variables] = (),
-    loops: I64 | None = None,
-    course: Course | None = None,
-    spread: Spread | None = None,
+    history: DriveHistory | None = None,
     title: str = "",
     subtitle: str = "",
 ) -> None:
     """Draw a map (see `map_figure`) into a .png, .svg or .pdf file.  Raises BadPicture, or OSError from the file."""
     checked_ending(path)
-    figure = map_figure(
-        estimate=estimate,
-        odometry=odometry,
-        truth=truth,
-        loops=loops,
-        course=course,
-        spread=spread,
-        title=title,
-        subtitle=subtitle,
-    )
-    save(figure, path, title)
+    save(map_figure(layers, history=history, title=title, subtitle=subtitle), path, title)
 
 
 def map_figure(
-    *,
-    estimate: Sequence[Variables],
-    odometry: Sequence[Variables] = (),
-    truth: Sequence[Variables] = (),
-    loops: I64 | None = None,
-    course: Course | None = None,
-    spread: Spread | None = None,
-    title: str = "",
-    subtitle: str = "",
+    layers: MapLayers, *, history: DriveHistory | None = None, title: str = "", subtitle: str = ""
 ) -> "Figure":
     """The map as a matplotlib figure of its own (no pyplot, no window).
 
-    estimate, odometry, truth: groups of variables with values; poses become lines in the order of their keys, one
-    for each letter; points become marks.  loops (m, 2): keys of poses joined by loop closures, drawn between their
-    estimates.  course: panels below the map.  spread: where variables may be.  Lengths are in metres and axes equal.
-    Poses that fill space are drawn in space, others in the plane they lie in.
+    history: panels below the map.  Lengths are in metres and axes equal.  Poses that fill space are drawn in space,
+    others in the plane they lie in.
     Raises BadPicture when there is no pose or no point to draw.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    drawn = _Layers(estimate, odometry, truth, loops, spread)
+    drawn = _Drawing(layers)
     with mpl.rc_context(style.SETTINGS):
-        panels = _panels(course)
+        panels = _panels(history)
         heights = [1.0, 0.05, 0.26] if panels else [1.0, 0.05]  # map, legend, panels
         figure = Figure(figsize=(9.0, 7.4 * sum(heights) + 1.0), layout="constrained")
         grid = figure.add_gridspec(len(heights), max(len(panels), 1), height_ratios=heights)
         axes = figure.add_subplot(grid[0, :], projection="3d" if drawn.view.in_space else None)
         _legend(figure.add_subplot(grid[1, :]), drawn.draw(axes))
         for column, panel in enumerate(panels):
-            panel(figure.add_subplot(grid[2, column]), course)
+            panel(figure.add_subplot(grid[2, column]), history)
         figure.suptitle(title, x=0.012, ha="left", fontsize=13)
         axes.set_title(subtitle, loc="left", fontsize=9.5, color="#555555", pad=8)
     return figure
 
 
-def _panels(course: Course | None) -> list[Any]:
+def _panels(history: DriveHistory | None) -> list[Any]:
     """The panels for which there are numbers."""
-    if course is None:
+    if history is None:
         return []
-    return [panel for panel, there in ((chi2_panel, len(course.chi2)), (time_panel, len(course.step_ms))) if there]
+    return [panel for panel, there in ((chi2_panel, len(history.chi2)), (time_panel, len(history.step_ms))) if there]
 
 
 def _legend(axes: Any, handles: list[Any]) -> None:
@@ -100,18 +93,12 @@ def _legend(axes: Any, handles: list[Any]) -> None:
     axes.legend(handles=handles, loc="center", ncols=columns, handlelength=1.6, columnspacing=1.6, borderpad=0)
 
 
-class _Layers:
+class _Drawing:
     """All that is drawn into the map, from the lowest layer to the highest."""
 
-    def __init__(
-        self,
-        estimate: Sequence[Variables],
-        odometry: Sequence[Variables],
-        truth: Sequence[Variables],
-        loops: I64 | None,
-        spread: Spread | None,
-    ) -> None:
-        self.spread = spread
+    def __init__(self, layers: MapLayers) -> None:
+        estimate, odometry, truth, loops = layers.estimate, layers.odometry, layers.truth, layers.loops
+        self.spread = layers.spread
         self.estimate, self.odometry, self.truth = track_of(estimate), track_of(odometry), track_of(truth)
         self.points, self.true_points = points_of(estimate), points_of(truth)
         if not len(self.estimate.keys) and not len(self.points.keys):

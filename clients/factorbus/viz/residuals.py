@@ -14,7 +14,7 @@ from factorbus.proto.messages import Factors, Variables
 _WIDEST = 7  # numbers of a pose in space
 
 
-def factor_chi2(group: Factors, values: "Values") -> F64:
+def chi2_of_factors(group: Factors, values: "Values") -> F64:
     """rᵀ Ω r of each factor of `group` (m,); NaN where a variable has no value or the kind is not one of ours."""
     residual = _RESIDUALS.get(group.kind)
     if residual is None or not len(group.keys):

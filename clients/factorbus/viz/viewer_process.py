@@ -1,6 +1,6 @@
 """A Rerun viewer, or what serves one to browsers, as a process of its own that listens at one address and ends with us.
 
-Rerun's Python library listens on every address of the machine; its program can be told where, so that is what is run.
+Rerun's Python library listens on every address of the machine; its program takes the address, so that is what is run.
 `python -m factorbus.viz.viewer_process` runs it, and ends it when standard input closes: whatever ends us, it goes too.
 """
 
@@ -57,7 +57,7 @@ class Viewer:
         return f"http://{_bracketed(_seen_at(self._host))}:{self._web_port}/?url={data}"
 
     def stop(self) -> None:
-        """End it, unless it is a window of this display: that stays for whoever looks at it."""
+        """End it, unless it is a window of this display: that stays for its user."""
         if self._process is None or self._process.stdin is None or self._process.stderr is None:
             return
         self._process.stdin.close()

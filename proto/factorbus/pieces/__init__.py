@@ -3,6 +3,6 @@
 A front end that sends a linear factor of many variables cuts it up here, and so does the solver with its marginals.
 """
 
-from factorbus.pieces.cut import MOST, Pieces, as_pieces, cut, dims_of
+from factorbus.pieces.cut import MOST, Pieces, as_pieces, cut, tangent_dims
 
-__all__ = ["MOST", "Pieces", "as_pieces", "cut", "dims_of"]
+__all__ = ["MOST", "Pieces", "as_pieces", "cut", "tangent_dims"]

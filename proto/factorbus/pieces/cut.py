@@ -34,7 +34,7 @@ class Pieces(NamedTuple):
     information: F64
 
 
-def dims_of(kinds: Sequence[str]) -> list[int]:
+def tangent_dims(kinds: Sequence[str]) -> list[int]:
     """Scalars of each variable.  Raises ValueError: no such kind, or some of the plane and some of space."""
     for kind in kinds:
         if kind not in _DIM:
@@ -54,7 +54,7 @@ def as_pieces(
     if len(kinds) > 2:
         information, eta = whole or (H.T @ H, -H.T @ b)
         return cut(kinds, keys, y, information, eta, float(b @ b))
-    dims = dims_of(kinds)
+    dims = tangent_dims(kinds)
     first, *others = order = sorted(range(len(kinds)), key=lambda n: (dims[n], _ORDER.index(kinds[n])))
     blocks = np.split(H, np.cumsum(dims)[:-1], axis=1)
     rows = dims[first]
@@ -85,9 +85,9 @@ def cut(
     keys (n,), y: their values, Λ (Σ d, Σ d), positive semidefinite to rounding, η (Σ d,) in its range
     constant: c; None: such that the least value is 0
     They come in this order: a number (a factor with H = 0), those of negative weight, the others of one variable, those
-    of two.  Sent so, they are told from what is known of the same variables otherwise.
+    of two.  Sent so, they are distinguished from what is known of the same variables otherwise.
     """
-    n, dims = keys.size, np.array(dims_of(kinds))
+    n, dims = keys.size, np.array(tangent_dims(kinds))
     start = np.cumsum(dims) - dims
     D = np.sqrt(np.maximum(information.diagonal(), 0.0))
     inverse = np.where(D > 0.0, 1.0 / np.where(D > 0.0, D, 1.0), 0.0)

@@ -26,7 +26,7 @@ from factorbus.proto.codec import encode_map
 from factorbus.proto.columns import factors_to_maps, read_batch
 from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.messages import Factors
 from factorbus.proto.problems import BadMessage, UnknownKind
 from factorbus.wording import counted
@@ -45,10 +45,10 @@ def encode_ask_covariance(ask: AskCovariance) -> bytes:
     return encode_map(content)
 
 
-def decode_ask_covariance(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskCovariance:
+def decode_ask_covariance(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskCovariance:
     """The question; no bytes at all: the whole diagonal."""
     content = fields.read_map("question", data, limits) if data else {}
-    blocks = fields.word("question", content, "blocks", BLOCKS, "diagonal")
+    blocks = fields.choice_of("question", content, "blocks", BLOCKS, "diagonal")
     keys = _keys(content, "keys", needed=blocks in ("joint", "cross", "relative"))
     others = _keys(content, "others", needed=blocks == "cross")
     if blocks == "relative" and keys is not None:
@@ -73,7 +73,7 @@ def encode_covariances(message: Covariances) -> bytes:
     return encode_map(content | {"groups": groups})
 
 
-def decode_covariances(data: bytes, limits: Limits = ANSWER_LIMITS) -> Covariances:
+def decode_covariances(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Covariances:
     """The answer to ask/covariance that `data` is."""
     content = fields.read_map("covariances", data, limits)
     epoch, revision = (fields.integer("", content, name) for name in ("epoch", "revision"))
@@ -96,7 +96,7 @@ def encode_ask_gate(ask: AskGate) -> bytes:
     return encode_map({"factors": factors_to_maps(ask.factors), "probability": float(ask.probability)})
 
 
-def decode_ask_gate(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskGate:
+def decode_ask_gate(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskGate:
     """The question that `data` is."""
     content = fields.read_map("question", data, limits)
     return AskGate(_factors(content, limits), probability(content, 0.95))
@@ -116,7 +116,7 @@ def encode_gated(message: Gated) -> bytes:
     )
 
 
-def decode_gated(data: bytes, limits: Limits = ANSWER_LIMITS) -> Gated:
+def decode_gated(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Gated:
     """The answer to ask/gate that `data` is."""
     content = fields.read_map("gated", data, limits)
     dims = _keys(content, "dims", needed=True)
@@ -130,7 +130,7 @@ def encode_ask_gain(ask: AskGain) -> bytes:
     return encode_map({"factors": factors_to_maps(ask.factors)})
 
 
-def decode_ask_gain(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskGain:
+def decode_ask_gain(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskGain:
     """The question that `data` is."""
     return AskGain(_factors(fields.read_map("question", data, limits), limits))
 
@@ -140,7 +140,7 @@ def encode_gained(message: Gained) -> bytes:
     return encode_map({"epoch": message.epoch, "revision": message.revision, "gain": _f8(message.gain)})
 
 
-def decode_gained(data: bytes, limits: Limits = ANSWER_LIMITS) -> Gained:
+def decode_gained(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Gained:
     """The answer to ask/gain that `data` is."""
     content = fields.read_map("gained", data, limits)
     return Gained(*_when(content), _read_f8("", content, "gain", None))
@@ -158,7 +158,7 @@ def encode_ask_associate(ask: AskAssociate) -> bytes:
     return encode_map(content if ask.landmarks is None else content | {"landmarks": _i8(ask.landmarks)})
 
 
-def decode_ask_associate(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskAssociate:
+def decode_ask_associate(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskAssociate:
     """The question that `data` is."""
     content = fields.read_map("question", data, limits)
     kind = fields.text("", content, "kind")
@@ -199,7 +199,7 @@ def encode_associated(message: Associated) -> bytes:
     )
 
 
-def decode_associated(data: bytes, limits: Limits = ANSWER_LIMITS) -> Associated:
+def decode_associated(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Associated:
     """The answer to ask/associate that `data` is."""
     content = fields.read_map("associated", data, limits)
     landmarks, sightings, candidates = (
@@ -225,7 +225,7 @@ def encode_ask_why(ask: AskWhy) -> bytes:
     return encode_map({name: int(value) for name, value in named.items() if value is not None})
 
 
-def decode_ask_why(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskWhy:
+def decode_ask_why(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskWhy:
     """The question that `data` is."""
     content = fields.read_map("question", data, limits)
     if ("key" in content) == ("factor" in content):
@@ -245,7 +245,7 @@ def encode_why(message: Why) -> bytes:
     return encode_map(content)
 
 
-def decode_why(data: bytes, limits: Limits = ANSWER_LIMITS) -> Why:
+def decode_why(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Why:
     """The answer to ask/why that `data` is."""
     content = fields.read_map("why", data, limits)
     variable, factor, step = (fields.mapping("", content, name) for name in ("variable", "factor", "step"))
@@ -256,7 +256,7 @@ def _when(content: Map) -> tuple[int, int]:
     return fields.integer("", content, "epoch"), fields.integer("", content, "revision")
 
 
-def _factors(content: Map, limits: Limits) -> tuple[Factors, ...]:
+def _factors(content: Map, limits: MessageLimits) -> tuple[Factors, ...]:
     return read_batch({"factors": content.get("factors")}, limits).factors
 
 

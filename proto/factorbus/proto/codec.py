@@ -17,7 +17,7 @@ from factorbus.proto import fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.change_columns import changes_to_maps, read_changes
 from factorbus.proto.columns import factors_to_maps, read_batch, read_values, variables_to_maps
-from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Graph, Insert, Job, JobDone, Optimum
 from factorbus.proto.problems import Refused
 from factorbus.proto.report import Report
@@ -44,7 +44,7 @@ def encode_insert(message: Insert) -> bytes:
     return _pack(content)
 
 
-def decode_insert(data: bytes, limits: Limits = REQUEST_LIMITS) -> Insert:
+def decode_insert(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> Insert:
     """The insert that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("insert", data, limits)
     return Insert(
@@ -76,7 +76,7 @@ def report_encoder() -> Callable[[Mapping[str, Any]], bytes]:
     return msgpack.Packer().pack
 
 
-def decode_accepted(data: bytes, limits: Limits = ANSWER_LIMITS) -> Accepted:
+def decode_accepted(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Accepted:
     """The answer to an insert that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("accepted", data, limits)
     return Accepted(
@@ -100,7 +100,7 @@ def encode_estimate(message: Estimate) -> bytes:
     )
 
 
-def decode_estimate(data: bytes, limits: Limits = ANSWER_LIMITS) -> Estimate:
+def decode_estimate(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Estimate:
     """The estimate that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("estimate", data, limits)
     return Estimate(
@@ -123,7 +123,7 @@ def encode_delta(message: Delta) -> bytes:
     )
 
 
-def decode_delta(data: bytes, limits: Limits = ANSWER_LIMITS) -> Delta:
+def decode_delta(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Delta:
     """The delta that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("delta", data, limits)
     return Delta(
@@ -147,7 +147,7 @@ def encode_graph(message: Graph) -> bytes:
     )
 
 
-def decode_graph(data: bytes, limits: Limits = ANSWER_LIMITS) -> Graph:
+def decode_graph(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Graph:
     """The graph that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("graph", data, limits)
     return Graph(
@@ -173,7 +173,7 @@ def encode_chi2(message: Chi2) -> bytes:
     return _pack(content, default=_plain)
 
 
-def decode_chi2(data: bytes, limits: Limits = ANSWER_LIMITS) -> Chi2:
+def decode_chi2(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Chi2:
     """The answer to ask/chi2 that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("chi2", data, limits)
     asked = content.get("batch") is not None
@@ -196,7 +196,7 @@ def encode_job(message: Job) -> bytes:
     return _pack({"job": message.job, "kind": message.kind, "payload": message.payload})
 
 
-def decode_job(data: bytes, limits: Limits = ANSWER_LIMITS) -> Job:
+def decode_job(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Job:
     """The job that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("job", data, limits)
     return Job(
@@ -211,7 +211,7 @@ def encode_job_done(message: JobDone) -> bytes:
     return _pack({"job": message.job, "kind": message.kind, "payload": message.payload, "seconds": message.seconds})
 
 
-def decode_job_done(data: bytes, limits: Limits = ANSWER_LIMITS) -> JobDone:
+def decode_job_done(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> JobDone:
     """The worker's answer that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("job_done", data, limits)
     return JobDone(
@@ -236,7 +236,7 @@ def encode_optimum(message: Optimum) -> bytes:
     return _pack(content)
 
 
-def decode_optimum(data: bytes, limits: Limits = ANSWER_LIMITS) -> Optimum:
+def decode_optimum(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Optimum:
     """The result of a job of kind `batch` that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("optimum", data, limits)
     return Optimum(
@@ -259,7 +259,7 @@ def encode_problem(problem: Any, following: int | None = None) -> bytes:
     return _pack(content, default=_plain)
 
 
-def decode_problem(data: bytes, limits: Limits = ANSWER_LIMITS) -> Refused:
+def decode_problem(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Refused:
     """The problem that `data` is, ready to be raised.  Raises BadMessage, TooLarge."""
     return _read_problem("", fields.read_map("problem", data, limits))
 
@@ -269,7 +269,7 @@ def encode_keys_asked(keys: I64 | None) -> bytes:
     return _pack({} if keys is None else {"keys": np.asarray(keys, fields.I8).tobytes()})
 
 
-def decode_keys_asked(data: bytes, limits: Limits = REQUEST_LIMITS) -> I64 | None:
+def decode_keys_asked(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> I64 | None:
     """The keys (n,) that ask/estimate is about, None for all.  Raises BadMessage, TooLarge."""
     content = decode_map(data, limits, what="question")
     return fields.keys(lambda: "question", content, 0) if content.get("keys") is not None else None
@@ -280,7 +280,7 @@ def encode_map(content: Mapping[str, Any]) -> bytes:
     return _pack(dict(content), default=_plain)
 
 
-def decode_map(data: bytes, limits: Limits = ANSWER_LIMITS, what: str = "map") -> dict[str, Any]:
+def decode_map(data: bytes, limits: MessageLimits = ANSWER_LIMITS, what: str = "map") -> dict[str, Any]:
     """The plain map that `data` is; no bytes at all are an empty map.  Raises BadMessage, TooLarge."""
     return dict(fields.read_map(what, data, limits)) if data else {}
 

@@ -9,7 +9,7 @@ from factorbus.proto import fields
 from factorbus.proto.arrays import I64
 from factorbus.proto.fields import F8, I8, Map
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
-from factorbus.proto.limits import Limits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.problems import BadLoss, BadMessage, BadStamp, TooLarge, UnknownKind
 from factorbus.wording import counted
@@ -25,7 +25,7 @@ def factors_to_maps(groups: Sequence[Factors]) -> list[dict[str, Any]]:
     return [_factors_map(group) for group in groups]
 
 
-def read_batch(message: Map, limits: Limits) -> Batch:
+def read_batch(message: Map, limits: MessageLimits) -> Batch:
     """The batch in `message`; every kind has to be known.  Raises BadMessage, UnknownKind, TooLarge."""
     variables = [_read_variables(i, m, strict=True) for i, m in enumerate(fields.maps("", message, "variables"))]
     factors = [_read_factors(i, m) for i, m in enumerate(fields.maps("", message, "factors"))]

@@ -127,7 +127,7 @@ class Done(NamedTuple):
     seconds: float
 
 
-class Answer(NamedTuple):
+class FeaturesAnswer(NamedTuple):
     """The answer to an Ask: its shards in the order of the features.
 
     clean: everybody who was given a part has answered for it, so nobody will write to the segment any more.
@@ -144,9 +144,9 @@ def answer_size(ask: Ask) -> int:
         return 8 * (13 * n + 6 * m + 9)
     if ask.form == "half":
         return 8 * (6 * n + 6 * n * m + 36 * n * (n + 1) // 2)
-    return 8 * 6 * n + (0 if ask.segment else rows_size(n, m))
+    return 8 * 6 * n + (0 if ask.segment else new_rows_size(n, m))
 
 
-def rows_size(n: int, m: int) -> int:
+def new_rows_size(n: int, m: int) -> int:
     """Bytes of the whole new rows."""
     return 8 * 6 * n * (m + 6 * n)

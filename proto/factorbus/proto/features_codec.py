@@ -17,16 +17,16 @@ from factorbus.proto.features import (
     CAMERA_STATE,
     FEATURE,
     FORMS,
-    Answer,
     Ask,
     Done,
+    FeaturesAnswer,
     Segment,
     Shard,
     ShardDone,
     Sighting,
 )
 from factorbus.proto.fields import F8, Map
-from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.problems import BadMessage
 from factorbus.wording import counted
 
@@ -55,10 +55,10 @@ def encode_ask(message: Ask) -> bytes:
     return _pack(content)
 
 
-def decode_ask(data: bytes, limits: Limits = REQUEST_LIMITS) -> Ask:
+def decode_ask(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> Ask:
     """The question that `data` is.  Raises BadMessage, BadCamera, TooLarge."""
     content = fields.read_map("ask", data, limits)
-    form = fields.word("", content, "form", FORMS, "rows")
+    form = fields.choice_of("", content, "form", FORMS, "rows")
     sighting = Sighting(
         _camera(fields.mapping("", content, "camera")),
         _array(content, "state", CAMERA_STATE).reshape(-1)[:CAMERA_STATE],
@@ -76,7 +76,7 @@ def encode_shard(message: Shard) -> bytes:
     return _pack({"ask": message.ask, "first": message.first, "last": message.last})
 
 
-def decode_shard(data: bytes, limits: Limits = ANSWER_LIMITS) -> Shard:
+def decode_shard(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Shard:
     """The payload of a job of kind `idp` that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("shard", data, limits)
     first = fields.integer("", content, "first")
@@ -94,7 +94,7 @@ def encode_shard_done(message: ShardDone) -> bytes:
     return _pack(content)
 
 
-def decode_shard_done(data: bytes, limits: Limits = ANSWER_LIMITS) -> ShardDone:
+def decode_shard_done(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> ShardDone:
     """The result of a job of kind `idp` that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("shard_done", data, limits)
     first = fields.integer("", content, "first")
@@ -112,7 +112,7 @@ def encode_answer(shards: Iterable[tuple[bytes, str, float]], clean: bool) -> by
     return _pack({"shards": [{"shard": s, "worker": worker, "seconds": t} for s, worker, t in shards], "clean": clean})
 
 
-def decode_answer(data: bytes, limits: Limits = ANSWER_LIMITS) -> Answer:
+def decode_answer(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> FeaturesAnswer:
     """The answer to an ask that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("answer", data, limits)
     done = tuple(
@@ -123,7 +123,7 @@ def decode_answer(data: bytes, limits: Limits = ANSWER_LIMITS) -> Answer:
         )
         for i, each in enumerate(fields.maps("", content, "shards"))
     )
-    return Answer(done, fields.flag("", content, "clean"))
+    return FeaturesAnswer(done, fields.flag("", content, "clean"))
 
 
 def _column(numbers: Any) -> memoryview:

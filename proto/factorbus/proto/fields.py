@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 
 from factorbus.proto.arrays import F64, I64
-from factorbus.proto.limits import Limits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import BadMessage, BadOption, TooLarge
 from factorbus.wording import counted
 
@@ -26,7 +26,7 @@ _TOO_MANY = re.compile(r"(\d+) exceeds max_(?:array|map)_len")
 Map = Mapping[str, Any]
 
 
-def read_map(what: str, data: bytes, limits: Limits) -> Map:
+def read_map(what: str, data: bytes, limits: MessageLimits) -> Map:
     """The MessagePack map that `data` is.  Raises TooLarge, BadMessage."""
     if len(data) > limits.max_bytes:
         raise TooLarge(what, len(data), limits.max_bytes, "bytes")
@@ -75,7 +75,7 @@ def parameter(where: str, fields: Map, name: str, span: tuple[float, float], wan
     return value
 
 
-def word(where: str, fields: Map, name: str, known: Sequence[str], default: str) -> str:
+def choice_of(where: str, fields: Map, name: str, known: Sequence[str], default: str) -> str:
     """An optional string that is one of `known`.  Raises BadMessage, BadOption."""
     value = text(where, fields, name, default)
     if value not in known:

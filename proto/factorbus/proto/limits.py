@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class MessageLimits:
     """What a decoder takes.
 
     max_bytes: of the whole message.  max_variables, max_factors: of the batch in it.  max_elements: of one
@@ -20,7 +20,7 @@ class Limits:
 
 
 # What a service takes from strangers, and what a client takes from the service it chose to connect to.
-REQUEST_LIMITS = Limits(max_bytes=64 << 20, max_variables=1_000_000, max_factors=1_000_000)
-ANSWER_LIMITS = Limits(
+REQUEST_LIMITS = MessageLimits(max_bytes=64 << 20, max_variables=1_000_000, max_factors=1_000_000)
+ANSWER_LIMITS = MessageLimits(
     max_bytes=256 << 20, max_variables=1 << 30, max_factors=1 << 30, max_elements=65_536, max_containers=65_536
 )

@@ -163,7 +163,7 @@ class Chi2:
     """The answer to ask/chi2: Σ rᵀ Ω r at `revision`; `batch` is the optimum found from scratch, if asked for.
 
     worker: who computed the batch optimum ("in-place": the service itself); seconds: how long it took there.
-    start: what led to it, one of `STARTS` ("": not told).  notice: a BetterOptimum where the map is well above it.
+    start: what led to it, one of `STARTS` ("": unknown).  notice: a BetterOptimum where the map is well above it.
     variables: the optimum itself, if it was asked for.  batch_converged: false where the search ended before it had
     converged: the optimum may be below `batch`.
     """
@@ -203,7 +203,7 @@ class JobDone:
 class Optimum:
     """The payload that answers a job of kind `batch`: the graph optimized from scratch, its χ² and its values.
 
-    start: what led there, one of `STARTS`; "": not told.  converged: false where the search ended before it had.
+    start: what led there, one of `STARTS`; "": unknown.  converged: false where the search ended before it had.
     """
 
     chi2: float

@@ -11,7 +11,7 @@ from factorbus.proto.asking_codec import probability
 from factorbus.proto.codec import encode_map
 from factorbus.proto.columns import read_values, variables_to_maps
 from factorbus.proto.fields import F8, I8, Map
-from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
 from factorbus.proto.problems import BadMessage
 from factorbus.wording import counted
 
@@ -26,7 +26,7 @@ def encode_ask_repair(ask: AskRepair) -> bytes:
     return encode_map(content)
 
 
-def decode_ask_repair(data: bytes, limits: Limits = REQUEST_LIMITS) -> AskRepair:
+def decode_ask_repair(data: bytes, limits: MessageLimits = REQUEST_LIMITS) -> AskRepair:
     """The question that `data` is; no bytes at all: everything as by default."""
     content = fields.read_map("question", data, limits) if data else {}
     factors = None if content.get("factors") is None else _integers("question", content, "factors")
@@ -50,7 +50,7 @@ def encode_repaired(message: Repaired) -> bytes:
     return encode_map(content)
 
 
-def decode_repaired(data: bytes, limits: Limits = ANSWER_LIMITS) -> Repaired:
+def decode_repaired(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Repaired:
     """The answer to ask/repair that `data` is."""
     content = fields.read_map("repaired", data, limits)
     factors = _integers("", content, "factors")

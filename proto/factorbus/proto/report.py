@@ -1,4 +1,4 @@
-"""A step's account of work, as it is told in the answer to an insert and in a delta.  Explained in the contract, §4."""
+"""A step's account of work, as it is in the answer to an insert and in a delta.  Explained in the contract, §4."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ _NUMBERS = ("chi2", "chi2_before", "damping", "step_ms", "solver_ms", "compiled_
 class Report(dict[str, Any]):
     """A map that is open: fields of later services are in it, and asking for a documented one never fails.
 
-    One that is not told is "", 0, NaN, False or an empty map, by its type; `in` and `get` say whether it was.
+    One that is not reported is "", 0, NaN, False or an empty map, by its type; `in` and `get` say whether it was.
     """
 
     def __missing__(self, name: str) -> Any:

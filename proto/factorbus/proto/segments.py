@@ -1,9 +1,9 @@
 """Memory that processes of one host share: anonymous files that the asker makes and others write answers into.
 
 The asker makes a file without a name (memfd), writes a nonce at its beginning and says by which process and descriptor
-it is found; whoever finds a file there with that nonce is on the same host, under the same user, whatever containers
-and mounts say.  The file is sealed so that it cannot become shorter, so who has mapped it cannot be ended by it; and it
-goes with its last user, so that nothing is left behind, however a process ends.
+it is found; a process that finds a file there with that nonce is on the same host, under the same user,
+whatever containers and mounts say.  The file is sealed so that it cannot become shorter, so who has mapped it cannot
+be ended by it; and it goes with its last user, so that nothing is left behind, however a process ends.
 
 A file serves one question at a time, and another one only if nobody can write to it for the one before any more.  One
 who was frozen meanwhile and wakes writes what stands there already: an answer is a pure function of its question.

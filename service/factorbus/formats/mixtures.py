@@ -17,7 +17,7 @@ from factorbus.formats.assemble import EdgeColumns, VertexColumns
 from factorbus.formats.edges import Lead
 from factorbus.formats.errors import refuse_first
 from factorbus.formats.left_out import LeftOut
-from factorbus.formats.rotations import inverse, product
+from factorbus.formats.rotations import compose_poses, inverse_poses
 from factorbus.formats.weights import unpacked_symmetric
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import FACTOR_KINDS
@@ -55,7 +55,7 @@ def best_components(file: str, mixed: Lead, vertices: Sequence[VertexColumns], l
 
 def _residuals(first: F64, second: F64, measured: F64) -> F64:
     """z⁻¹ (xᵢ⁻¹ xⱼ) as residuals have it: (n, 3) with the angle wrapped, or (n, 6)."""
-    error = product(inverse(measured), product(inverse(first), second))
+    error = compose_poses(inverse_poses(measured), compose_poses(inverse_poses(first), second))
     if error.shape[1] == 3:
         return np.concatenate([error[:, :2], np.remainder(error[:, 2:] + np.pi, 2 * np.pi) - np.pi], axis=1)
     return np.concatenate([error[:, :3], np.where(error[:, 6:] < 0, -error[:, 3:6], error[:, 3:6])], axis=1)

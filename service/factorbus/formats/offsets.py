@@ -22,7 +22,7 @@ from factorbus.formats.left_out import LeftOut
 from factorbus.formats.lines import Bucket
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.records import OFFSETS
-from factorbus.formats.rotations import inverse, matrices, normalized_poses, product
+from factorbus.formats.rotations import compose_poses, inverse_poses, normalized_poses, rotation_matrices
 from factorbus.formats.weights import packed_upper, unpacked_symmetric
 from factorbus.proto.arrays import F64, I64
 
@@ -131,12 +131,12 @@ def _identity(size: int) -> F64:
 def _moved(kind: str, places: list[F64], measured: F64, information: F64) -> tuple[F64, F64]:
     last = places[-1]
     if kind.startswith("landmark"):
-        R = matrices(last)
+        R = rotation_matrices(last)
         length = measured.shape[1]
         return last[:, :length] + np.einsum("nij,nj->ni", R, measured), _carried(information, np.swapaxes(R, 1, 2))
-    z = product(measured, inverse(last))
+    z = compose_poses(measured, inverse_poses(last))
     if kind.startswith("between"):
-        z = product(places[0], z)
+        z = compose_poses(places[0], z)
     return z, _carried(information, _adjoints(last))
 
 
@@ -148,7 +148,7 @@ def _carried(information: F64, A: F64) -> F64:
 
 def _adjoints(places: F64) -> F64:
     """A of MATH (3.28) for each place: (n, 3, 3) or (n, 6, 6)."""
-    Qt = np.swapaxes(matrices(places), 1, 2)
+    Qt = np.swapaxes(rotation_matrices(places), 1, 2)
     if places.shape[1] == 3:
         A = np.tile(np.eye(3), (len(places), 1, 1))
         A[:, :2, :2] = Qt

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factorbus.formats.rotations import inverse, product
+from factorbus.formats.rotations import compose_poses, inverse_poses
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch
 
@@ -65,7 +65,7 @@ def composed(batch: Batch, ends: tuple[I64, ...], rank: I64, entry: I64, known: 
     edges: dict[int, list[tuple[int, F64]]] = defaultdict(list)
     for group, rows in zip(batch.factors, ends, strict=True):
         if group.kind == "between_se2":
-            for (i, j), z, back in zip(rows.tolist(), group.measured, inverse(group.measured), strict=True):
+            for (i, j), z, back in zip(rows.tolist(), group.measured, inverse_poses(group.measured), strict=True):
                 edges[j].append((i, z))
                 edges[i].append((j, back))
     poses = np.full((len(rank), 3), np.nan)
@@ -88,7 +88,7 @@ def _place(pose: int, poses: F64, edges: list[tuple[int, F64]], known: Mapping[i
     if not near:
         return False
     other, z = edges[min(near)[1]]
-    poses[pose] = product(poses[None, other], z[None])[0]
+    poses[pose] = compose_poses(poses[None, other], z[None])[0]
     return True
 
 

@@ -20,7 +20,7 @@ from factorbus.formats.parallax import lone_bearings
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
 from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
 from factorbus.formats.rotations import normalized_poses
-from factorbus.formats.sniff import named, sniffed
+from factorbus.formats.sniff import dialect_named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch
@@ -57,7 +57,7 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
     buckets = read_buckets(path)
     if dialect == TUM or (dialect is None and is_trajectory(buckets)):
         return read_trajectory(file, buckets)
-    guess = sniffed(path, buckets) if dialect is None else named(file, dialect)
+    guess = sniffed(path, buckets) if dialect is None else dialect_named(file, dialect)
     chosen, left = guess.dialect, LeftOut(file, strict, whole)
     if guess.why:
         left.say(guess.why)

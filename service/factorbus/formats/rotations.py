@@ -43,7 +43,7 @@ def isam_edges3(ids: I64, measured: F64, root: F64) -> tuple[I64, F64, F64]:
     """
     back = ids[:, 0] > ids[:, 1]
     poses = np.concatenate([measured[:, :3], quat_xyzw(measured[:, 3:])], axis=1)
-    poses[back] = inverse(poses[back])
+    poses[back] = inverse_poses(poses[back])
     angles = measured[:, 3:].copy()
     angles[back] = _roll_pitch_yaw(poses[back, 3:])
     ids = np.where(back[:, None], ids[:, ::-1], ids)
@@ -75,7 +75,7 @@ def quat_xyzw(angles: F64) -> F64:
     return np.where(quat[:, 3:] < 0, -quat, quat)
 
 
-def rotated(quat: F64, vectors: F64) -> F64:
+def rotate_vectors(quat: F64, vectors: F64) -> F64:
     """R(quat) v for each row.
 
     in   quat (n, 4) qx qy qz qw   vectors (n, 3)
@@ -85,34 +85,34 @@ def rotated(quat: F64, vectors: F64) -> F64:
     return vectors + w * t + np.cross(u, t)
 
 
-def inverse(poses: F64) -> F64:
+def inverse_poses(poses: F64) -> F64:
     """The inverse of each pose: (n, 3) x y theta, or (n, 7) x y z qx qy qz qw."""
     if poses.shape[1] == 3:
-        back = np.einsum("nji,nj->ni", matrices(poses), poses[:, :2])
+        back = np.einsum("nji,nj->ni", rotation_matrices(poses), poses[:, :2])
         return np.concatenate([-back, -poses[:, 2:]], axis=1)
     conjugate = poses[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
-    return np.concatenate([-rotated(conjugate, poses[:, :3]), conjugate], axis=1)
+    return np.concatenate([-rotate_vectors(conjugate, poses[:, :3]), conjugate], axis=1)
 
 
-def product(a: F64, b: F64) -> F64:
+def compose_poses(a: F64, b: F64) -> F64:
     """a b for each pair of poses, both (n, 3) or both (n, 7)."""
     if a.shape[1] == 3:
-        places = a[:, :2] + np.einsum("nij,nj->ni", matrices(a), b[:, :2])
+        places = a[:, :2] + np.einsum("nij,nj->ni", rotation_matrices(a), b[:, :2])
         return np.concatenate([places, a[:, 2:] + b[:, 2:]], axis=1)
     (u, v), (s, t) = (a[:, 3:6], b[:, 3:6]), (a[:, 6:], b[:, 6:])
     vector = s * v + t * u + np.cross(u, v)
     scalar = s * t - np.sum(u * v, axis=1, keepdims=True)
     quat = np.concatenate([vector, scalar], axis=1)
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    return np.concatenate([a[:, :3] + rotated(a[:, 3:], b[:, :3]), quat], axis=1)
+    return np.concatenate([a[:, :3] + rotate_vectors(a[:, 3:], b[:, :3]), quat], axis=1)
 
 
-def matrices(poses: F64) -> F64:
+def rotation_matrices(poses: F64) -> F64:
     """The rotation of each pose: (n, 2, 2) of (n, 3), (n, 3, 3) of (n, 7)."""
     if poses.shape[1] == 3:
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         return np.stack([c, -s, s, c], axis=1).reshape(-1, 2, 2)
-    columns = [rotated(poses[:, 3:], np.broadcast_to(axis, (len(poses), 3))) for axis in np.eye(3)]
+    columns = [rotate_vectors(poses[:, 3:], np.broadcast_to(axis, (len(poses), 3))) for axis in np.eye(3)]
     return np.stack(columns, axis=2)
 
 

@@ -22,7 +22,7 @@ class Guess:
     why: str = ""
 
 
-def named(file: str, name: str) -> Guess:
+def dialect_named(file: str, name: str) -> Guess:
     """The dialect that somebody named.  Raises FormatError when there is none of that name."""
     if name not in DIALECTS:
         raise FormatError(file, None, f"dialect {name!r}", f"one of {', '.join((*DIALECTS, 'tum'))}")
@@ -35,8 +35,8 @@ def sniffed(path: Path, buckets: Mapping[str, Bucket]) -> Guess:
     EDGE2 is a record of TORO, of iSAM and of SLAM++, which put other numbers into it.  Where nothing else tells TORO
     apart, the last number does: in iSAM's and SLAM++'s it belongs to the angle alone and is never 0, in TORO's it joins
     x and angle and mostly is.  Where even that leaves both, the ending decides: .graph is TORO.  iSAM and SLAM++ (a
-    square root of the information, and the information itself) cannot be told apart by their numbers: without vertices
-    a file is taken for iSAM's.
+    square root of the information, and the information itself) cannot be distinguished by their numbers: without
+    vertices a file is taken for iSAM's.
     """
     names = set(buckets)
     if names & _SLAMPP_ONLY:

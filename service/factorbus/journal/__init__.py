@@ -3,5 +3,5 @@
 folder of a service/          one service owns it (`lock`)
   MAP/
     journal.db                every insert and what became of it (`store`, SQLite)
-    snapshot-N.fbs            the solver's state after record N (`snapshots`)
+    checkpoint-N.fbs            the solver's state after record N (`checkpoints`)
 """

@@ -1,4 +1,4 @@
-"""A whole map as one file: its journal, and the newest snapshot in the same database, in pieces.
+"""A whole map as one file: its journal, and the newest checkpoint in the same database, in pieces.
 
 Made of a journal that is closed or at work, on this machine; read into a folder of journals under any name.
 """
@@ -8,9 +8,9 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from factorbus.journal.checkpoints import file_of
 from factorbus.journal.folders import IMPORTING, make_beside, sync_folder
 from factorbus.journal.problems import JournalDamaged, JournalFailed, MapThere, NoJournal
-from factorbus.journal.snapshots import file_of
 from factorbus.journal.store import NAME, open_store, what_reading_failed_with
 from factorbus.ownership import private_file
 
@@ -28,7 +28,7 @@ def export_map(folder: Path, file: Path) -> int:
     store = open_store(folder, read_only=True)
     try:
         store.copy_to(beside)
-        saved = store.snapshots()
+        saved = store.checkpoints()
     finally:
         store.close()
     try:
@@ -64,8 +64,8 @@ def import_map(file: Path, folder: Path) -> None:
         open_store(beside, read_only=True).close()
         with _opened(beside / NAME) as database:
             for record, content in _pieces(database):
-                with open(file_of(beside, record), "ab", opener=private_file) as snapshot:
-                    snapshot.write(content)
+                with open(file_of(beside, record), "ab", opener=private_file) as checkpoint:
+                    checkpoint.write(content)
             database.execute("DROP TABLE IF EXISTS piece")
             database.execute("UPDATE header SET value = ? WHERE name = 'map'", (folder.name,))
         _check(beside)
@@ -106,7 +106,7 @@ class _Database:
 
 
 def _put(database: sqlite3.Connection, record: int, path: Path) -> bool:
-    """Whether the snapshot is there and is now in the database, too."""
+    """Whether the checkpoint is there and is now in the database, too."""
     try:
         with path.open("rb") as file:
             number = 0

@@ -12,7 +12,7 @@ from factorbus.proto import codec
 START = bytes(16)
 
 
-def follow(chain: bytes, delta: bytes) -> bytes:
+def extend_chain(chain: bytes, delta: bytes) -> bytes:
     """The chain after a step that published `delta`: its variables count, not its account of work."""
     digest = blake2b(chain, digest_size=16)
     message = codec.decode_delta(delta)

@@ -7,9 +7,9 @@ from pathlib import Path
 from factorbus.journal.log_frames import lost_from
 from factorbus.journal.problems import JournalDamaged, JournalUnreadable, JournalVersion
 
-# 2: the answer to what was accepted was not kept whole; 3: its header had no seal; 4: a snapshot counted only for the
-# build of the solver that wrote it
-FORM = 5
+# 2: the answer to what was accepted was not kept whole; 3: its header had no seal; 4: a checkpoint counted only for the
+# build of the solver that wrote it; 5: checkpoints were called snapshots, in the database and in names of files
+FORM = 6
 APPLICATION = 0x46427573  # "FBus"
 _LOG_BYTES = 64 << 20  # what a log that was longer is cut to, once it is in the database
 # Ways to open it for reading.  The last: where no file can be made beside it, which the log of a database needs.

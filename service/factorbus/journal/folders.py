@@ -20,7 +20,7 @@ def maps_in(folder: Path, file: str) -> list[str]:
 
 def is_map(folder: Path, file: str) -> bool:
     """Whether `folder` has `file`, or what is written beside it."""
-    return any(path.is_file() for kind in (f"{file}*", "snapshot-*") for path in folder.glob(kind))
+    return any(path.is_file() for kind in (f"{file}*", "checkpoint-*") for path in folder.glob(kind))
 
 
 def left_behind(folder: Path) -> list[Path]:

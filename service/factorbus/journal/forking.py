@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.folders import UNFINISHED, make_beside, sync_folder
 from factorbus.journal.problems import JournalFailed
 from factorbus.journal.records import Epoch
-from factorbus.journal.snapshots import file_of, write_snapshot
-from factorbus.journal.store import NAME, Saved, open_store
+from factorbus.journal.store import NAME, Checkpoint, open_store
 
 log = logging.getLogger(__name__)
 
 
-def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, Any], saved: Saved) -> None:
+def fork_journal(source: Path, target: Path, epoch: Epoch, state: Mapping[str, Any], saved: Checkpoint) -> None:
     """The journal in `source`, which may be at work, up to a record into `target`, which must not be there yet.
 
     state: of the solver after that record, so that a restart is quick; saved: which record that is, and what the state
@@ -45,19 +45,19 @@ def _copy(source: Path, beside: Path) -> None:
         store.close()
 
 
-def _written(beside: Path, state: Mapping[str, Any], saved: Saved) -> Saved | None:
-    """The snapshot, if there is room for it: without one a restart takes longer."""
+def _written(beside: Path, state: Mapping[str, Any], saved: Checkpoint) -> Checkpoint | None:
+    """The checkpoint, if there is room for it: without one a restart takes longer."""
     if not saved.record:
         return None
     path = file_of(beside, saved.record)
     try:
-        return saved._replace(bytes=write_snapshot(path, state))
+        return saved._replace(bytes=write_checkpoint(path, state))
     except OSError as error:
-        log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
+        log.warning("no checkpoint in %s: %s; a restart takes longer without it", path, error)
         return None
 
 
-def _begin(beside: Path, name: str, epoch: Epoch, record: int, saved: Saved | None) -> None:
+def _begin(beside: Path, name: str, epoch: Epoch, record: int, saved: Checkpoint | None) -> None:
     store = open_store(beside)
     try:
         store.become(name, record, epoch, saved)

@@ -39,7 +39,7 @@ def own(
 ) -> Owned | None:
     """Own `folder`, which is made if it is not there.
 
-    wait: stand by until the present owner is gone, or this is set (then None); `waiting` is told who that is.
+    wait: stand by until the present owner is gone, or this is set (then None); `waiting` is called with who that is.
     Raises JournalInUse when it has an owner and nobody wants to wait; UnsafeJournal: others can write to it; OSError.
     """
     descriptor = _open(folder)

@@ -14,7 +14,7 @@ class Entry(NamedTuple):
     """One insert, in its place.
 
     revision, first_factor, together: where it was accepted.  answer: the bytes it was answered with, an accepted or a
-    problem, so that whoever asks again gets the same.  digest: of all the rest (`digest.sealed`).
+    problem, so that a client that asks again gets the same.  digest: of all the rest (`digest.sealed`).
     """
 
     client: str

@@ -36,7 +36,7 @@ CREATE TABLE entry (
     together INTEGER NOT NULL, answer BLOB NOT NULL, message BLOB NOT NULL
 );
 CREATE INDEX entry_of_client ON entry (client);
-CREATE TABLE snapshot (
+CREATE TABLE checkpoint (
     record INTEGER PRIMARY KEY, format INTEGER NOT NULL, build TEXT NOT NULL, differs TEXT NOT NULL,
     bytes INTEGER NOT NULL
 );
@@ -46,8 +46,8 @@ _REBUILT, _FURTHER = 1, 2
 _ENTRY = "client, sequence, digest, outcome, revision, first_factor, together, answer"
 
 
-class Saved(NamedTuple):
-    """A snapshot that was written: after which record, in which format of a state, by which build, how large.
+class Checkpoint(NamedTuple):
+    """A checkpoint that was written: after which record, in which format of a state, by which build, how large.
 
     differs: why a replay of the journal up to there may give other bits; empty: as far as is known it gives the same.
     """
@@ -91,12 +91,12 @@ class Store:
             row = self._db.execute("SELECT number, revision, chain FROM record ORDER BY number DESC LIMIT 1").fetchone()
         return Last(*row) if row else Last(0, 0, chain.START)
 
-    def at(self, record: int) -> Last:
+    def last_at(self, record: int) -> Last:
         """Where it was after `record`.  Raises JournalDamaged."""
         with self._reading():
             row = self._db.execute("SELECT number, revision, chain FROM record WHERE number = ?", (record,)).fetchone()
         if row is None:
-            raise JournalDamaged(self.path, f"record {record}, which a snapshot was made after, is missing")
+            raise JournalDamaged(self.path, f"record {record}, which a checkpoint was made after, is missing")
         return Last(*row)
 
     def records(self, after: int = 0) -> Iterator[JournalRecord]:
@@ -149,11 +149,11 @@ class Store:
             ).fetchone()
         return {"records": records, "inserts": row[0], "clients": row[1], "message_bytes": row[2] or 0}
 
-    def snapshots(self) -> list[Saved]:
-        """The snapshots that were written, newest first."""
+    def checkpoints(self) -> list[Checkpoint]:
+        """The checkpoints that were written, newest first."""
         with self._reading():
-            rows = self._db.execute("SELECT * FROM snapshot ORDER BY record DESC").fetchall()
-            return [Saved(record, form, json.loads(build), *more) for record, form, build, *more in rows]
+            rows = self._db.execute("SELECT * FROM checkpoint ORDER BY record DESC").fetchall()
+            return [Checkpoint(record, form, json.loads(build), *more) for record, form, build, *more in rows]
 
     def append(self, records: Sequence[JournalRecord]) -> None:
         """Write `records` down: when this returns they are as safe as the durability says.  Raises JournalFailed."""
@@ -166,14 +166,14 @@ class Store:
                 [(record.number, *entry) for record in records for entry in record.entries],
             )
 
-    def add_snapshot(self, saved: Saved, keep: int) -> list[int]:
-        """Note a snapshot, and forget all but the last `keep`: gives the records of those.  Raises JournalFailed."""
+    def add_checkpoint(self, saved: Checkpoint, keep: int) -> list[int]:
+        """Note a checkpoint, and forget all but the last `keep`: gives the records of those.  Raises JournalFailed."""
         with self._writing():
-            self._insert_snapshot(saved)
+            self._insert_checkpoint(saved)
             old = self._db.execute(
-                "SELECT record FROM snapshot ORDER BY record DESC LIMIT -1 OFFSET ?", (keep,)
+                "SELECT record FROM checkpoint ORDER BY record DESC LIMIT -1 OFFSET ?", (keep,)
             ).fetchall()
-            self._db.executemany("DELETE FROM snapshot WHERE record = ?", old)
+            self._db.executemany("DELETE FROM checkpoint WHERE record = ?", old)
         return [record for (record,) in old]
 
     def begin(self, durability: str, epoch: Epoch | None = None, maker: Maker | None = None) -> None:
@@ -195,10 +195,10 @@ class Store:
         with self._writing():
             self._set({"clean": "1"})
 
-    def become(self, name: str, record: int, epoch: Epoch, saved: Saved | None) -> None:
+    def become(self, name: str, record: int, epoch: Epoch, saved: Checkpoint | None) -> None:
         """A copy of another map's is the journal of map `name`: with nothing after `record`, in an epoch of its own.
 
-        saved: the one snapshot that it has.  Raises JournalFailed.
+        saved: the one checkpoint that it has.  Raises JournalFailed.
         """
         with self._writing():
             self._db.execute("DELETE FROM entry WHERE record > ?", (record,))
@@ -206,9 +206,9 @@ class Store:
             self._db.execute("DELETE FROM epoch WHERE record > ?", (epoch.record,))
             self._db.execute("DELETE FROM maker WHERE record > ?", (record,))
             self._add_epoch(epoch)
-            self._db.execute("DELETE FROM snapshot")
+            self._db.execute("DELETE FROM checkpoint")
             if saved is not None:
-                self._insert_snapshot(saved)
+                self._insert_checkpoint(saved)
             self._set({"map": name, "clean": "1"})
             self._seal()
 
@@ -300,9 +300,9 @@ class Store:
             "INSERT INTO epoch (epoch, record, because) VALUES (?, ?, ?)", (epoch.epoch, epoch.record, epoch.because)
         )
 
-    def _insert_snapshot(self, saved: Saved) -> None:
+    def _insert_checkpoint(self, saved: Checkpoint) -> None:
         row = saved.record, saved.format, _text(saved.build), saved.differs, saved.bytes
-        self._db.execute("INSERT OR REPLACE INTO snapshot VALUES (?, ?, ?, ?, ?)", row)
+        self._db.execute("INSERT OR REPLACE INTO checkpoint VALUES (?, ?, ?, ?, ?)", row)
 
     def _checked(self, entry: Entry) -> Entry:
         if digest_of(entry) != entry.digest:

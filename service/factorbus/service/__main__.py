@@ -11,7 +11,7 @@ from typing import Any
 
 from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
-from factorbus.service.config import DURABILITIES, Config, checked, load
+from factorbus.service.config import DURABILITIES, Config, checked_config, load_config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,7 +61,7 @@ def _config(options: argparse.Namespace) -> Config:
         given["standby"] = True
     if options.insecure:
         given["insecure"] = True
-    return load(options.config, **given) if options.config else checked(replace(Config(), **given))
+    return load_config(options.config, **given) if options.config else checked_config(replace(Config(), **given))
 
 
 if __name__ == "__main__":

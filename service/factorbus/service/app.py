@@ -39,8 +39,8 @@ from factorbus.service.bus.zenoh_session import (
     refuse,
     reply,
 )
-from factorbus.service.config import BadConfig, Config, checked
-from factorbus.service.core.events import Asked, Asker, Refuse
+from factorbus.service.config import BadConfig, Config, checked_config
+from factorbus.service.core.events import ArrivedQuestion, Asker, Refuse
 from factorbus.service.jobs.features import FeatureLimits, FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
@@ -75,9 +75,9 @@ def serve(
     """Keep maps until `stop` is set, then answer everything accepted and return.
 
     `on_ready` gets the endpoints that clients can connect to, once they can.  `on_look` gets the service's health,
-    several times a second: for whoever watches over it.  Raises BadConfig, Problem.
+    several times a second: for a supervisor.  Raises BadConfig, Problem.
     """
-    checked(config)
+    checked_config(config)
     # Who only waits for the folder has everything ready by then; who cannot have it says so before compiling.
     library = open_library(config, log_owner, stop) if config.journal and not config.standby else None
     try:
@@ -229,7 +229,7 @@ class Shell:
         if found is None:
             self._delivery.refusals.hand(self._no_map, query, name)
         else:
-            found.host.ask(Asked(query, question, payload_of(query)))
+            found.host.ask(ArrivedQuestion(query, question, payload_of(query)))
 
     def _on_admin(self, query: Asker) -> None:
         if (waiting := self._control.waiting) < _ADMIN_WAITING:
@@ -254,13 +254,13 @@ class Shell:
             self._control.hand(self._latencies.left, worker)
 
     def _about(self) -> dict[str, Any]:
-        from factorbus.service.operations.warm import compiled_seconds
+        from factorbus.service.operations.warm import seconds_compiling
 
         return {
             "service": self._service,
             "version": __version__,
             "protocol": known(),
-            "kernels_compiled_s": compiled_seconds(),
+            "kernels_compiled_s": seconds_compiling(),
             "workers": self._worker_rows,
         }
 

@@ -10,7 +10,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from factorbus.proto.endpoints import checked_endpoint
 from factorbus.proto.keys import checked_name
-from factorbus.proto.limits import Limits as MessageLimits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.problems import Problem
 
 _HOST_PORT = re.compile(r"(?:\[[0-9a-fA-F:]+\]|[^\s:/]+):\d{1,5}")
@@ -87,7 +87,7 @@ class Config:
     journal: str = ""  # folder where maps are kept; empty: they end with the service
     durability: str = "commit"  # what an answer promises of it: none, group or commit
     group_s: float = 0.05  # durability group: written no later than this after the answer
-    snapshot_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
+    checkpoint_s: float = 5.0  # of steps, after which the solver's state is written, so that a restart is quick
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
     # From so much memory of a map on; before, each on its own thread alone.  10,000 poses in a plane, 2,000 in space.
     cores_from_bytes: int = 64 << 20
@@ -95,17 +95,17 @@ class Config:
     limits: Limits = field(default_factory=Limits)
 
 
-def load(path: str | Path, **overrides: Any) -> Config:
+def load_config(path: str | Path, **overrides: Any) -> Config:
     """The configuration in the TOML file `path`; `overrides` win.  Raises BadConfig, BadEndpoint, BadName, OSError."""
     with Path(path).open("rb") as file:
         try:
             content = tomllib.load(file)
         except tomllib.TOMLDecodeError as error:
             raise BadConfig(f"{path} is not TOML: {error}") from None
-    return checked(replace(_build(Config, content, str(path)), **overrides))
+    return checked_config(replace(_build(Config, content, str(path)), **overrides))
 
 
-def checked(config: Config) -> Config:
+def checked_config(config: Config) -> Config:
     """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
     for endpoint in (*config.listen, *config.connect):
         checked_endpoint(endpoint)
@@ -121,7 +121,7 @@ def checked(config: Config) -> Config:
         least = 0 if name in _MAY_BE_0 else 1e-9
         if getattr(config.limits, name) < least:
             raise BadConfig(f"limits.{name} is {getattr(config.limits, name)}; wanted more than 0")
-    for name in ("job_deadline_s", "stuck_s", "group_s", "snapshot_s"):
+    for name in ("job_deadline_s", "stuck_s", "group_s", "checkpoint_s"):
         if getattr(config, name) <= 0:
             raise BadConfig(f"{name} is {getattr(config, name)}; wanted more than 0")
     if config.cores < 1:

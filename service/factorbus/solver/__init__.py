@@ -11,7 +11,7 @@
 from factorbus.solver import errors
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.groups import FactorGroup, Group
-from factorbus.solver.kernels.jit.compile import compiled_seconds
+from factorbus.solver.kernels.jit.compile import compile_seconds
 from factorbus.solver.kernels.jit.releases import why_stock as why_stock_numba
 from factorbus.solver.optimize.evaluate import chi2_at
 from factorbus.solver.options import Options
@@ -31,7 +31,7 @@ __all__ = [
     "StepReport",
     "Tuning",
     "chi2_at",
-    "compiled_seconds",
+    "compile_seconds",
     "errors",
     "solve_batch",
     "warm",

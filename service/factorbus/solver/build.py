@@ -7,7 +7,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 
-from factorbus.solver.kernels.jit.compile import WIRE_KINDS, machine
+from factorbus.solver.kernels.jit.compile import WIRE_KINDS, code_environment
 
 _LIBRARIES = ("scipy", "scikit-sparse")  # besides those that compile kernels
 
@@ -15,7 +15,7 @@ _LIBRARIES = ("scipy", "scikit-sparse")  # besides those that compile kernels
 @cache
 def present_build() -> Mapping[str, str]:
     """Its parts: `sources` (a hash), `processor`, `versions`, `flags`.  Equal builds make equal bits of equal steps."""
-    parts = machine()
+    parts = code_environment()
     versions = ", ".join([parts["versions"], *(f"{name} {_version(name)}" for name in _LIBRARIES)])
     return MappingProxyType({"sources": _sources(), **parts, "versions": versions})
 

@@ -22,32 +22,28 @@ from factorbus.solver.report import StepReport
 from factorbus.solver.solver import Solver
 
 
-def is_sound(changed: I64, graph: Graph, report: StepReport) -> bool:
-    """Whether the last step, which `changed` these variables, left them and χ² within bounds."""
-    return find_escaped(changed, graph.places) < 0 and math.isfinite(report.chi2) and math.isfinite(report.chi2_before)
-
-
 def check_step(solver: Solver, report: StepReport) -> None:
     """Raises Diverged if the last step of `solver`, which gave `report`, left anything out of bounds."""
-    changed, graph = solver.pick_changed()
-    if is_sound(changed, graph, report):
-        return
-    v = find_escaped(changed, graph.places)
-    if v < 0:
-        raise errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
-    kind, start, key = (
-        VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])],
-        int(graph.var[v, at.V_AT]),
-        int(graph.keys[v]),
-    )
-    value = graph.values[start : start + kind.size]
-    seen = float(value[np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))[0]])
-    raise errors.Diverged(f"{kind} {errors.printed(key)}", seen, MOST_NUMBER, key)
+    if (diverged := find_diverged(*solver.pick_changed(), report)) is not None:
+        raise diverged
+
+
+def find_diverged(changed: I64, graph: Graph, report: StepReport) -> errors.Diverged | None:
+    """What the last step, which `changed` these variables, left out of bounds: one of them, or χ²."""
+    v = int(find_escaped(changed, graph.array_table))
+    if v >= 0:
+        kind, start = VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])], int(graph.var[v, at.V_AT])
+        key, value = int(graph.keys[v]), graph.values[start : start + kind.size]
+        seen = float(value[np.flatnonzero(~(np.abs(value) <= MOST_NUMBER))[0]])
+        return errors.Diverged(f"{kind} {errors.printed(key)}", seen, MOST_NUMBER, key)
+    if math.isfinite(report.chi2) and math.isfinite(report.chi2_before):
+        return None
+    return errors.Diverged("χ²", max(report.chi2, report.chi2_before), math.inf)
 
 
 def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:
     """Whether all numbers are of usual sizes, but for those of the first so many variables and factors."""
-    return bool(are_usual(variables, factors, solver._graph.places))
+    return bool(are_usual(variables, factors, solver._graph.array_table))
 
 
 def unstage(solver: Solver) -> None:

@@ -22,8 +22,8 @@ class StepReport(NamedTuple):
     changed      variables whose values differ from before, the new ones included
     relinearized linearization points that were moved, counted once per iteration
     eliminated   variables eliminated, counted once per factorization
-    inactive       sights without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
-                 linearized); `Solver.inactive` tells which and why
+    inactive       observations without a pixel, and so without weight, at the estimate (mode "bayes-tree": where it is
+                 linearized); `Solver.inactive` says which and why
     nnz_r, flops of one factorization; damping: Levenberg-Marquardt's at the end (0: pure Gauss-Newton)
     converged    a full Gauss-Newton step from the estimate would not lower χ² by more than `Options.converged_share` of
                  it, in the mode "bayes-tree" by a bound; in the others the last iteration did not by more than the
@@ -54,11 +54,11 @@ class StepReport(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain types."""
-        told = self._asdict()
-        told["phases_ms"] = dict(self.phases_ms)
+        shown = self._asdict()
+        shown["phases_ms"] = dict(self.phases_ms)
         if self.compiled_ms is None:
-            del told["compiled_ms"]
-        return told
+            del shown["compiled_ms"]
+        return shown
 
 
 class PhaseShares(Mapping[str, float]):

@@ -1,23 +1,22 @@
 """The solver of one map: batches of variables and factors in, the least-squares estimate out, step by step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.changes.convert_to_points import find_convertible, pick_features, with_points
+from factorbus.solver.changes.convert_to_points import find_convertible
 from factorbus.solver.changes.edited import edited
-from factorbus.solver.changes.in_place import try_in_place
-from factorbus.solver.changes.requested import ChangeLike, Edits, collect, unchanged
+from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.source import CovarianceSource
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.admission import admit
+from factorbus.solver.graph.columns import Columns
 from factorbus.solver.graph.factor_graph import Graph
-from factorbus.solver.graph.groups import Addition, BatchLike, FactorGroup, Group
-from factorbus.solver.graph.joints import check_joints, find_apart
-from factorbus.solver.graph.staging import Staging
+from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
+from factorbus.solver.graph.joints import find_apart
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -39,7 +38,7 @@ class Solver:
     covariances     R of the last step, for covariances: `CovarianceSource`
     """
 
-    NOT_KEPT = ("_options", "_staging", "covariances")
+    NOT_KEPT = ("_options", "covariances")
 
     def __init__(self, options: Options | None = None) -> None:
         self._options = options or Options()
@@ -48,7 +47,6 @@ class Solver:
         self._graph = Graph()
         steps = TreeSteps if mode_named(self._options.mode).tree else IncrementalSteps
         self._stepper: Stepper = steps(self._graph, self._options)
-        self._staging = Staging(self._graph)
         self.covariances = CovarianceSource(self._graph, self._stepper)
 
     @property
@@ -61,19 +59,12 @@ class Solver:
         """Factors, the staged ones included."""
         return int(self._graph.counts[at.FACTORS])
 
-    def stage(self, batch: BatchLike) -> int:
+    def stage(self, batch: BatchLike | Columns) -> int:
         """Check `batch`, take it in, and give values to its variables that have none; gives the id of its first factor.
 
         The next step solves for it.  Raises the errors of `admission.admit`; nothing has changed then.
         """
-        return self._staging.stage(batch)
-
-    def try_stage(self, raw: bytes, groups: I64) -> int | None:
-        """As `stage`, for a small batch whose columns lie in `raw`; None: nothing was done, `stage` says why.
-
-        groups (n, layout.G_WIDTH): where they lie, as `kernels/model/layout.py` says.  Offsets are not checked.
-        """
-        return self._staging.try_stage(raw, groups)
+        return admit(self._graph, batch)
 
     def step(self, settle: bool = False) -> StepReport:
         """Solve for all that was staged since the last step; with `settle`, until it has converged.
@@ -95,7 +86,7 @@ class Solver:
         return self._graph.variables(self._stepper.changed())
 
     def pick_changed(self) -> tuple[I64, Graph]:
-        """What `changed` tells of as indices of variables, ascending, and the arenas to look them up in, to be read."""
+        """What `changed` lists, as indices of variables, ascending, and the arenas to look them up in, to be read."""
         return self._stepper.changed(), self._graph
 
     def chi2(self) -> float:
@@ -114,52 +105,6 @@ class Solver:
         """Keys of the features whose linearity index is below this: as points they are as good Gaussians.  MATH §3.3"""
         return self._graph.keys[find_convertible(self._graph, below)]
 
-    def with_points(self, keys: I64) -> tuple["Solver", StepReport]:
-        """A solver in which these features are points, under their keys, and its first step; this one stays as it is.
-
-        Later sights of them may still be sent as `idp_seen`.  Raises UnknownVariable, KindMismatch, and as `step` does.
-        """
-        made = self._taken_over(with_points(self._graph, pick_features(self._graph, keys)))
-        return made, made._stepper.resume(False)
-
-    def with_changes(
-        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
-    ) -> tuple["Solver", int, StepReport, dict[str, int]]:
-        """A solver of the same map with `changes` made, in their order, and then `batch` added; this one stays.
-
-        Gives it, the id of the first factor of `batch`, the report of its first step, and what was changed.  That step
-        relinearizes everything at the estimate and eliminates all anew, whatever the mode.  Nothing may be staged.
-        Raises as `changes.collect`, `stage` and `step` do.
-        """
-        edits = collect(self._graph, changes)
-        made = self._taken_over(edited(self._graph, edits))
-        check_joints(made._graph)
-        if edits.added:
-            admit(made._graph, Addition((), edits.added))
-        before = made.variable_count, made.factor_count
-        first = made._graph.next_id if batch is None else made.stage(batch)
-        new = made.variable_count - before[0], made.factor_count - before[1]
-        report = made._stepper.resume(settle)._replace(new_variables=new[0], new_factors=new[1])
-        return made, first, report, edits.counted
-
-    def try_change(
-        self, changes: Sequence[ChangeLike], batch: BatchLike | None = None, settle: bool = False
-    ) -> tuple[int, StepReport, dict[str, int]] | None:
-        """Make `changes` of factors, add `batch`, and step, in this solver: it eliminates what they touch, no more.
-
-        Gives what `with_changes` gives.  None: only that can make them, or say why not; then nothing has changed.  So
-        it is where they remove, fix, free, place or marginalize variables, where linear factors are among them, where
-        something would be free to move, with `settle`, and in modes other than "bayes-tree".  Nothing may be staged.
-        Raises as `changes.collect` and `stage` do.
-        """
-        if settle:
-            return None
-        edits: Edits = collect(self._graph, changes)
-        came = try_in_place(
-            self._graph, self._stepper, edits, lambda: self._graph.next_id if batch is None else self.stage(batch)
-        )
-        return None if came is None else (*came, edits.counted)
-
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
         """Take over the first so many variables and factors of `other`, as they are; the first step of a new solver."""
         edits = unchanged(other._graph)
@@ -169,7 +114,7 @@ class Solver:
         return self._stepper.resume(False)
 
     def inactive(self) -> list[tuple[int, str, str]]:
-        """(factor id, the factor, why) of every sight that has no pixel at the estimate, and so no weight."""
+        """(factor id, the factor, why) of every observation that has no pixel at the estimate, and so no weight."""
         return observations.inactive(self._graph)
 
     def memory_bytes(self) -> int:

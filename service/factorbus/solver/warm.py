@@ -8,7 +8,7 @@ from typing import Any
 
 from factorbus.solver import kernels
 from factorbus.solver.covariance import kernels as covariance_kernels
-from factorbus.solver.kernels.jit.compile import compiled_seconds, is_on_disk, iter_compile
+from factorbus.solver.kernels.jit.compile import compile_seconds, is_on_disk, iter_compile
 
 
 def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -> float:
@@ -17,14 +17,14 @@ def warm(progress: Callable[[str], None] | None = None, *packages: ModuleType) -
 
     `progress` is called with the name of each file of kernels before its turn.
     """
-    before = compiled_seconds()
+    before = compile_seconds()
     for package in packages or (kernels, covariance_kernels):
         for name, found in _iter_groups(package):
             if progress:
                 progress(name)
             for _ in iter_compile(*found):
                 pass
-    return compiled_seconds() - before
+    return compile_seconds() - before
 
 
 def list_missing(*packages: ModuleType) -> list[Any]:

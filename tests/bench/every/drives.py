@@ -7,9 +7,10 @@ from typing import Any
 
 from bench.replays.problems import Problem, load
 
-from factorbus.datasets import CATALOGUE, Places, locate, named
+from factorbus.datasets import CATALOGUE, Places, dataset_named, locate
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS as SIMULATED
+from factorbus.simulate import TreeSensor
 
 from . import hard
 from .motion import PLANE, SPACE
@@ -55,7 +56,7 @@ WORLDS = {
         World("manhattan", partial(_simulated, "manhattan")),
         World("city_trees", partial(_simulated, "city_trees")),
         World("sphere", partial(_simulated, "sphere")),
-        World("bearing_range", partial(_simulated, "city_trees", sensor="bearing_range_se2")),
+        World("bearing_range", partial(_simulated, "city_trees", sensor=TreeSensor("bearing_range_se2"))),
         World("outliers", hard.outliers, kind="hard"),
         World("drift", hard.drift, kind="hard"),
         World("meetings_2d", partial(hard.meetings, PLANE), 400, "hard"),
@@ -79,4 +80,4 @@ def chosen(words: list[str]) -> list[World]:
 
 def is_here(world: World) -> bool:
     """Whether the data set of a world is on this machine."""
-    return world.is_drawn or locate(named(world.name, CATALOGUE), Places.of_this_machine()) is not None
+    return world.is_drawn or locate(dataset_named(world.name, CATALOGUE), Places.of_this_machine()) is not None

@@ -19,7 +19,7 @@ from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.kernels.model.retract import move
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.cholesky import Cholesky
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import Symbolic, analyze
@@ -52,7 +52,7 @@ class Judge:
     """Takes in what a solver takes in, and judges its estimates."""
 
     def __init__(self) -> None:
-        self._graph, self._blocks, self._cholesky = Graph(), Blocks(), Cholesky()
+        self._graph, self._blocks, self._cholesky = Graph(), HessianBlocks(), Cholesky()
         self._mark = self._graph.mark()
         self._symbolic: Symbolic | None = None
         self._odometry: list[int] = []

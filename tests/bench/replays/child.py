@@ -178,9 +178,9 @@ def _compiled_s(name: str) -> float:
     """Seconds spent in compiling kernels so far; a peer's process has none, and does not load Numba."""
     if not contestants.ENTRIES[name].runs_our_kernels:
         return 0.0
-    from factorbus.solver import compiled_seconds
+    from factorbus.solver import compile_seconds
 
-    return compiled_seconds()
+    return compile_seconds()
 
 
 def _paced(tell: Tell, every_s: float = 0.25) -> Tell:

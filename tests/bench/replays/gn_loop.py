@@ -14,7 +14,7 @@ from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import move
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.cholesky import Cholesky
 from factorbus.solver.sparse.ordering import order
 from factorbus.solver.sparse.symbolic import analyze
@@ -28,7 +28,7 @@ class GaussNewtonAtLoops:
     """What is on the clock: taking in the step, solving if it closes a loop, a copy of all values."""
 
     def __init__(self) -> None:
-        self._graph, self._blocks, self._cholesky = Graph(), Blocks(), Cholesky()
+        self._graph, self._blocks, self._cholesky = Graph(), HessianBlocks(), Cholesky()
         self._mark = self._graph.mark()
         self._batch = Batch()
         self._groups: list[Group] = []

@@ -33,7 +33,7 @@ _FIRST_STEP = """
 import sys
 import numpy as np
 from factorbus.proto.messages import Batch, Factors, Variables
-from factorbus.solver import Options, Solver, compiled_seconds
+from factorbus.solver import Options, Solver, compile_seconds
 ends = np.array([[0, 1], [1, 2], [0, 2]])
 measured = np.array([[1.0, 0.0, 0.1], [1.0, 0.0, 0.1], [2.1, 0.1, 0.2]])
 information = np.tile([100.0, 0.0, 0.0, 100.0, 0.0, 400.0], (3, 1))
@@ -42,7 +42,7 @@ solver = Solver(Options(mode=sys.argv[1]))
 batch = Batch((start, Variables("se2", np.array([1, 2]))), (Factors("between_se2", ends, measured, information),))
 solver.stage(batch)
 assert solver.step().iterations > 0
-print(compiled_seconds())
+print(compile_seconds())
 """
 _STARTS = 5
 _STEP = "tree_step"

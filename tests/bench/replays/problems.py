@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from factorbus.datasets import CATALOGUE, Places, find, locate, named
+from factorbus.datasets import CATALOGUE, Places, dataset_named, find, locate
 from factorbus.formats import read
 from factorbus.proto.messages import Batch
 from factorbus.simulate import WORLDS
@@ -49,7 +49,7 @@ class Problem:
     @property
     def steps(self) -> int:
         """How many a replay has: one a pose."""
-        return self.poses or named(self.name, CATALOGUE).poses
+        return self.poses or dataset_named(self.name, CATALOGUE).poses
 
     def shortened(self, poses: int) -> "Problem":
         """The first `poses` poses of it; their optimum is not a published one."""
@@ -78,7 +78,7 @@ def choose(quick: bool, of: Sequence[Problem] = PAPER) -> tuple[list[Problem], s
     A data set is looked for by name: in FACTORBUS_DATASETS, in the cache, in the gtsam wheel.
     """
     places = Places.of_this_machine()
-    there = [problem for problem in of if locate(named(problem.name, CATALOGUE), places)]
+    there = [problem for problem in of if locate(dataset_named(problem.name, CATALOGUE), places)]
     missing = [problem.name for problem in of if problem not in there]
     note = f"Not on this machine: {', '.join(missing)} (factorbus datasets fetch --all)." if missing else ""
     if quick:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from factorbus.idp.minimal import NewRows, covariance_factors
+from factorbus.idp.minimal import FeatureRows, covariance_factors
 from factorbus.idp.new_features import Seen, see
 from factorbus.proto import segments
-from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, rows_size
+from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, new_rows_size
 from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.problems import BadMessage, TooLarge
@@ -33,7 +33,7 @@ def done(shard: Shard, ask: Ask) -> ShardDone:
         found = covariance_factors(ask.sighting, seen, first, last)
         return ShardDone(first, last, y, turn=found.turn, own=found.own, U=found.U, S=found.S)
     if ask.form == "half":
-        half = NewRows(ask.sighting, seen, first).half(first, last)
+        half = FeatureRows(ask.sighting, seen, first).half(first, last)
         return ShardDone(first, last, y, cross=half.cross, blocks=half.blocks)
     if ask.segment is not None and _stored(shard, ask, ask.segment, seen):
         return ShardDone(first, last, y, stored=True)
@@ -45,17 +45,17 @@ def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
     n, m = ask.sighting.count, ask.sighting.width
     width, rows = m + FEATURE * n, FEATURE * (shard.last - shard.first)
     start = 8 * FEATURE * shard.first * width
-    out = segments.try_array(segment, rows_size(n, m), start, (rows, width)) if rows else None
+    out = segments.try_array(segment, new_rows_size(n, m), start, (rows, width)) if rows else None
     if out is None:
         return False
-    NewRows(ask.sighting, seen).rows(shard.first, shard.last, out)
+    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, out)
     return True
 
 
 def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
     n, m = ask.sighting.count, ask.sighting.width
-    if (size := rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
+    if (size := new_rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
         raise TooLarge("the answer, which cannot go to shared memory,", size, ANSWER_LIMITS.max_bytes, "bytes")
     rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
-    NewRows(ask.sighting, seen).rows(shard.first, shard.last, rows)
+    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, rows)
     return rows

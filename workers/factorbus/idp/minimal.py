@@ -45,13 +45,13 @@ def covariance(P: F64, sighting: Sighting, seen: Seen, out: F64 | None = None) -
     m, n = len(P), len(seen.y)
     after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
     after[:m, :m] = P
-    new = NewRows(sighting, seen)
+    new = FeatureRows(sighting, seen)
     count = new.multiplications + new.rows(0, n, after[m:])
     kernels.mirror(m, after)
     return Counted(after, count)
 
 
-class NewRows:
+class FeatureRows:
     """What the new rows are made of: O(m + n) numbers, from which any rows can be had.
 
     first: rows of features before this one are not asked for, nor, by the upper half, blocks with them.

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
-from factorbus.workers.config import WorkerConfig, checked_config
+from factorbus.workers.config import WorkerConfig, checked_worker_config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,7 +41,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _config(options: argparse.Namespace) -> WorkerConfig:
     connect = tuple(options.connect) if options.connect else WorkerConfig().connect
-    return checked_config(WorkerConfig(connect, options.name, options.slots, options.zenoh, not options.no_warm))
+    return checked_worker_config(WorkerConfig(connect, options.name, options.slots, options.zenoh, not options.no_warm))
 
 
 if __name__ == "__main__":

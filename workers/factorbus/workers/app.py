@@ -22,7 +22,7 @@ from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
 from factorbus.workers import jobs
-from factorbus.workers.config import BadWorkerConfig, WorkerConfig, checked_config
+from factorbus.workers.config import BadWorkerConfig, WorkerConfig, checked_worker_config
 from factorbus.workers.heap import keep_freed_memory
 
 log = logging.getLogger(__name__)
@@ -39,16 +39,16 @@ def work(config: WorkerConfig, on_ready: Callable[[str], None], stop: threading.
 
     `on_ready` gets the worker's name once it can be found.  Raises BadWorkerConfig, BadName.
     """
-    checked_config(config)
+    checked_worker_config(config)
     keep_freed_memory()
-    from factorbus.solver import compiled_seconds, warm, why_stock_numba
+    from factorbus.solver import compile_seconds, warm, why_stock_numba
 
     if why := why_stock_numba():
         log.warning("kernels are compiled by Numba as it is, which takes longer, and take longer themselves: %s", why)
     if config.warm:
         from factorbus.idp import warm_idp
 
-        seconds = sum(make(lambda name: _announce(name, compiled_seconds())) for make in (warm, warm_idp))
+        seconds = sum(make(lambda name: _announce(name, compile_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
     sys.setswitchinterval(0.0005)
     session = _open(config, stop)

@@ -30,7 +30,7 @@ class WorkerConfig:
     warm: bool = True  # compile every kernel before taking the first job
 
 
-def checked_config(config: WorkerConfig) -> WorkerConfig:
+def checked_worker_config(config: WorkerConfig) -> WorkerConfig:
     """`config`, if it can work.  Raises BadWorkerConfig, BadEndpoint, BadName."""
     if not config.connect:
         raise BadWorkerConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')

@@ -11,15 +11,11 @@ from factorbus.cli.output.advice import advising, of_what_is_there
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import FAILED, OK, input_file
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from, ratio_to
-from factorbus.cli.process.options import (
-    Number,
-    asks_map,
-    file_argument,
-)
+from factorbus.cli.process.options import MapAddress, Number, asks_map, file_argument
 from factorbus.cli.process.reading import read_graph
 from factorbus.wording import counted
 
-_SHOWN = 20  # more false factors than these are told with --json only
+_SHOWN = 20  # more false factors than these are listed with --json only
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -51,9 +47,7 @@ _probability = click.option(
 @click.option("--joint", "blocks", flag_value="joint", help="Of all KEYS together, one matrix.")
 @click.option("--relative", "blocks", flag_value="relative", help="Of the second as seen from the first, pair by pair.")
 @click.option("--last", "blocks", flag_value="last", help="Of the pose that was inserted last.")
-def covariance_command(
-    name: str, keys: tuple[str, ...], blocks: str | None, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
-) -> int:
+def covariance_command(address: MapAddress, keys: tuple[str, ...], blocks: str | None, as_json: bool) -> int:
     """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
 
     \b
@@ -71,8 +65,8 @@ def covariance_command(
         raise click.UsageError(
             f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
         )
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        found = asked.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, timeout_s).result()
+    with _map(address) as joined:
+        found = joined.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, address.timeout_s).result()
     if found.covariance is not None:
         names = [format_symbol(int(key)) for key in found.keys]
         if as_json:
@@ -100,9 +94,7 @@ def covariance_command(
 @asks_map
 @file_argument("candidates")
 @_probability
-def gate_command(
-    name: str, candidates: Path, probability: float, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
-) -> int:
+def gate_command(address: MapAddress, candidates: Path, probability: float, as_json: bool) -> int:
     """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
     The file is g2o, TORO, iSAM or SLAM++ text. Their keys are those of the map; vertices in the file are not looked at.
@@ -112,8 +104,8 @@ def gate_command(
     """
     read = _read(candidates)
     factors = read.batch.factors
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        found = asked.uncertainty.ask.gate(factors, probability, timeout_s).result()
+    with _map(address) as joined:
+        found = joined.uncertainty.ask.gate(factors, probability, address.timeout_s).result()
     columns = (found.distance.tolist(), found.threshold.tolist(), found.plausible.tolist())
     rows = [
         {"factor": told, "distance": distance, "threshold": allowed, "plausible": plausible}
@@ -135,7 +127,7 @@ def gate_command(
 @command.command("gain")
 @asks_map
 @file_argument("candidates")
-def gain_command(name: str, candidates: Path, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def gain_command(address: MapAddress, candidates: Path, as_json: bool) -> int:
     """How much information each of the factors in the file CANDIDATES would bring by itself, in nats, the most first.
 
     \b
@@ -143,8 +135,8 @@ def gain_command(name: str, candidates: Path, endpoint: str, zenoh: str, timeout
     """
     read = _read(candidates)
     factors = read.batch.factors
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        found = asked.uncertainty.ask.gain(factors, timeout_s).result()
+    with _map(address) as joined:
+        found = joined.uncertainty.ask.gain(factors, address.timeout_s).result()
     rows = sorted(zip(_described(factors), found.gain.tolist(), strict=True), key=lambda row: -row[1])
     if as_json:
         content = [{"factor": told, "gain": gain} for told, gain in rows]
@@ -159,9 +151,7 @@ def gain_command(name: str, candidates: Path, endpoint: str, zenoh: str, timeout
 @click.argument("what")
 @click.option("--variable", "only", flag_value="variable", help="WHAT is a variable: of a key without a letter, 7.")
 @click.option("--factor", "only", flag_value="factor", help="WHAT is the id of a factor.")
-def why_command(
-    name: str, what: str, only: str | None, endpoint: str, zenoh: str, timeout_s: float, as_json: bool
-) -> int:
+def why_command(address: MapAddress, what: str, only: str | None, as_json: bool) -> int:
     """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
 
     Residuals and χ² are at the estimate. The leverage of a factor is the trace of its part of the hat matrix,
@@ -169,10 +159,10 @@ def why_command(
     pivots of a variable are those of the Cholesky factor R, and Λ is the information matrix: R²ᵢᵢ/Λᵢᵢ is 1 where no
     variable that was eliminated before depends on it, and near 0 where its estimate rests on those.
 
-    By how much χ² falls without a factor is told to first order, "about", and is never more than all of χ².
+    By how much χ² falls without a factor is given to first order, "about", and is never more than all of χ².
 
     A number is the factor with this id, and where the map has a variable whose key is that number without a letter,
-    both are told, unless --variable or --factor says which is meant.
+    both are shown, unless --variable or --factor says which is meant.
 
     \b
     factorbus ask why warehouse x12
@@ -181,8 +171,8 @@ def why_command(
     """
     if only == "factor" and not what.isdecimal():
         raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        told = _accounts(asked, what, only)
+    with _map(address) as joined:
+        told = _accounts(joined, what, only)
     if as_json:
         content = {"revision": told[0].revision, "variable": {}, "factor": {}, "step": told[0].step}
         for found in told:
@@ -194,18 +184,18 @@ def why_command(
     return OK
 
 
-def _accounts(asked: Any, what: str, only: str | None) -> list[Any]:
+def _accounts(joined: Any, what: str, only: str | None) -> list[Any]:
     """Of the variable, of the factor, or of both where WHAT may be either.  Raises Refused."""
     from factorbus.client import Refused
 
     if not what.isdecimal() or only == "variable":
-        return [asked.uncertainty.why(what)]
+        return [joined.uncertainty.why(what)]
     if only == "factor":
-        return [asked.uncertainty.why(factor=int(what))]
+        return [joined.uncertainty.why(factor=int(what))]
     told, refused = [], None
     for how in ({"key": what}, {"factor": int(what)}):
         try:
-            told.append(asked.uncertainty.why(**how))
+            told.append(joined.uncertainty.why(**how))
         except Refused as problem:
             if problem.code not in ("unknown_variable", "unknown_factor"):
                 raise
@@ -230,7 +220,7 @@ def _tell(what: str, found: Any) -> None:
 @command.command("chi2")
 @asks_map
 @click.option("--batch", is_flag=True, help="Also of the optimum found from scratch, which takes a while.")
-def chi2_command(name: str, batch: bool, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def chi2_command(address: MapAddress, batch: bool, as_json: bool) -> int:
     """How well the estimate fits: χ² = Σ rᵀΩr, with --batch over that of the optimum found from scratch.
 
     That is the lowest of three: from the map's own values, from composed odometry, from averaged rotations. Where the
@@ -241,8 +231,8 @@ def chi2_command(name: str, batch: bool, endpoint: str, zenoh: str, timeout_s: f
     factorbus ask chi2 warehouse
     factorbus ask chi2 warehouse --batch
     """
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        found = asked.chi2(batch, timeout_s)
+    with _map(address) as joined:
+        found = joined.chi2(batch, address.timeout_s)
     if as_json:
         content = {"revision": found.revision, "chi2": found.chi2}
         if found.batch is not None:
@@ -259,7 +249,7 @@ def chi2_command(name: str, batch: bool, endpoint: str, zenoh: str, timeout_s: f
         ratio = ratio_to(found.chi2, found.batch)
         rows.append(("χ² / batch", ratio if found.batch_converged else f"{ratio}  (batch: {NOT_CONVERGED})"))
     if found.notice is not None:
-        rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {name}")))
+        rows.append((found.notice.code, found.notice.message.replace("adopt MAP", f"adopt {address.name}")))
     table(rows, title=f"At revision {found.revision}")
     return OK
 
@@ -277,15 +267,7 @@ def chi2_command(name: str, batch: bool, endpoint: str, zenoh: str, timeout_s: f
     help="With which a right measurement is kept.",
 )
 def repair_command(
-    name: str,
-    factors: tuple[int, ...],
-    applied: bool,
-    loss: str,
-    probability: float,
-    endpoint: str,
-    zenoh: str,
-    timeout_s: float,
-    as_json: bool,
+    address: MapAddress, factors: tuple[int, ...], applied: bool, loss: str, probability: float, as_json: bool
 ) -> int:
     """Which of the factors FACTORS (ids), or of all that close loops, are false. Changes nothing without --apply.
 
@@ -296,11 +278,11 @@ def repair_command(
     """
     from factorbus.client import Changes
 
-    with _map(name, endpoint, zenoh, timeout_s) as asked:
-        found = asked.repair(factors or None, probability=probability, timeout_s=timeout_s)
+    with _map(address) as joined:
+        found = joined.repair(factors or None, probability=probability, timeout_s=address.timeout_s)
         if applied and found.factors.size:
             changes = Changes().repair(found, (loss, 1.0) if loss else None)
-            asked.change(changes, settle=True, timeout_s=timeout_s)
+            joined.change(changes, settle=True, timeout_s=address.timeout_s)
     rows = list(zip(found.factors.tolist(), found.distance.tolist(), strict=True))
     if as_json:
         content = {"revision": found.revision, "suspects": found.suspects, "before": found.before, "after": found.after}
@@ -370,13 +352,9 @@ def _described(factors: tuple[Any, ...]) -> list[str]:
 
 
 @contextmanager
-def _map(name: str, endpoint: str, zenoh: str, timeout_s: float) -> Iterator[Any]:
+def _map(address: MapAddress) -> Iterator[Any]:
     """The map, joined only if it is there."""
-    from factorbus.cli.process.bus import open_bus
+    from factorbus.cli.process.bus import joined_map
 
-    with (
-        advising(of_what_is_there(name)),
-        open_bus(endpoint, "ask", zenoh, timeout_s) as bus,
-        bus.map(name, mirror=False, create=False) as joined,
-    ):
+    with advising(of_what_is_there(address.name)), joined_map(address, "ask") as joined:
         yield joined

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from factorbus.cli.output.console import document, note
+from factorbus.cli.output.console import document, print_note
 from factorbus.cli.output.exits import FAILED, OK, Stopped
 from factorbus.cli.process.options import json_option
 
@@ -60,7 +60,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     names = BENCHES if name == "all" else (name,)
     codes, results = {}, {}
     for each in names:
-        note(f"bench {each}")
+        print_note(f"bench {each}")
         ran = subprocess.run(
             [sys.executable, str(folder / _file(each)), *(["--json"] if as_json else []), *options],
             stdout=subprocess.PIPE if as_json else None,
@@ -74,7 +74,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
         document(results if name == "all" else results[name])
     missed = [each for each, code in codes.items() if code]
     if missed:
-        note(f"bench: {', '.join(missed)} failed or missed a target")
+        print_note(f"bench: {', '.join(missed)} failed or missed a target")
     return FAILED if missed else OK
 
 

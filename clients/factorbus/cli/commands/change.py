@@ -11,7 +11,7 @@ from factorbus.cli.output.advice import advising_changes
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
 from factorbus.cli.output.starts import optimum_from
-from factorbus.cli.process.options import Number, asks_map
+from factorbus.cli.process.options import MapAddress, Number, asks_map
 
 F = TypeVar("F", bound=Callable[..., Any])
 _COUNTS = ("removed_variables", "removed_factors", "edited_factors", "fixed_variables", "freed_variables")
@@ -42,7 +42,7 @@ def _changing(command: F) -> F:
 @_changing
 @click.argument("what", nargs=-1, required=True)
 @click.option("--alone", is_flag=True, help="Refuse if any other factor is on the variables.")
-def remove_command(name: str, what: tuple[str, ...], alone: bool, **how: Any) -> int:
+def remove_command(address: MapAddress, what: tuple[str, ...], alone: bool, **how: Any) -> int:
     """Remove factors (ids: 17) and variables (keys: x12), these with every factor on them.
 
     \b
@@ -57,7 +57,7 @@ def remove_command(name: str, what: tuple[str, ...], alone: bool, **how: Any) ->
         changes.remove_factors(ids)
     if names:
         changes.remove_variables(*names, alone=alone)
-    return _make(name, changes, **how)
+    return _make(address, changes, **how)
 
 
 @command.command("loss")
@@ -65,7 +65,7 @@ def remove_command(name: str, what: tuple[str, ...], alone: bool, **how: Any) ->
 @click.argument("loss")
 @click.argument("scale", type=Number())
 @click.argument("factors", nargs=-1, required=True, type=int)
-def loss_command(name: str, loss: str, scale: float, factors: tuple[int, ...], **how: Any) -> int:
+def loss_command(address: MapAddress, loss: str, scale: float, factors: tuple[int, ...], **how: Any) -> int:
     """Give factors a robust LOSS of a SCALE in standard deviations, or take it away with `none`.
 
     \b
@@ -74,14 +74,14 @@ def loss_command(name: str, loss: str, scale: float, factors: tuple[int, ...], *
     """
     from factorbus.client import Changes
 
-    return _make(name, Changes().loss(factors, "" if loss == "none" else loss, scale), **how)
+    return _make(address, Changes().loss(factors, "" if loss == "none" else loss, scale), **how)
 
 
 @command.command("weigh")
 @_changing
 @click.argument("weight", type=Number())
 @click.argument("factors", nargs=-1, required=True, type=int)
-def weigh_command(name: str, weight: float, factors: tuple[int, ...], **how: Any) -> int:
+def weigh_command(address: MapAddress, weight: float, factors: tuple[int, ...], **how: Any) -> int:
     """Multiply the information of factors by WEIGHT: below 1 they count for less.
 
     \b
@@ -89,13 +89,13 @@ def weigh_command(name: str, weight: float, factors: tuple[int, ...], **how: Any
     """
     from factorbus.client import Changes
 
-    return _make(name, Changes().weigh(factors, weight), **how)
+    return _make(address, Changes().weigh(factors, weight), **how)
 
 
 @command.command("fix")
 @_changing
 @click.argument("keys", nargs=-1, required=True)
-def fix_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
+def fix_command(address: MapAddress, keys: tuple[str, ...], **how: Any) -> int:
     """Hold variables where they are.
 
     \b
@@ -103,13 +103,13 @@ def fix_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
     """
     from factorbus.client import Changes
 
-    return _make(name, Changes().fix(*keys), **how)
+    return _make(address, Changes().fix(*keys), **how)
 
 
 @command.command("free")
 @_changing
 @click.argument("keys", nargs=-1, required=True)
-def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
+def free_command(address: MapAddress, keys: tuple[str, ...], **how: Any) -> int:
     """Estimate fixed variables again.
 
     \b
@@ -117,12 +117,12 @@ def free_command(name: str, keys: tuple[str, ...], **how: Any) -> int:
     """
     from factorbus.client import Changes
 
-    return _make(name, Changes().free(*keys), **how)
+    return _make(address, Changes().free(*keys), **how)
 
 
 @command.command("adopt")
 @asks_map
-def adopt_command(name: str, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def adopt_command(address: MapAddress, as_json: bool) -> int:
     """Put the map into the optimum found from scratch, if that is below its χ² by more than 1 %; and settle it.
 
     One step, as any change kept in the journal. Variables that came since the optimum was asked for go along with
@@ -138,12 +138,12 @@ def adopt_command(name: str, endpoint: str, zenoh: str, timeout_s: float, as_jso
     from factorbus.client import connect as open_bus
 
     with (
-        open_bus(endpoint, client="change", zenoh=zenoh, timeout_s=timeout_s) as bus,
-        bus.map(name, mirror=False, create=False) as joined,
+        open_bus(address.endpoint, client="change", zenoh=address.zenoh, timeout_s=address.timeout_s) as bus,
+        bus.map(address.name, mirror=False, create=False) as joined,
     ):
-        found = joined.chi2(batch=True, values=True, timeout_s=timeout_s)
+        found = joined.chi2(batch=True, values=True, timeout_s=address.timeout_s)
         better = found.notice is not None
-        accepted = joined.change(Changes().adopt(found), settle=True, timeout_s=timeout_s) if better else None
+        accepted = joined.change(Changes().adopt(found), settle=True, timeout_s=address.timeout_s) if better else None
     revision = found.revision if accepted is None else accepted.revision
     chi2 = found.chi2 if accepted is None else accepted.report.get("chi2")
     if as_json:
@@ -164,7 +164,7 @@ def adopt_command(name: str, endpoint: str, zenoh: str, timeout_s: float, as_jso
 @command.command("fork")
 @asks_map
 @click.argument("new")
-def fork_command(name: str, new: str, endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> int:
+def fork_command(address: MapAddress, new: str, as_json: bool) -> int:
     """Make a map NEW that begins as NAME is now, on the same service: to try something out, and to drop it.
 
     Where the service keeps a journal, the new map is kept as well. Where access control is on, ask as an operator.
@@ -176,28 +176,24 @@ def fork_command(name: str, new: str, endpoint: str, zenoh: str, timeout_s: floa
     """
     from factorbus.cli.process.bus import open_bus
 
-    with open_bus(endpoint, "change", zenoh, timeout_s) as bus:
-        row = bus.fork(name, new)
+    with open_bus(address.endpoint, "change", address.zenoh, address.timeout_s) as bus:
+        row = bus.fork(address.name, new)
     if as_json:
         document(asdict(row))
     else:
         shown = [("mode", row.mode), ("variables", f"{row.variables}"), ("factors", f"{row.factors}")]
-        table(shown, title=f"{row.name} begins at revision {row.revision} of {name}")
+        table(shown, title=f"{row.name} begins at revision {row.revision} of {address.name}")
     return OK
 
 
 command.command("merge")(_changing(merge_command))
 
 
-def _make(name: str, changes: Any, endpoint: str, zenoh: str, timeout_s: float, settle: bool, as_json: bool) -> int:
+def _make(address: MapAddress, changes: Any, settle: bool, as_json: bool) -> int:
     """Send it, and say what came of it."""
-    from factorbus.cli.process.bus import open_bus
+    from factorbus.cli.process.bus import joined_map
 
-    with (
-        advising_changes(name),
-        open_bus(endpoint, "change", zenoh, timeout_s) as bus,
-        bus.map(name, mirror=False, create=False) as joined,
-    ):
+    with advising_changes(address.name), joined_map(address, "change") as joined:
         accepted = joined.change(changes, settle=settle)
     report = accepted.report
     counted = {what: report[what] for what in _COUNTS if report.get(what)}

@@ -48,7 +48,7 @@ def command(
         )
     if robot is not None and target.suffix == ".g2o":
         raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
-    from factorbus.cli.output.console import document, note
+    from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
     _check_any(graph, target)
@@ -58,7 +58,7 @@ def command(
         about = {"source": str(source), "read": graph.account(whole=True), "files": [str(file) for file in files]}
         document({**about, "notes": list(notes), **counts})
     told = ", ".join(counted(counts[many], one) for many, one in COUNTED)
-    note(f"{', '.join(map(str, files))}: {told}")
+    print_note(f"{', '.join(map(str, files))}: {told}")
 
 
 def _check_any(graph: "GraphFile", target: Path) -> None:

@@ -11,7 +11,17 @@ from factorbus.cli.output import console as screen
 from factorbus.cli.output.exits import BAD_FILE, FAILED, OK, UNAVAILABLE, USAGE, Stopped
 from factorbus.cli.process.options import Number, json_option
 from factorbus.cli.process.stopping import interrupt_on_sigterm
-from factorbus.datasets import CATALOGUE, Dataset, DatasetProblem, Places, check, fetch, find, locate, named
+from factorbus.datasets import (
+    CATALOGUE,
+    Dataset,
+    DatasetProblem,
+    Places,
+    check_dataset,
+    dataset_named,
+    fetch_dataset,
+    find,
+    locate,
+)
 from factorbus.datasets.download import GITHUB
 
 _EXITS = {
@@ -99,28 +109,28 @@ def fetch_command(
         raise click.UsageError("wanted names, or --all for all of them")
     places = Places.of_this_machine()
     with _exit_codes():
-        chosen = _catalogue(context) if everything else [named(name, _catalogue(context)) for name in names]
+        chosen = _catalogue(context) if everything else [dataset_named(name, _catalogue(context)) for name in names]
     failures: list[Stopped] = []
     rows = []
     with interrupt_on_sigterm():
         for dataset in chosen:
             try:
                 with _exit_codes(), _bars(dataset.name) as watch:
-                    path = fetch(dataset, places.cache, wheel=places.wheel, watch=watch, **how)
+                    path = fetch_dataset(dataset, places.cache, wheel=places.wheel, watch=watch, **how)
                 rows.append({"name": dataset.name, "path": str(path)})
                 if not as_json:
                     click.echo(str(path))
             except Stopped as stopped:
                 if len(chosen) == 1:
                     raise
-                screen.note(f"factorbus: {stopped.message} [{stopped.code}]")
+                screen.print_note(f"factorbus: {stopped.message} [{stopped.code}]")
                 problem = {"code": stopped.code, "message": stopped.message, "detail": stopped.detail}
                 rows.append({"name": dataset.name, "problem": problem})
                 failures.append(stopped)
     if as_json:
         screen.document({"datasets": rows})
     if failures:
-        screen.note(f"{len(failures)} of {len(chosen)} could not be fetched")
+        screen.print_note(f"{len(failures)} of {len(chosen)} could not be fetched")
     return failures[0].exit_code if failures else OK
 
 
@@ -139,7 +149,7 @@ def check_command(context: click.Context, names: tuple[str, ...], as_json: bool)
     """
     places = Places.of_this_machine()
     with _exit_codes():
-        chosen = [named(name, _catalogue(context)) for name in names] or _catalogue(context)
+        chosen = [dataset_named(name, _catalogue(context)) for name in names] or _catalogue(context)
         rows = [_judged(dataset, places) for dataset in chosen]
     if as_json:
         screen.document({"good": not any(row["state"] == "bad" for row in rows), "datasets": rows})
@@ -163,7 +173,7 @@ def path_command(context: click.Context, name: str) -> None:
     """
     with _exit_codes():
         path = find(name, Places.of_this_machine(), _catalogue(context))
-        dataset = named(name, _catalogue(context))
+        dataset = dataset_named(name, _catalogue(context))
     if path is None:
         raise Stopped("not_found", f"{dataset.name} is not on this machine: factorbus datasets fetch {dataset.name}")
     click.echo(str(path))
@@ -256,7 +266,7 @@ def _judged(dataset: Dataset, places: Places) -> dict[str, Any]:
     path: Path = place.path
     if place.where == "wheel":  # located by its checksum
         return {"name": dataset.name, "state": "good", "path": str(path), "says": f"good source: {path}"}
-    verdict = check(dataset, path)
+    verdict = check_dataset(dataset, path)
     says = f"good: {path}"
     if not verdict.good:
         says = f"BAD: {path} has SHA-256 {verdict.seen}, wanted {verdict.wanted}; fetch it again"

@@ -75,27 +75,27 @@ def command(ctx: click.Context, as_json: bool, plot: Path | None, **asked: Any) 
     if plot is None:
         plot = Path("out") / "demo.png"
         plot.parent.mkdir(exist_ok=True)
-    result = demo(DemoRequest(plot=plot, **asked))
+    result = run_demo(DemoRequest(plot=plot, **asked))
     if as_json:
         screen.document(result)
     else:
         screen.table(_rows(result), title=f"{result['world']}, {counted(result['poses'], 'pose')}")
 
 
-def demo(request: DemoRequest) -> dict[str, Any]:
+def run_demo(request: DemoRequest) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
     from factorbus.cli.demo.ground_truth import World
-    from factorbus.cli.driving.picture import course_of, draw
+    from factorbus.cli.driving.picture import draw, history_of
     from factorbus.cli.driving.remote import RemoteMap
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.children import STARTING, child, service, worker
     from factorbus.cli.process.stopping import interrupt_on_sigterm
     from factorbus.client import connect
 
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note(STARTING)
-        solver, endpoint = stack.enter_context(service(say=note))
+        print_note(STARTING)
+        solver, endpoint = stack.enter_context(service(say=print_note))
         names = [f"worker{number}" for number in range(1, request.workers + 1)]
         workers = [stack.enter_context(worker(endpoint, name)) for name in names]
         bus = stack.enter_context(connect(endpoint, client="viewer"))
@@ -108,8 +108,8 @@ def demo(request: DemoRequest) -> dict[str, Any]:
         processes = {"solver": solver.pid, "robot": robot.pid} | {
             name: w.pid for name, w in zip(names, workers, strict=True)
         }
-        note(f"on {endpoint}: " + ", ".join(f"{name} {pid}" for name, pid in processes.items()))
-        note(f"driving {counted(request.poses, 'pose')}; 2,000 take five to thirty seconds")
+        print_note(f"on {endpoint}: " + ", ".join(f"{name} {pid}" for name, pid in processes.items()))
+        print_note(f"driving {counted(request.poses, 'pose')}; 2,000 take five to thirty seconds")
         _look_on(request, solver, robot, viewer)
         driven = json.loads(robot.output(timeout_s=60))
         viewer.wait_for(driven["revision"])
@@ -137,8 +137,8 @@ def demo(request: DemoRequest) -> dict[str, Any]:
     subtitle = (
         f"{counted(result['poses'], 'pose')}, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
     )
-    course = course_of(reports, compared)
-    draw(request.plot, world.batches, estimate, course, f"{request.world}, as the bus saw it", subtitle, world.truth)
+    history = history_of(reports, compared)
+    draw(request.plot, world.batches, estimate, history, f"{request.world}, as the bus saw it", subtitle, world.truth)
     return result
 
 

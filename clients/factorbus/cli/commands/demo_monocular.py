@@ -49,7 +49,7 @@ def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
     if plot is None:
         plot = Path("out") / "monocular.png"
         plot.parent.mkdir(exist_ok=True)
-    result = demo(plot=plot, **asked)
+    result = run_monocular_demo(plot=plot, **asked)
     if as_json:
         screen.document(result)
     else:
@@ -59,12 +59,12 @@ def command(as_json: bool, plot: Path | None, **asked: Any) -> None:
         )
 
 
-def demo(
+def run_monocular_demo(
     plot: Path, frames: int, points: int, features: int, noise: float, outliers: float, seed: int, workers: int
 ) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
     from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
-    from factorbus.cli.output.console import note, progress
+    from factorbus.cli.output.console import print_note, progress
     from factorbus.cli.process.children import STARTING, service, worker
     from factorbus.cli.process.stopping import interrupt_on_sigterm
     from factorbus.client import connect
@@ -74,8 +74,8 @@ def demo(
     world = monocular(frames, seed, points=points, sigma_pixel=noise, outlier_share=outliers)
     with ExitStack() as stack:
         stack.enter_context(interrupt_on_sigterm())
-        note(STARTING)
-        _, endpoint = stack.enter_context(service(say=note))
+        print_note(STARTING)
+        _, endpoint = stack.enter_context(service(say=print_note))
         for number in range(1, workers + 1):
             stack.enter_context(worker(endpoint, f"worker{number}"))
         bus = stack.enter_context(connect(endpoint, client="camera"))

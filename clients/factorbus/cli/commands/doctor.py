@@ -18,7 +18,7 @@ _SIGNS = {"ok": "[green]ok[/]", "warn": "[yellow]warn[/]", "fail": "[red]FAIL[/]
 def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
     """Look at versions, extras, SuiteSparse and its BLAS, caches, clocks, shared memory, permissions, ports, bus.
 
-    With --connect also at the services there: are they alive, is there memory left, do versions fit, who is told to
+    With --connect also at the services there: are they alive, is there memory left, do versions fit, who has to
     wait. A warning is something that works but could be better; with a failure the exit code is 1.
 
     \b
@@ -33,12 +33,12 @@ def command(endpoint: str | None, zenoh: str, as_json: bool) -> int:
         checked_endpoint(endpoint)  # before the checks of this machine, which take a while
     findings = []
     for look in CHECKS:
-        screen.note(f"looking at {look.__doc__}")
+        screen.print_note(f"looking at {look.__doc__}")
         findings.append(look())
     if endpoint:
         from factorbus.cli.doctor.service_checks import services
 
-        screen.note(f"looking at the services at {endpoint}")
+        screen.print_note(f"looking at the services at {endpoint}")
         findings += services(endpoint, zenoh)
     failed = sum(finding.state == "fail" for finding in findings)
     if as_json:

@@ -20,7 +20,7 @@ from factorbus.proto.keys import checked_name
 )
 @out_option("--out", "out", "The file.  [default: MAP.fbmap here]", "FILE")
 def command(name: str, folder: Path, out: Path | None) -> None:
-    """Copy MAP out of a service's journal into one file: every insert, clients' places, the newest snapshot.
+    """Copy MAP out of a service's journal into one file: every insert, clients' places, the newest checkpoint.
 
     Also while the service is at work: the file has the map as it was at one moment; its revision is printed. To move a
     map, `factorbus import` the file where it is to be, and drop the old one at that revision: if somebody inserted

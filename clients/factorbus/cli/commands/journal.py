@@ -46,10 +46,10 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
         counts = store.counts()
         rows.append(
             {"map": name, "mode": header.mode, "epoch": header.epoch, "revision": last.revision, **counts}
-            | {"snapshots": [saved.record for saved in store.snapshots()], "durability": header.durability}
+            | {"checkpoints": [saved.record for saved in store.checkpoints()], "durability": header.durability}
             | {"epochs": [epoch.because for epoch in header.epochs], "closed_in_order": header.clean}
             | {"builds": [{"from_record": maker.record, **maker.build} for maker in store.makers()]}
-            | {"differs": next((saved.differs for saved in store.snapshots()), "")}
+            | {"differs": next((saved.differs for saved in store.checkpoints()), "")}
         )
     if as_json:
         screen.document({"maps": rows})
@@ -61,7 +61,7 @@ def show(names: tuple[str, ...], folder: Path, as_json: bool) -> None:
 @_MAP
 @_FOLDER
 def check(names: tuple[str, ...], folder: Path) -> int:
-    """Is it sound: the database, every insert's bytes, every client's numbers, every snapshot? Exit code 1: no."""
+    """Is it sound: the database, every insert's bytes, every client's numbers, every checkpoint? Exit code 1: no."""
     sound = True
     for name in _names(folder, names):
         wrong = list(_wrong_with(folder / name))
@@ -74,15 +74,15 @@ def check(names: tuple[str, ...], folder: Path) -> int:
 
 def _wrong_with(folder: Path) -> Iterator[str]:
     """What is wrong with the journal in `folder`, also where it does not open."""
-    from factorbus.journal.snapshots import file_of, read_snapshot
+    from factorbus.journal.checkpoints import file_of, read_checkpoint
     from factorbus.proto.problems import Problem
 
     try:
         with _open(folder) as store:
             yield from store.check()
-            for saved in store.snapshots():
+            for saved in store.checkpoints():
                 try:
-                    read_snapshot(file_of(store.path.parent, saved.record))
+                    read_checkpoint(file_of(store.path.parent, saved.record))
                 except (OSError, ValueError) as error:
                     yield f"{error}; the map opens without it, and takes longer"
     except Problem as problem:

@@ -36,7 +36,7 @@ def command(endpoint: str, zenoh: str, timeout_s: float, as_json: bool) -> None:
     elif rows:
         screen.table([(row.name, _told(row)) for row in rows])
     else:
-        screen.note(f"there is no map at {endpoint} yet")
+        screen.print_note(f"there is no map at {endpoint} yet")
 
 
 def _told(row: "MapRow") -> str:

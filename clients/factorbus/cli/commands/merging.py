@@ -1,5 +1,6 @@
 """`factorbus change merge`: another map into this one."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import click
@@ -7,8 +8,22 @@ import click
 from factorbus.cli.output.advice import MERGING, advising
 from factorbus.cli.output.console import document, table
 from factorbus.cli.output.exits import OK
+from factorbus.cli.process.options import MapAddress, grouped
 
 
+@dataclass(frozen=True, slots=True)
+class MergeOptions:
+    """How OTHER goes into NAME, as typed: see the help of each."""
+
+    source: str | None
+    letters: tuple[str, ...]
+    anchors: tuple[tuple[str, str, str], ...]
+    frame: str | None
+    sigmas: str | None
+    absolute: str
+
+
+@grouped("merging", MergeOptions)
 @click.argument("other")
 @click.option("--from", "source", metavar="ENDPOINT", help="The service that has OTHER.  [default: that of --connect]")
 @click.option("--letter", "letters", multiple=True, metavar="OLD=NEW", help="Keys of OTHER get another letter: x=y.")
@@ -33,11 +48,7 @@ from factorbus.cli.output.exits import OK
     show_default=True,
     help="What OTHER knows of its own frame, beyond where it begins.",
 )
-def merge_command(
-    name: str, other: str, source: str | None, letters: tuple[str, ...], anchors: tuple[tuple[str, str, str], ...],
-    frame: str | None, sigmas: str | None, absolute: str, endpoint: str, zenoh: str, timeout_s: float, settle: bool,
-    as_json: bool,
-) -> int:  # fmt: skip
+def merge_command(address: MapAddress, other: str, merging: MergeOptions, settle: bool, as_json: bool) -> int:
     """Take all of map OTHER into NAME: its keys renamed, in NAME's frame, held by the anchors. OTHER stays as it is.
 
     All of it happens or none. One fixed pose, or one prior of a pose, is what a map has to begin with, and is left out.
@@ -50,20 +61,22 @@ def merge_command(
     """
     from factorbus.cli.process.bus import open_bus
 
+    sigmas = merging.sigmas
     how = {
-        "letters": dict(_pair(each) for each in letters),
-        "anchors": _draft(anchors, sigmas) if anchors else None,
-        "frame": _numbers("--frame", frame) if frame else None,
+        "letters": dict(_pair(each) for each in merging.letters),
+        "anchors": _draft(merging.anchors, sigmas) if merging.anchors else None,
+        "frame": _numbers("--frame", merging.frame) if merging.frame else None,
         "sigmas": _numbers("--sigmas", sigmas) if sigmas else None,
-        "absolute": absolute.replace("-", "_"),
+        "absolute": merging.absolute.replace("-", "_"),
     }
+    endpoint, zenoh, timeout_s = address.endpoint, address.zenoh, address.timeout_s
     with open_bus(endpoint, "change", zenoh, timeout_s) as bus:
         with (
-            open_bus(source or endpoint, "change", zenoh, timeout_s) as there,
+            open_bus(merging.source or endpoint, "change", zenoh, timeout_s) as there,
             there.map(other, mirror=False, create=False) as theirs,
         ):
             graph = theirs.graph(timeout_s)
-        with advising(MERGING), bus.map(name, mirror=False, create=False) as joined:
+        with advising(MERGING), bus.map(address.name, mirror=False, create=False) as joined:
             merged = joined.merge(graph, settle=settle, **how)
     _show(merged, as_json)
     return OK

@@ -65,14 +65,14 @@ def map_command(
     factorbus plot map warehouse --connect tcp/127.0.0.1:7447 --ellipses 60
     """
     from factorbus.cli.driving.picture import draw
-    from factorbus.cli.driving.plot_source import graph_of, placed, solved, spread_in
-    from factorbus.viz import Course
+    from factorbus.cli.driving.plot_source import graph_of, solved, spread_in, with_values
+    from factorbus.viz import DriveHistory
 
     drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
-    drawn = solved(drawn, on_file=connect is None) if solve else placed(drawn)
+    drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
-    draw(path, [drawn.unsolved()], drawn.graph.variables, Course(), drawn.name, drawn.about, spread=spread)
+    draw(path, [drawn.unsolved()], drawn.graph.variables, DriveHistory(), drawn.name, drawn.about, spread=spread)
     click.echo(path)
 
 
@@ -99,9 +99,9 @@ def drive_command(
 
     require("service", "factorbus plot drive")
     file = _ready(lambda: file_named(source, dialect, strict), out)
-    from factorbus.cli.driving.drive import drive
+    from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.local import LocalMap
-    from factorbus.cli.driving.picture import course_of
+    from factorbus.cli.driving.picture import history_of
     from factorbus.cli.output.console import progress
     from factorbus.solver import warm
     from factorbus.viz import drive_figure, save
@@ -109,13 +109,13 @@ def drive_command(
     warm()  # so that the first steps do not load kernels
     target = LocalMap(mode)
     with progress(Path(file.path).name, file.poses) as show:
-        driven = drive(target, file.steps(), max(file.poses // 10, 1) if every is None else every, show)
+        driven = insert_steps(target, file.steps(), max(file.poses // 10, 1) if every is None else every, show)
     reports = [step.report for step in driven.steps]
     name = Path(file.path).stem
     path = out or Path(f"{name}-drive.png")
     about = f"{counted(driven.poses, 'pose')}, {counted(driven.factors, 'factor')}, mode {reports[-1]['mode']}"
     figure = drive_figure(
-        course_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
+        history_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )
     save(figure, path, name)
     click.echo(path)

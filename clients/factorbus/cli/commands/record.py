@@ -44,7 +44,7 @@ def command(
     factorbus record warehouse --connect tcp/robot.local:7447 --out monday.mcap
     """
     require("record", "factorbus record")
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.output.exits import Stopped
     from factorbus.cli.process.bus import joined_when_there, open_bus
     from factorbus.cli.process.stopping import stop_on_signals
@@ -58,13 +58,13 @@ def command(
         joined_when_there(bus, map_name, stop.wait) as joined,
     ):
         if joined is None:
-            note(f"stopped before there was a map {map_name}; nothing is recorded")
+            print_note(f"stopped before there was a map {map_name}; nothing is recorded")
             return
         _record(joined, path, every_s, until, stop)
 
 
 def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: "Event") -> None:
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.viz.map_follower import MapFollower
     from factorbus.viz.mcap import Recording
 
@@ -75,4 +75,4 @@ def _record(joined: "Map", path: Path, every_s: float, until: int | None, stop: 
             recording.take(follower.look())
         recording.take(follower.last_look(joined.timeout_s))
     what = f"{counted(recording.deltas, 'delta')}, {counted(recording.factors, 'factor')}"
-    note(f"{path}: {what}, up to revision {recording.revision}")
+    print_note(f"{path}: {what}, up to revision {recording.revision}")

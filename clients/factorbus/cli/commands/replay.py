@@ -138,18 +138,18 @@ def command(as_json: bool, **asked: Any) -> None:
         raise click.BadParameter(f"{request.out} does not end in .g2o", param_hint="--out")
     from factorbus.cli.output import console as screen
 
-    def told(result: dict[str, Any]) -> None:
+    def report(result: dict[str, Any]) -> None:
         if as_json:
             screen.document(result)
         else:
             screen.table(_rows(result), title=f"{request.file}, in {request.where}")
 
-    replay(request, told)
+    replay(request, report)
 
 
-def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
-    """Do it, with progress on standard error; returns the document, and hands it to `told` while the map is there."""
-    from factorbus.cli.driving.drive import drive
+def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = lambda _: None) -> dict[str, Any]:
+    """Do it, with progress on standard error; returns the document, and hands it to `report` while the map is there."""
+    from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.replay_source import source_of
     from factorbus.cli.output import console as screen
 
@@ -166,7 +166,7 @@ def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lamb
     with _target(request) as target:
         before = target.account()
         with screen.progress(request.file.name, steps.poses) as show:
-            driven = drive(target, _paced(steps, request.pace), request.every, show)
+            driven = insert_steps(target, _paced(steps, request.pace), request.every, show)
         unsettled = target.chi2()
         last = target.settle() if request.settle else driven.steps[-1]
         adopted = None
@@ -177,7 +177,7 @@ def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lamb
             _draw(request.plot, request.file.name, driven, target, steps)
         result = _document(request, driven, target, steps, last, unsettled, before)
         result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
-        told(result)
+        report(result)
         if request.live:
             _stay()
     return result
@@ -185,7 +185,7 @@ def replay(request: ReplayRequest, told: Callable[[dict[str, Any]], None] = lamb
 
 def _adopt(request: ReplayRequest, target: Any, last: Any) -> tuple[Any, dict[str, Any] | None]:
     """The optimum found from scratch, if it is better than where the map has settled; says so."""
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
 
     found = target.optimum()
     if found.notice is None:
@@ -193,7 +193,7 @@ def _adopt(request: ReplayRequest, target: Any, last: Any) -> tuple[Any, dict[st
     last = target.adopt(found)
     told = f"better_optimum: χ² {found.chi2:.6g} where the map had settled; it is now at the"
     there = optimum_from(found.start, request.use_values, found.batch_converged)
-    note(f"{told} {there}; χ² {last.report['chi2']:.6g}")
+    print_note(f"{told} {there}; χ² {last.report['chi2']:.6g}")
     return last, {"code": found.notice.code, **found.as_dict(), "chi2_adopted": last.report["chi2"]}
 
 
@@ -230,7 +230,7 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
         yield LocalMap(request.mode)
         return
     from factorbus.cli.driving.remote import RemoteMap
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.children import gateway, service, worker
     from factorbus.cli.process.stopping import interrupt_on_sigterm
     from factorbus.client import connect
@@ -240,8 +240,8 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
         endpoint, solver = request.connect, None
         if endpoint is None:
             require("service", "factorbus replay without --connect")
-            solver, endpoint = stack.enter_context(service(say=note))
-            note(f"solver process {solver.pid} on {endpoint}")
+            solver, endpoint = stack.enter_context(service(say=print_note))
+            print_note(f"solver process {solver.pid} on {endpoint}")
             if request.every:
                 stack.enter_context(worker(endpoint, "worker1"))
         bus = stack.enter_context(
@@ -266,14 +266,14 @@ def _target(request: ReplayRequest) -> Iterator[Any]:
             )
         if request.live:
             page = stack.enter_context(gateway(endpoint, request.port, request.zenoh))
-            note(f"the map, live: {page}/#{request.map_name}")
+            print_note(f"the map, live: {page}/#{request.map_name}")
         target = RemoteMap(joined, request.window)
         stack.callback(target.close)
         yield target
 
 
 def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
-    """The same steps, at most so many a second."""
+    """The same steps, at most `pace_hz` a second."""
     begun = time.monotonic()
     for number, step in enumerate(steps):
         if pace_hz is not None:
@@ -283,17 +283,17 @@ def _paced(steps: Iterable[Any], pace_hz: float | None) -> Iterator[Any]:
 
 def _stay() -> None:
     """Until Ctrl-C or SIGTERM."""
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.stopping import stop_on_signals, wait_until
 
     with stop_on_signals(until_eof=False) as stop:
-        note("the page stays until Ctrl-C")
+        print_note("the page stays until Ctrl-C")
         wait_until(stop)
 
 
 def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.reading import say
     from factorbus.formats import write_g2o, write_kitti, write_tum
     from factorbus.proto.messages import Batch
@@ -307,16 +307,16 @@ def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
         if path:
             robots = write(path, Batch(target.estimate()))
             if robots != [path]:
-                note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
+                print_note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
             files += robots
     return files
 
 
 def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
-    from factorbus.cli.driving.picture import course_of, draw
+    from factorbus.cli.driving.picture import draw, history_of
 
     reports = [step.report for step in driven.steps]
-    draw(path, steps, target.estimate(), course_of(reports, target.compared()), title)
+    draw(path, steps, target.estimate(), history_of(reports, target.compared()), title)
 
 
 def _chi2_initial(steps: Any) -> float | None:

@@ -14,7 +14,7 @@ def command(endpoint: str, map_name: str, world: str, poses: int, seed: int, unt
     """Drive through WORLD, inserting pose by pose into a map; print what it measured as JSON."""
     import threading
 
-    from factorbus.cli.driving.drive import drive
+    from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.remote import RemoteMap
     from factorbus.cli.output.console import document
     from factorbus.cli.process.stopping import leave_on_eof
@@ -25,6 +25,6 @@ def command(endpoint: str, map_name: str, world: str, poses: int, seed: int, unt
         threading.Thread(target=leave_on_eof, daemon=True).start()
     with connect(endpoint, client="robot") as bus, bus.map(map_name) as joined:
         target = RemoteMap(joined)
-        driven = drive(target, (step.batch for step in WORLDS[world.replace("-", "_")](poses=poses, seed=seed)))
+        driven = insert_steps(target, (step.batch for step in WORLDS[world.replace("-", "_")](poses=poses, seed=seed)))
         document(driven.measures() | target.account())
         target.close()

@@ -3,21 +3,34 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.output.logs import begin, log_option
+from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, zenoh_option
+from factorbus.cli.process.options import DEFAULT_ENDPOINT, Number, grouped, zenoh_option
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical")
 # The interpreter's default, 5 ms, is what a transform would wait for while a path is being drawn.
 _SWITCH_S = 0.0005
 
 
+@dataclass(frozen=True, slots=True)
+class NodeOptions:
+    """Our node in the robot's ROS graph: the router to join (None: as --connect), domain, distribution, its names."""
+
+    ros: str | None
+    domain: int
+    distro: str
+    namespace: str
+    node_name: str
+
+
 @click.command()
+@grouped("as_node", NodeOptions)
 @click.argument("map_name", metavar="MAP")
 @click.option("--connect", "endpoint", default=DEFAULT_ENDPOINT, show_default=True, metavar="ENDPOINT", help="Ours.")
 @click.option("--ros", metavar="ENDPOINT", help="The robot's Zenoh router (rmw_zenohd).  [default: as --connect]")
@@ -47,11 +60,11 @@ _SWITCH_S = 0.0005
 @click.option("--letter", default="x", show_default=True, metavar="LETTER", help="Of this robot's keys: one for each.")
 @click.option(
     "--start", type=click.Choice(("odometry", "pose")), default="odometry", show_default=True,
-    help="Where the map begins: where odometry does, or with the first pose that is told.",
+    help="Where the map begins: where odometry does, or with the first pose that is received.",
 )  # fmt: skip
 @click.option(
     "--keyframe", nargs=2, type=Number(min=0, min_open=True), default=(0.5, 0.35), show_default=True,
-    metavar="METRES RADIANS", help="A pose of the map for so much way or turn.",
+    metavar="METRES RADIANS", help="Least way or turn between two poses of the map.",
 )  # fmt: skip
 @click.option(
     "--mount",
@@ -73,11 +86,7 @@ _SWITCH_S = 0.0005
 def command(
     map_name: str,
     endpoint: str,
-    ros: str | None,
-    domain: int,
-    distro: str,
-    namespace: str,
-    node_name: str,
+    as_node: NodeOptions,
     log_form: str,
     quiet: bool,
     until_eof: bool,
@@ -102,20 +111,26 @@ def command(
     from factorbus.ros2.bridge import Bridge
     from factorbus.ros2.messages import Messages
     from factorbus.ros2.node import open_node
-    from factorbus.ros2.settings import from_options
+    from factorbus.ros2.settings import BridgeOptions, from_options
 
-    begin(log_form, quiet)
-    settings = from_options(**given)
+    begin_logging(log_form, quiet)
+    settings, ros = from_options(BridgeOptions(**given)), as_node.ros
     with (
         _switching_often(),
         stop_on_signals(until_eof) as stop,
         open_bus(endpoint, "ros2", zenoh) as bus,
         bus.map(map_name) as joined,
         open_node(
-            ros or endpoint, domain, namespace, node_name, bus.timeout_s, {}, zenoh if ros is None else ""
+            ros or endpoint,
+            as_node.domain,
+            as_node.namespace,
+            as_node.node_name,
+            bus.timeout_s,
+            {},
+            zenoh if ros is None else "",
         ) as node,
     ):
-        bridge = Bridge(joined, node, Messages(distro), settings)
+        bridge = Bridge(joined, node, Messages(as_node.distro), settings)
         click.echo(f"{READY}{ros or endpoint}")
         bridge.run(stop)
         click.echo(" ".join(f"{name}={count}" for name, count in sorted(bridge.counts.items())), err=True)

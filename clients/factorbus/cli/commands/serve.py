@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import input_file, require
-from factorbus.cli.output.logs import begin, log_option
+from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.notify import Notifier
 from factorbus.cli.process.options import USUAL_ENDPOINT
@@ -31,7 +31,7 @@ from factorbus.cli.process.options import USUAL_ENDPOINT
     "--insecure",
     is_flag=True,
     default=None,
-    help="Listen to other machines even where whoever reaches the port could read and write.",
+    help="Listen to other machines even where anybody who reaches the port could read and write.",
 )
 @click.option("--journal", metavar="DIR", help="Keep maps in this folder, across restarts and crashes.")
 @click.option(
@@ -81,7 +81,7 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.service.app import serve
 
-    begin(log_form, quiet)
+    begin_logging(log_form, quiet)
     manager = Notifier()
 
     def on_ready(endpoints: list[str]) -> None:
@@ -95,10 +95,10 @@ def command(config: Path | None, until_eof: bool, quiet: bool, log_form: str, **
 def _settings(path: Path | None, given: dict[str, Any]) -> Any:
     from dataclasses import replace
 
-    from factorbus.service.config import Config, checked, load
+    from factorbus.service.config import Config, checked_config, load_config
 
     given = {name: value for name, value in given.items() if value not in (None, ())}
     if path is None:
-        return checked(replace(Config(), **given))
+        return checked_config(replace(Config(), **given))
     with input_file(path):
-        return load(path, **given)
+        return load_config(path, **given)

@@ -49,10 +49,10 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
     if out:
         graph = merged(batches)
         say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
-        screen.note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
+        screen.print_note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
     if truth:
         write_tum(truth, merged(truths))
-        screen.note(f"{truth}: {counted(poses, 'pose')}, as they are")
+        screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
 
 
 def _steps(world: str, poses: int, seed: int) -> Iterator[Any]:

@@ -82,7 +82,7 @@ def _map(row: Mapping[str, Any]) -> str:
         f"χ² {row['chi2']:.6g}, {_convergence(row)}; {_steps(row['strategies'])}",
         f"steps take {_times(row['step_s'])}; inserts {_times(row['insert_s'])}",
         f"inserts: {inserts['accepted']} accepted, {inserts['refused']} refused{_codes(row['refusals'])}, "
-        f"{inserts['busy']} told to wait; {row['waiting']} waiting, {row['parked']} parked; "
+        f"{inserts['busy']} answered busy; {row['waiting']} waiting, {row['parked']} parked; "
         f"{counted(row['clients'], 'client')}",
         *([f"not reproducible: {row['reason']}"] if row.get("reproducible") is False else []),
         *(f"journal {name}: {value}" for name, value in _told(row.get("journal", {}))),

@@ -2,7 +2,7 @@
 
 import click
 
-from factorbus.cli.output.console import note
+from factorbus.cli.output.console import print_note
 from factorbus.cli.output.exits import require
 
 
@@ -17,7 +17,7 @@ def command() -> None:
     factorbus warm
     """
     require("service", "factorbus warm")
-    from factorbus.service.operations.warm import compiled_seconds, warm
+    from factorbus.service.operations.warm import seconds_compiling, warm
 
-    seconds = warm(lambda kernel: note(f"  compiling {kernel}"))
-    click.echo(f"kernels ready in {seconds:.1f} s, {compiled_seconds():.1f} s of it compiling")
+    seconds = warm(lambda kernel: print_note(f"  compiling {kernel}"))
+    click.echo(f"kernels ready in {seconds:.1f} s, {seconds_compiling():.1f} s of it compiling")

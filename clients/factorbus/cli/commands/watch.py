@@ -2,16 +2,36 @@
 
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.options import Number, connect_option, ellipses_option, out_option, zenoh_option
+from factorbus.cli.process.options import (
+    Number,
+    connect_option,
+    ellipses_option,
+    grouped,
+    out_option,
+    zenoh_option,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """Where the view goes: a recording, browsers (serving; host and ports), or a viewer on this display."""
+
+    save: Path | None
+    serving: bool
+    host: str
+    web_port: int
+    data_port: int
 
 
 @click.command()
+@grouped("viewer", ViewOptions)
 @click.argument("map_name", metavar="MAP")
 @connect_option
 @zenoh_option
@@ -30,11 +50,7 @@ def command(
     map_name: str,
     endpoint: str,
     zenoh: str,
-    save: Path | None,
-    serving: bool,
-    host: str,
-    web_port: int,
-    data_port: int,
+    viewer: ViewOptions,
     rate: float,
     ellipses: int,
     until: int | None,
@@ -51,10 +67,10 @@ def command(
     factorbus watch warehouse --serve --host 192.168.1.20
     factorbus watch warehouse --save monday.rrd; rerun monday.rrd
     """
-    if save and serving:
+    if viewer.save and viewer.serving:
         raise click.UsageError("--save and --serve exclude each other")
     require("watch", "factorbus watch")
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.cli.process.bus import joined_when_there, open_bus
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.viz.live import LiveView
@@ -66,11 +82,11 @@ def command(
         joined_when_there(bus, map_name, stop.wait) as joined,
     ):
         if joined is None:
-            note(f"stopped before there was a map {map_name}")
+            print_note(f"stopped before there was a map {map_name}")
             return
         view = LiveView(map_name)
         try:
-            where = _open(view, save, host if serving or not _has_display() else None, web_port, data_port)
+            where = _open(view, viewer)
             with MapFollower(joined, ellipses=ellipses) as follower:
                 view.show(follower.last_look(joined.timeout_s))
                 click.echo(f"ready {where}")
@@ -82,20 +98,20 @@ def command(
             view.close()
     unconverged = ", which had not converged" if joined.estimate.converged is False else ""
     converging = unconverged or (", which was converging" if joined.estimate.converging else "")
-    note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
+    print_note(f"watched {map_name} up to revision {joined.estimate.revision}{converging}")
 
 
-def _open(view: Any, save: Path | None, host: str | None, web_port: int, data_port: int) -> str:
+def _open(view: Any, viewer: ViewOptions) -> str:
     """Where it is to be seen.  Raises Stopped."""
     from factorbus.cli.output.exits import Stopped
 
     try:
-        if save:
-            view.save(save)
-            return str(save)
-        if host is not None:
-            return view.serve(host, web_port, data_port)
-        view.spawn(data_port)
+        if viewer.save:
+            view.save(viewer.save)
+            return str(viewer.save)
+        if viewer.serving or not _has_display():
+            return view.serve(viewer.host, viewer.web_port, viewer.data_port)
+        view.spawn(viewer.data_port)
     except RuntimeError as error:
         raise Stopped("no_viewer", f"the viewer does not start: {error}") from error
     return "on this display"

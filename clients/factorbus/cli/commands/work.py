@@ -5,7 +5,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.output.logs import begin, log_option
+from factorbus.cli.output.logs import begin_logging, log_option
 from factorbus.cli.process.children import READY
 from factorbus.cli.process.notify import Notifier
 from factorbus.cli.process.options import DEFAULT_ENDPOINT
@@ -38,7 +38,7 @@ def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...
     from factorbus.workers.app import work
     from factorbus.workers.config import WorkerConfig
 
-    begin(log_form, quiet)
+    begin_logging(log_form, quiet)
     manager = Notifier()
 
     def on_ready(name: str) -> None:

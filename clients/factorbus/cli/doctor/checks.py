@@ -182,7 +182,7 @@ def clock() -> Finding:
     return Finding("clock", "ok", seen)
 
 
-def machine() -> Finding:
+def machine_limits() -> Finding:
     """cores and limits"""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -239,7 +239,8 @@ def permissions() -> Finding:
 _TIMEX_BYTES, _UNSYNCHRONIZED = 512, 5
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    python, libraries, extras, cholmod, numba, cache, machine, clock, wall_clock, shared_memory, permissions, port, bus,
+    python, libraries, extras, cholmod, numba, cache, machine_limits, clock, wall_clock, shared_memory, permissions,
+    port, bus,
 )  # fmt: skip
 
 

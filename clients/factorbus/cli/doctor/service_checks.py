@@ -56,4 +56,4 @@ def _troubles(account: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
         inserts = row["inserts"]
         if inserts["busy"] > 0.1 * max(inserts["accepted"], 10):
             mend = "clients send faster than it solves: insert less often, or spread maps over more services"
-            yield "warn", f"map {row['name']} told {inserts['busy']} of its inserts to wait", mend
+            yield "warn", f"map {row['name']} answered {inserts['busy']} of its inserts with busy", mend

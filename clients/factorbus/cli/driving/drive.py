@@ -146,7 +146,7 @@ class Driven:
         }
 
 
-def drive(
+def insert_steps(
     target: Target, batches: Iterable[Batch], every: int = 0, show: Callable[[int, str], None] | None = None
 ) -> Driven:
     """Insert `batches` one after the other; with `every`, hold χ² against the batch optimum at every Nth.

@@ -10,7 +10,8 @@ import numpy as np
 from factorbus.cli.driving.drive import Compared, DriveStep
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Batch, Change, Factors, Variables
-from factorbus.solver import Options, Solver, compiled_seconds, solve_batch
+from factorbus.solver import Options, Solver, compile_seconds, solve_batch
+from factorbus.solver.changing import with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 
 
@@ -57,7 +58,7 @@ class LocalMap:
         """Go to an optimum, and settle there."""
         start = time.thread_time()
         changes = [Change("place", keys=g.keys, kind=g.kind, values=g.values, carry=True) for g in found.variables]
-        self._solver, _, report, counted = self._solver.with_changes(changes, settle=True)
+        self._solver, _, report, counted = with_changes(self._solver, changes, settle=True)
         self._cpu_s += time.thread_time() - start
         self._revision += 1
         return DriveStep(self._revision, report.as_dict() | counted, None)
@@ -80,7 +81,7 @@ class LocalMap:
 
     def account(self) -> dict[str, Any]:
         """CPU seconds of this thread in the solver, seconds of compiling."""
-        return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compiled_seconds(), "deltas": None}
+        return {"solver_cpu_s": self._cpu_s, "kernels_compiled_s": compile_seconds(), "deltas": None}
 
     def _step(self, start: float, settle: bool) -> DriveStep:
         report = self._solver.step(settle=settle).as_dict()

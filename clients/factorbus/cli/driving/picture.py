@@ -10,14 +10,14 @@ from factorbus.cli.driving.columns import merged
 from factorbus.cli.driving.drive import Compared
 from factorbus.proto.arrays import F64
 from factorbus.proto.messages import Batch, Variables
-from factorbus.viz import Course, Odometry, Spread, loops_of, save_map
+from factorbus.viz import DriveHistory, MapLayers, Odometry, Spread, loops_of, save_map
 
 
 def draw(
     path: Path,
     batches: Iterable[Batch],
     estimate: Sequence[Variables],
-    course: Course,
+    history: DriveHistory,
     title: str,
     subtitle: str = "",
     truth: Sequence[Variables] = (),
@@ -28,17 +28,8 @@ def draw(
     spread: where some of the estimate may be.
     """
     graph = merged(batches)
-    save_map(
-        path,
-        estimate=estimate,
-        odometry=reckoned(graph),
-        truth=truth,
-        loops=loops_of(graph),
-        course=course,
-        spread=spread,
-        title=title,
-        subtitle=subtitle,
-    )
+    layers = MapLayers(estimate, reckoned(graph), truth, loops_of(graph), spread)
+    save_map(path, layers, history=history, title=title, subtitle=subtitle)
 
 
 def reckoned(graph: Batch) -> tuple[Variables, ...]:
@@ -48,12 +39,12 @@ def reckoned(graph: Batch) -> tuple[Variables, ...]:
     return odometry.variables()
 
 
-def course_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> Course:
+def history_of(reports: Sequence[Mapping[str, Any]], compared: Sequence[Compared]) -> DriveHistory:
     """χ², time and work of every step, and χ² of the batch optimum where it was found, those not converged apart."""
     names = ("new_variables", "eliminated", "relinearized")
     work = np.array([[report[name] for name in names] for report in reports], float).reshape(-1, 3)
     work[:, 0] = work[:, 0].cumsum()
-    return Course(
+    return DriveHistory(
         np.array([report["chi2"] for report in reports]),
         np.array([report["step_ms"] for report in reports]),
         _optima(each for each in compared if each.batch_converged),

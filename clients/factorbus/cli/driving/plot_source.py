@@ -50,13 +50,13 @@ def file_named(source: str, dialect: str | None = None, strict: bool = False) ->
     return read_graph(source_of(Path(source)), dialect, strict)
 
 
-def placed(drawn: Drawn) -> Drawn:
+def with_values(drawn: Drawn) -> Drawn:
     """The same graph with a value for every pose: where the file has none, composed from odometry.  Raises Stopped."""
     bare = [group for group in drawn.graph.variables if group.values is None and group.keys.size]
     if not bare:
         return drawn
     from factorbus.cli.driving.picture import reckoned
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
 
     have = [group for group in drawn.graph.variables if group.values is not None]
     missing = np.concatenate([group.keys for group in bare])
@@ -66,7 +66,7 @@ def placed(drawn: Drawn) -> Drawn:
             have.append(Variables(group.kind, group.keys[rows], group.values[rows]))
     left = np.setdiff1d(missing, np.concatenate([np.empty(0, np.int64), *(group.keys for group in have)])).size
     composed = missing.size - left
-    note(
+    print_note(
         f"{drawn.name}: {counted(missing.size, 'variable')} without a value; "
         f"{counted(composed, 'pose')} composed from odometry"
         + (f", {left} are not drawn (--solve places them)" if left else "")

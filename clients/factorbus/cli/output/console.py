@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
-def note(text: str) -> None:
+def print_note(text: str) -> None:
     """A line about what is going on, to standard error."""
     click.echo(text, err=True)
 

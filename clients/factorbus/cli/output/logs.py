@@ -23,7 +23,7 @@ def log_option(command: F) -> F:
     )(command)
 
 
-def begin(form: str, quiet: bool) -> None:
+def begin_logging(form: str, quiet: bool) -> None:
     """Log to standard error from now on, warnings only if `quiet`."""
     handler = logging.StreamHandler(sys.stderr)
     text = logging.Formatter("%(asctime)s %(levelname)-7s %(message)s")

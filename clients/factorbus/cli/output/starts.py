@@ -20,5 +20,7 @@ def optimum_from(start: str, file_values: bool = False, converged: bool = True) 
 
     converged: whether the search for it had when it ended; if not, that is said.
     """
-    words = "the file's values" if file_values and start == "values" else _WORDS.get(start, "a start that is not told")
+    words = (
+        "the file's values" if file_values and start == "values" else _WORDS.get(start, "a start that is not reported")
+    )
     return f"optimum from {words}" + ("" if converged else f", {NOT_CONVERGED}")

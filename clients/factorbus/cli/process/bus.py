@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from factorbus.cli.process.options import MapAddress
+
 if TYPE_CHECKING:
     from factorbus.client import Bus, Map
 
@@ -18,12 +20,22 @@ def open_bus(endpoint: str, client: str, zenoh: str = "", timeout_s: float = 10.
 
 
 @contextmanager
+def joined_map(address: MapAddress, client: str) -> Iterator["Map"]:
+    """The map at `address`, joined only if it is there.  Raises as `factorbus.client.connect`, and UnknownMap."""
+    with (
+        open_bus(address.endpoint, client, address.zenoh, address.timeout_s) as bus,
+        bus.map(address.name, mirror=False, create=False) as joined,
+    ):
+        yield joined
+
+
+@contextmanager
 def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -> Iterator["Map | None"]:
-    """Map `name`, once there is one; None if it was stopped before.  stopped: waits for so many seconds, at most.
+    """Map `name`, once there is one; None if it was stopped before.  stopped: waits for that many seconds, at most.
 
     Raises Refused, Unavailable.
     """
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
     from factorbus.proto.problems import UnknownMap
 
     said = False
@@ -33,7 +45,7 @@ def joined_when_there(bus: "Bus", name: str, stopped: Callable[[float], bool]) -
             break
         except UnknownMap as unknown:
             if not said:
-                note(f"{unknown.message}; waiting until there is one")
+                print_note(f"{unknown.message}; waiting until there is one")
             said = True
         if stopped(_LISTENING_S):
             yield None

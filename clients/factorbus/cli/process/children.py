@@ -1,4 +1,4 @@
-"""Other processes of ours: started with this interpreter, told to stop in order, and never left behind.
+"""Other processes of ours: started with this interpreter, stopped in order, and never left behind.
 
 A child runs with `--until-eof`: it stops when its standard input closes.  So it goes when we go, whatever ends us.
 """

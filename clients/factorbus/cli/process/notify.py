@@ -1,7 +1,7 @@
-"""What systemd is told: ready, stopping, and, while the service is alive, that it is (sd_notify(3)).
+"""What systemd is notified of: ready, stopping, and, while the service is alive, that it is (sd_notify(3)).
 
-A unit with `Type=notify` and `WatchdogSec=` has the service restarted when it has not been told for so long.  It is not
-told on a timer: only after the service has looked at its threads and found none of them stuck.
+A unit with `Type=notify` and `WatchdogSec=` has the service restarted when it got no sign for that long.  It is not
+sent on a timer: only after the service has looked at its threads and found none of them stuck.
 """
 
 import os

@@ -3,19 +3,35 @@
 import math
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import click
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Where a service listens that is told nothing else, and where everybody looks for one that is told nothing else.
+# Where a service listens, and where clients look for one, without an address of their own.
 USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
 MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "bayes-tree")
 WORLDS = ("manhattan", "city-trees", "sphere")
+
+
+def grouped(name: str, group: type) -> Callable[[F], F]:
+    """Options that belong together reach the command as one argument `name`: a `group`, a dataclass of their names."""
+    own = [field.name for field in fields(group)]
+
+    def with_group(command: F) -> F:
+        @wraps(command)
+        def call(*args: Any, **given: Any) -> Any:
+            return command(*args, **{name: group(**{each: given.pop(each) for each in own})}, **given)
+
+        return cast(F, call)
+
+    return with_group
 
 
 class ModeChoice(click.Choice):
@@ -91,9 +107,20 @@ def json_option(command: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")(command)
 
 
+@dataclass(frozen=True, slots=True)
+class MapAddress:
+    """A map on the bus: its name, the service that has it, our Zenoh configuration, seconds to wait for an answer."""
+
+    name: str
+    endpoint: str
+    zenoh: str
+    timeout_s: float
+
+
 def asks_map(command: F) -> F:
-    """NAME, --connect, --timeout, --zenoh and --json: of a command that asks a map on the bus."""
-    for option in (json_option, zenoh_option, timeout_option(30), connect_option, click.argument("name")):
+    """NAME, --connect, --timeout and --zenoh, as one argument `address`, and --json: of a command that asks a map."""
+    address = grouped("address", MapAddress)
+    for option in (address, json_option, zenoh_option, timeout_option(30), connect_option, click.argument("name")):
         command = option(command)
     return command
 
@@ -129,5 +156,5 @@ def ellipses_option(count: int) -> Callable[[F], F]:
         default=count,
         show_default=True,
         metavar="N",
-        help="Show for so many poses and points where they may be, with 95 %.",
+        help="Draw 95 % ellipses of up to N poses and N points.",
     )

@@ -54,7 +54,7 @@ def read_graph(path: Path, dialect: str | None = None, strict: bool = False, who
 
 def say(path: Path, notes: tuple[str, ...]) -> None:
     """Notes on a file, to standard error."""
-    from factorbus.cli.output.console import note
+    from factorbus.cli.output.console import print_note
 
     for text in notes:
-        note(f"{path}: {text}")
+        print_note(f"{path}: {text}")

@@ -72,7 +72,7 @@ def interrupt_on_sigterm(grace_s: float = 10.0) -> Iterator[None]:
 
 
 def _see_to_the_end(told: socket.socket, grace_s: float) -> None:
-    """After one signal there are so many seconds to end by itself, after another there is none."""
+    """After one signal there are `grace_s` seconds to end by itself, after another there is none."""
     with told:
         if not signalled(told):
             return
@@ -93,7 +93,7 @@ def signalled(told: socket.socket) -> bool:
 
 
 def leave_on_eof() -> None:
-    """Wait for the end of standard input, then end this process at once: whoever started it has gone."""
+    """Wait for the end of standard input, then end this process at once: the process that started it has gone."""
     while os.read(sys.stdin.fileno(), 4096):
         pass
     os._exit(INTERRUPTED)

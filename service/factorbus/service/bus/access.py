@@ -49,7 +49,7 @@ class Grant:
     maps: tuple[str, ...] = ("*",)
 
 
-class Rule(NamedTuple):
+class AccessRule(NamedTuple):
     """What may pass in one direction: messages on keys, from (`ingress`) or to (`egress`) the one who is named."""
 
     flow: str
@@ -99,7 +99,7 @@ def access_control(grants: list[Grant], identify_by: str = "cert_common_names") 
     }
 
 
-def rules_of(grant: Grant) -> list[Rule]:
+def rules_of(grant: Grant) -> list[AccessRule]:
     """All that `grant` lets pass."""
     return list(_RULES[grant.role](grant))
 
@@ -123,75 +123,75 @@ def _check_names(grants: list[Grant], where: str) -> None:
         seen[grant.name] = grant.role
 
 
-def _front_end(grant: Grant) -> Iterator[Rule]:
+def _front_end(grant: Grant) -> Iterator[AccessRule]:
     yield from _inserts(grant)
     yield from _follows(grant)
     yield from _exchange(f"{PREFIX}/features/*/ask")
     yield from _sees(f"{PREFIX}/features/*/live", ANY_SERVICE_OF_ANY_VERSION)
 
 
-def _viewer(grant: Grant) -> Iterator[Rule]:
+def _viewer(grant: Grant) -> Iterator[AccessRule]:
     yield from _follows(grant)
     yield from _sees(ANY_SERVICE_OF_ANY_VERSION)
 
 
-def _operator(grant: Grant) -> Iterator[Rule]:
+def _operator(grant: Grant) -> Iterator[AccessRule]:
     yield from _exchange(f"{PREFIX}/admin/*")
     yield from _inserts(grant)
     yield from _follows(grant)
     yield from _sees(f"{PREFIX}/features/*/live", f"{PREFIX}/worker/*/live/*", ANY_SERVICE_OF_ANY_VERSION)
 
 
-def _worker(grant: Grant) -> Iterator[Rule]:
+def _worker(grant: Grant) -> Iterator[AccessRule]:
     jobs, alive = _own(f"{PREFIX}/worker/", grant.name, "/job"), _own(f"{PREFIX}/worker/", grant.name, "/live/*")
-    yield Rule("ingress", _ANSWER, jobs)
-    yield Rule("egress", _ASK, jobs)
-    yield Rule("ingress", _BE_SEEN, alive)
+    yield AccessRule("ingress", _ANSWER, jobs)
+    yield AccessRule("egress", _ASK, jobs)
+    yield AccessRule("ingress", _BE_SEEN, alive)
 
 
-def _service(grant: Grant) -> Iterator[Rule]:
+def _service(grant: Grant) -> Iterator[AccessRule]:
     answered = (*_of_maps(grant, "in/*"), *_of_maps(grant, "ask/*"), f"{PREFIX}/admin/*", f"{PREFIX}/features/*/ask")
     alive = (*_of_maps(grant, "live/service/*"), f"{PREFIX}/features/*/live")
-    yield Rule("ingress", _ANSWER, answered)
-    yield Rule("egress", _ASK, answered)
-    yield Rule("ingress", ("put",), _of_maps(grant, "out/*"))
-    yield Rule("egress", ("declare_subscriber",), _of_maps(grant, "out/*"))
-    yield Rule("ingress", _BE_SEEN, alive)
-    yield Rule("egress", _SEE, alive)
+    yield AccessRule("ingress", _ANSWER, answered)
+    yield AccessRule("egress", _ASK, answered)
+    yield AccessRule("ingress", ("put",), _of_maps(grant, "out/*"))
+    yield AccessRule("egress", ("declare_subscriber",), _of_maps(grant, "out/*"))
+    yield AccessRule("ingress", _BE_SEEN, alive)
+    yield AccessRule("egress", _SEE, alive)
     # Is somebody else keeping its maps?  And who works?
     yield from _sees(*_of_maps(grant, "live/service/*"), f"{PREFIX}/worker/*/live/*")
     yield from _exchange(f"{PREFIX}/worker/*/job")
 
 
-def _router(_grant: Grant) -> Iterator[Rule]:
-    yield Rule("ingress", _ALL, ("**",))
-    yield Rule("egress", _ALL, ("**",))
+def _router(_grant: Grant) -> Iterator[AccessRule]:
+    yield AccessRule("ingress", _ALL, ("**",))
+    yield AccessRule("egress", _ALL, ("**",))
 
 
-def _inserts(grant: Grant) -> Iterator[Rule]:
+def _inserts(grant: Grant) -> Iterator[AccessRule]:
     yield from _exchange(*(key for each in _of_maps(grant, "in/") for key in _own(each, grant.name, "")))
-    yield Rule(
+    yield AccessRule(
         "ingress", _BE_SEEN, tuple(k for each in _of_maps(grant, "live/client/") for k in _own(each, grant.name, ""))
     )
 
 
-def _follows(grant: Grant) -> Iterator[Rule]:
+def _follows(grant: Grant) -> Iterator[AccessRule]:
     yield from _exchange(*_of_maps(grant, "ask/*"))
-    yield Rule("ingress", ("declare_subscriber",), _of_maps(grant, "out/*"))
-    yield Rule("egress", ("put",), _of_maps(grant, "out/*"))
+    yield AccessRule("ingress", ("declare_subscriber",), _of_maps(grant, "out/*"))
+    yield AccessRule("egress", ("put",), _of_maps(grant, "out/*"))
     yield from _sees(*_of_maps(grant, "live/service/*"), *_of_maps(grant, "live/client/*"))
 
 
-def _exchange(*keys: str) -> Iterator[Rule]:
+def _exchange(*keys: str) -> Iterator[AccessRule]:
     """Queries, and what comes back."""
-    yield Rule("ingress", _ASK, keys)
-    yield Rule("egress", _ANSWER, keys)
+    yield AccessRule("ingress", _ASK, keys)
+    yield AccessRule("egress", _ANSWER, keys)
 
 
-def _sees(*keys: str) -> Iterator[Rule]:
+def _sees(*keys: str) -> Iterator[AccessRule]:
     """Liveliness tokens of others."""
-    yield Rule("ingress", _SEE, keys)
-    yield Rule("egress", _BE_SEEN, keys)
+    yield AccessRule("ingress", _SEE, keys)
+    yield AccessRule("egress", _BE_SEEN, keys)
 
 
 def _of_maps(grant: Grant, below: str) -> tuple[str, ...]:
@@ -207,7 +207,7 @@ def _own(before: str, name: str, behind: str) -> tuple[str, str]:
     return f"{before}{name}{behind}", f"{before}{name}-$*{behind}"
 
 
-_RULES: Mapping[str, Callable[[Grant], Iterator[Rule]]] = {
+_RULES: Mapping[str, Callable[[Grant], Iterator[AccessRule]]] = {
     "front_end": _front_end,
     "viewer": _viewer,
     "worker": _worker,

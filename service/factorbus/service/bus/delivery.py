@@ -31,7 +31,7 @@ class Delivery:
     """The outbox, the executors that answer, that compute answers, that of refusals, and what goes on which.
 
     most: answers that may wait to be computed.  about: what this service adds to the stats of a map.  batch: finds
-    batch optima; (asker, question, snapshot).  copied: the same with a copy of a map, which is to be another one.
+    batch optima; (asker, question, copies).  copied: the same with a copy of a map, which is to be another one.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a map has done so far: counts and durations, for whoever asks.
+"""What a map has done so far: counts and durations, for statistics.
 
 An insert that is done at once is noted only, and counted when time goes by or somebody asks: its answer leaves when the
 thread that brought it is let go, and waits for all that is done before.  Measured: 10 of 500 µs.
@@ -41,11 +41,11 @@ class Account:
         self._noted: list[InsertDone] = []
 
     def received(self, size: int) -> None:
-        """An insert of so many bytes came in."""
+        """An insert of `size` bytes came in."""
         self._received += size
 
     def accepted(self, answered_bytes: int) -> None:
-        """An insert was; its answer has so many bytes."""
+        """An insert was; its answer has `answered_bytes` bytes."""
         self._accepted += 1
         self._answered += answered_bytes
 
@@ -54,7 +54,7 @@ class Account:
         self._refusals[problem.code] += 1
 
     def stepped(self, strategy: str, chi2: float, solver_ms: float, published_bytes: int) -> None:
-        """The solver made a step; its delta has so many bytes."""
+        """The solver made a step; its delta has `published_bytes` bytes."""
         self.count()  # what was noted came before
         self._step(strategy, chi2, solver_ms, published_bytes)
 

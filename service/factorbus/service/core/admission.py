@@ -24,7 +24,7 @@ begins first goes first.  So a small one overtakes large ones of others, and equ
 
 An insert that changes what the map has is a step by itself, so it goes to the solver by itself: what comes meanwhile
 waits for no other.  On the time line it is as long as all the small inserts that one step takes in, and of one client
-only so many may be without an answer: more are refused as busy, not used up.
+only a number of them may be without an answer: more are refused as busy, not used up.
 """
 
 from collections import OrderedDict, deque

@@ -25,7 +25,7 @@ _USELESS, _STILL = 20, 3  # so many in a row
 
 
 class Converging:
-    """How near a map is to its optimum at the revision that is told, and what is done about it."""
+    """How near a map is to its optimum at the revision that is published, and what is done about it."""
 
     def __init__(self) -> None:
         self.converged = True
@@ -73,17 +73,17 @@ class Converging:
         self._untold, self.gave_up = False, "the solver refused it, see the service's log"
 
     def undone(self) -> None:
-        """What was not told did not happen."""
+        """What was not published did not happen."""
         self._untold = False
 
     def moved_on(self, converged: bool, unfinished: bool, chi2: float) -> None:
-        """A step of another sort is told."""
+        """A step of another sort is published."""
         self.converged, self._unfinished, self.gave_up = converged, unfinished or not converged, ""
         self.steps, self._spent_s = 0, 0.0
         self._least, self._useless, self._still = chi2, 0, 0
 
     def went_on(self, stepped: Stepped) -> None:
-        """A further step is told: was it of use?"""
+        """A further step is published: was it of use?"""
         self._untold, self.converged = False, stepped.converged
         self._unfinished = stepped.unfinished or not stepped.converged
         self.steps += 1

@@ -1,6 +1,6 @@
 """What goes into the core and what comes out of it, as values.
 
-An `Asker` is whoever waits for an answer: the shell's query, which the core carries about and never looks into.
+An `Asker` waits for an answer: the shell's query, which the core carries about and never looks into.
 Time is in seconds of any clock that does not go back; it arrives with the events.
 
 Those on the path of every insert are named tuples: a frozen dataclass takes three times as long to make.
@@ -22,11 +22,18 @@ Asker: TypeAlias = Any
 
 
 class ParsedInsert(NamedTuple):
-    """The content of a usual insert whose columns still lie in its message; `groups` says where (`kernels/read.py`)."""
+    """The content of an insert that only adds, whose columns still lie in its message; `groups` says where
+    (`kernels/read.py`).
+
+    variables, factors: how many it has.
+    """
 
     message: bytes
     groups: I64
-    settle: bool
+    settle: bool = False
+    convert_below: float = 0.0
+    variables: int = 0
+    factors: int = 0
 
 
 class Arrived(NamedTuple):
@@ -54,7 +61,7 @@ class Arrived(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ArrivedQuestion:
     """A question came in, with its bytes."""
 
     asker: Asker

@@ -1,7 +1,7 @@
-"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: all of that is told.
+"""One map as a state machine: events in, effects out.  No bus, no clock, no thread, no solver: events bring all.
 
     Arrived ─▶ admission ─▶ inbox ─┐                    ┌─▶ Answer, Refuse    to who inserted
-    Asked ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
+    ArrivedQuestion ───▶ reads ──────────────┴▶ InsertBatch ─▶ Applied ────┼─▶ Publish           delta of every step
                                     (solver thread)     └─▶ InsertBatch       what came in meanwhile; nothing did, and
                                                                               it is not at its optimum: a further step
 
@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from factorbus.proto import codec
-from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Busy, Problem, ShuttingDown, UnknownMap
 from factorbus.service.config import Limits
 from factorbus.service.core.account import Account, InsertDone
@@ -24,7 +23,7 @@ from factorbus.service.core.converging import Converging
 from factorbus.service.core.events import (
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Asker,
     Drained,
     Effect,
@@ -117,7 +116,7 @@ class MapCore:
 
     def insert(self, arrived: Arrived) -> list[Effect]:
         """An insert came in."""
-        if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content.settle)):
+        if isinstance(arrived.content, ParsedInsert) and (run := self._try_alone(arrived, arrived.content)):
             self._account.received(arrived.size)
             return [run]
         effects = self._admission.expire(arrived.now)
@@ -133,17 +132,17 @@ class MapCore:
         self._account.refused(refuse.problem)
         return [replace(refuse, following=self._admission.wanted(client))]
 
-    def ask(self, asked: Asked, now: float) -> list[Effect]:
+    def ask(self, arrived: ArrivedQuestion, now: float) -> list[Effect]:
         """A question came in."""
         try:
             if self._closing is not None:
                 raise self._closing
-            question = parse(asked.question, asked.payload)
+            question = parse(arrived.question, arrived.payload)
         except Problem as problem:
-            return [Refuse(asked.asker, problem)]
+            return [Refuse(arrived.asker, problem)]
         if question.name == "stats":
-            return [Tell(asked.asker, self.stats(now))]
-        return self.read(Read(question, asked.asker), now)
+            return [Tell(arrived.asker, self.stats(now))]
+        return self.read(Read(question, arrived.asker), now)
 
     def read(self, read: Read, now: float) -> list[Effect]:
         """A question that needs the solver's state."""
@@ -259,7 +258,7 @@ class MapCore:
         self.variables, self.factors, self._solver_cpu_s = applied.variables, applied.factors, applied.solver_cpu_s
 
     def failed(self, problem: Problem, now: float) -> list[Effect]:
-        """The map's thread ended by a fault: whoever waits for anything, now or later, is told so."""
+        """The map's thread ended by a fault: all that wait for anything, now or later, get that."""
         effects = self.drop(now, problem)
         for insert in self._running.inserts if self._running else ():
             if self._admission.is_open(insert):
@@ -356,9 +355,15 @@ class MapCore:
         """May the solver have more, or has the journal to write first?"""
         return self._unjudged < self._limits.unwritten and self._unjudged_bytes < self._limits.waiting_bytes
 
-    def _try_alone(self, arrived: Arrived, settle: bool) -> InsertBatch | None:
+    def _try_alone(self, arrived: Arrived, content: ParsedInsert) -> InsertBatch | None:
         """The short InsertBatch of this insert and nothing else, if that is what `_go_on` would come to."""
-        if settle or self._running is not None or self._reads or not self._is_quick(arrived.size, arrived.now):
+        if (
+            content.settle
+            or content.convert_below
+            or self._running is not None
+            or self._reads
+            or not self._is_quick(arrived.size, arrived.now)
+        ):
             return None
         if self._must_reload or not self._has_room():
             return None
@@ -375,9 +380,9 @@ class MapCore:
         if reads or len(inserts) != 1 or not self._is_quick(inserts[0].size, now):
             return False
         content = inserts[0].content
-        if inserts[0].is_change or (isinstance(content, Insert) and content.convert_below):
-            return False
-        return isinstance(content, Problem) or not content.settle
+        if isinstance(content, Problem):
+            return True
+        return not (inserts[0].is_change or content.convert_below or content.settle)
 
     def _is_quick(self, size: int, now: float) -> bool:
         return size <= _SHORT_BYTES and self._slowest_s <= _SHORT_S and now - self._ended >= _ROUND_TRIP_S

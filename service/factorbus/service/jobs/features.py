@@ -14,7 +14,7 @@ from typing import Any
 
 from factorbus.proto.features import Ask, Shard, answer_size
 from factorbus.proto.features_codec import decode_ask, encode_answer, encode_shard
-from factorbus.proto.limits import Limits
+from factorbus.proto.limits import MessageLimits
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.service.core.events import Asker
@@ -63,7 +63,7 @@ class FeatureLimits:
     messages: of one message   open: questions at a time   deadline_s: of a shard, at most   room: for answers
     """
 
-    messages: Limits
+    messages: MessageLimits
     open: int
     deadline_s: float
     room: Room = _UNBOUNDED

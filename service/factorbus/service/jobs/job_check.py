@@ -2,7 +2,7 @@
 
     any job   its name and kind; a payload that can be read; seconds that are a time
     batch     all free variables of the graph, once each, of their kind, finite; χ² is that of these values; a start
-              that there is; `converged`, where it is told, true or false
+              that there is; `converged`, where it is there, true or false
     idp       the features that were asked for, all arrays of the form with their shapes; y begins where the camera is
               and ends with the prior of ρ; finite
 
@@ -45,7 +45,7 @@ def is_quick(done: JobDone) -> bool:
     return done.kind != "batch" and len(done.payload) <= _QUICK_BYTES
 
 
-def judged(job: Job, done: JobDone) -> JobDone | WrongAnswer:
+def checked_result(job: Job, done: JobDone) -> JobDone | WrongAnswer:
     """`done` if it can be the answer to `job`, else what is wrong with it."""
     try:
         _check_envelope(job, done)

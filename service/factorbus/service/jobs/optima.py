@@ -1,4 +1,4 @@
-"""Batch optima: a question's snapshot becomes a job, somebody does it, the question gets its answer.
+"""Batch optima: a question's copy of the graph becomes a job, somebody does it, the question gets its answer.
 
 For the control thread.
 """
@@ -28,7 +28,7 @@ class Optima:
     open: int = 0
 
     def batch(self, asker: Asker, question: Question, taken: QuestionCopies) -> None:
-        """Answer `question` with χ² and the batch optimum of the snapshot's graph."""
+        """Answer `question` with χ² and the batch optimum of the graph that was copied for it."""
         if self.open >= self.most:
             self.refuse(asker, Busy(self.open, 1.0))
             return

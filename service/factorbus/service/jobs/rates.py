@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from factorbus.proto.camera import Camera
-from factorbus.proto.features import CAMERA_STATE, Ask, Shard, Sighting, answer_size, rows_size
+from factorbus.proto.features import CAMERA_STATE, Ask, Shard, Sighting, answer_size, new_rows_size
 from factorbus.proto.features_codec import encode_ask, encode_shard
 from factorbus.proto.segments import PAGE, Memory
 from factorbus.service.jobs.sharding import Rates
@@ -28,7 +28,7 @@ def measured() -> Rates:
     feature_s = max(0.0, takes(_whole(encode_ask(many), _MANY)) - fixed_s) / _MANY
     rest = fixed_s + feature_s * _WIDE
     number_s = max(0.0, takes(_whole(half, _WIDE)) - rest) / (answer_size(wide._replace(form="half")) / 8)
-    stored_s = max(0.0, _stored(job.do, wide) - rest) / (rows_size(_WIDE, CAMERA_STATE) / 8)
+    stored_s = max(0.0, _stored(job.do, wide) - rest) / (new_rows_size(_WIDE, CAMERA_STATE) / 8)
     return Rates(fixed_s, feature_s, number_s, stored_s or number_s)
 
 
@@ -46,7 +46,7 @@ def _stored(do: Callable[[bytes], bytes], ask: Ask) -> float:
     n, best = ask.sighting.count, 0.0
     for _ in range(_TIMES):
         try:
-            memory = Memory(PAGE + rows_size(n, CAMERA_STATE))
+            memory = Memory(PAGE + new_rows_size(n, CAMERA_STATE))
         except OSError:
             return 0.0
         with memory:

@@ -16,7 +16,7 @@ from factorbus.proto import codec
 from factorbus.proto.messages import Job, JobDone, Optimum
 from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable, UnknownKind
 from factorbus.service.jobs.dispatch import Dispatch, Distrusted, Effect, Ended, InPlace, Send
-from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, is_quick, judged
+from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, checked_result, is_quick
 from factorbus.service.maps.serial_executor import SerialExecutor
 from factorbus.service.questions.answers import as_variables
 from factorbus.solver.errors import SolverError
@@ -119,7 +119,7 @@ class Jobs:
         self._perform(self._dispatch.submit(job, ahead))
 
     def tick(self) -> None:
-        """Give up what has taken too long, and try again whoever has been distrusted for long enough."""
+        """Give up what has taken too long, and try again workers that have been distrusted for long enough."""
         now = time.monotonic()
         for worker in [worker for worker, until in self._until.items() if until < now]:
             del self._until[worker]
@@ -174,10 +174,10 @@ class Jobs:
 
     def _hand_to_checks(self, tag: int, job: Job, result: JobDone) -> None:
         self._checks = self._checks or SerialExecutor("checks")
-        self._checks.hand(lambda: self._control.hand(self._came, tag, judged(job, result)))
+        self._checks.hand(lambda: self._control.hand(self._came, tag, checked_result(job, result)))
 
     def _judge(self, tag: int, job: Job, result: JobDone) -> None:
-        self._came(tag, judged(job, result))
+        self._came(tag, checked_result(job, result))
 
     def _came(self, tag: int, result: JobDone | Any) -> None:
         if isinstance(result, JobDone):

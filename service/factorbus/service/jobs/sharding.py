@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from factorbus.proto.features import FEATURE, Ask, answer_size, rows_size
+from factorbus.proto.features import FEATURE, Ask, answer_size, new_rows_size
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,12 @@ class Work:
 def work_of(ask: Ask) -> Work:
     """The work that a question is."""
     stored = ask.form == "rows" and ask.segment is not None
-    numbers = rows_size(ask.sighting.count, ask.sighting.width) if stored else answer_size(ask)
+    numbers = new_rows_size(ask.sighting.count, ask.sighting.width) if stored else answer_size(ask)
     return Work(ask.sighting.count, answer_size(ask), numbers // 8, stored)
 
 
 def seconds(work: Work, rates: Rates, shards: int = 1) -> float:
-    """What one of so many shards takes to compute: each worker looks at all features and makes its share of rows."""
+    """What one of `shards` shards takes to compute: each worker looks at all features and makes its share of rows."""
     number_s = rates.stored_s if work.stored else rates.number_s
     return rates.fixed_s + rates.feature_s * work.features + number_s * work.numbers / shards
 

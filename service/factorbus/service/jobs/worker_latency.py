@@ -13,7 +13,7 @@ from factorbus.proto.features import Shard, answer_size
 from factorbus.proto.features_codec import encode_ask, encode_shard
 from factorbus.proto.messages import Job, JobDone
 from factorbus.proto.problems import UnknownKind
-from factorbus.service.jobs.job_check import WrongAnswer, judged
+from factorbus.service.jobs.job_check import WrongAnswer, checked_result
 from factorbus.service.jobs.rates import example
 from factorbus.service.jobs.running import Jobs, SendJob
 from factorbus.service.jobs.sharding import RoundTrip
@@ -61,7 +61,7 @@ class WorkerLatency:
         self._known.pop(worker, None)
 
     def look_for(self, suspects: list[str], distrusted: list[str]) -> None:
-        """Time went by: ask again whoever could not be measured, and ask suspects for a sign."""
+        """Time went by: ask again those that could not be measured, and ask suspects for a sign."""
         for worker in self._here - self._asked - set(distrusted):
             if worker in suspects:
                 self._ask(worker, (_SMALL,), {})
@@ -87,7 +87,7 @@ class WorkerLatency:
         self._asked.discard(worker)
         if worker not in self._here:
             return
-        answer = judged(job, result) if isinstance(result, JobDone) else result
+        answer = checked_result(job, result) if isinstance(result, JobDone) else result
         if isinstance(answer, WrongAnswer):
             self._known.pop(worker, None)
             self._jobs.distrust(worker, answer.message)

@@ -1,15 +1,14 @@
 """A map's journal at work: a thread that writes down what was applied, and says when it is safe.
 
-    commit   what came of an InsertBatch is told when the disk has it: answers, deltas and estimates alike, so nobody
-    ever sees
-             what a crash could take back.  While the disk is busy the next inserts are applied; all that waits then
-             goes into one transaction (group commit)
-    group    told at once, written and safe no later than `group_s` afterwards
-    none     told at once, written now and then, safe when the operating system pleases
+    commit   what came of an InsertBatch is published when the disk has it: answers, deltas and estimates alike, so
+             nobody ever sees what a crash could take back.  While the disk is busy the next inserts are applied; all
+             that waits then goes into one transaction (group commit)
+    group    published at once, written and safe no later than `group_s` afterwards
+    none     published at once, written now and then, safe when the operating system pleases
 
 When the disk takes nothing: with commit, what was not written did not happen; it is refused, the solver goes back to
-what the journal has, and questions are answered from there.  Else it has been told, so it is kept here and tried again.
-In any case nothing new is taken in until the disk takes something.
+what the journal has, and questions are answered from there.  Else it has been published, so it is kept here and tried
+again.  In any case nothing new is taken in until the disk takes something.
 """
 
 import logging
@@ -20,11 +19,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
+from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalUnreadable, JournalVersion, NoJournal
 from factorbus.journal.records import JournalRecord
-from factorbus.journal.snapshots import file_of, write_snapshot
-from factorbus.journal.store import Last, Saved, Store, open_store
+from factorbus.journal.store import Checkpoint, Last, Store, open_store
 from factorbus.service.core.events import Arrived, Stepped, Verdict
+from factorbus.service.journal.checkpoint_plan import CheckpointPlan
 from factorbus.service.journal.writing import written
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
@@ -34,14 +34,13 @@ log = logging.getLogger(__name__)
 
 _NONE_S = 1.0  # durability none: how often what there is gets written
 _PAUSES_S = (0.2, 5.0)  # between tries to write again
-_KEPT_SNAPSHOTS = 2
-_SHARE = 0.05  # of the time that steps take, for copies of the solver's state
+_KEPT_CHECKPOINTS = 2
 
 Events: TypeAlias = Sequence[Verdict | Stepped]
 
 
 class Listener(Protocol):
-    """Who is told what becomes of the writing; called on the journal's thread."""
+    """What is called with what becomes of the writing, on the journal's thread."""
 
     def kept(self, events: Events) -> None:
         """What came of an InsertBatch is safe."""
@@ -76,30 +75,12 @@ class _After:
 
 @dataclass(frozen=True, slots=True)
 class _Noted:
-    saved: Saved
+    saved: Checkpoint
     life: int
 
 
 class _Reloaded:
     """The solver is where the journal is."""
-
-
-class SnapshotPlan:
-    """When the solver's state is to be written next, and the thread that does.
-
-    every_s: of steps.  steps_s: of those that a restart would make again already.  differs: what is noted beside each,
-    see `Saved`.
-    """
-
-    def __init__(self, every_s: float, steps_s: float = 0.0, differs: str = "") -> None:
-        self.every_s, self.differs, self.steps_s, self.copying_s = every_s, differs, steps_s, 0.0
-        self.thread: threading.Thread | None = None
-        self.record = 0
-
-    def due(self) -> bool:
-        """Steps have taken long enough, copying takes a small share of it, and none is being written."""
-        waits = max(self.every_s, self.copying_s / _SHARE)
-        return self.steps_s >= waits and (self.thread is None or not self.thread.is_alive())
 
 
 class Keeping(Protocol):
@@ -115,10 +96,10 @@ class Keeping(Protocol):
 
 
 class Keeper:
-    """One map's journal.  `hand` to `snapshot`: on the solver's thread only."""
+    """One map's journal.  `hand` to `checkpoint`: on the solver's thread only."""
 
     def __init__(
-        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, snapshot: "SnapshotPlan",
+        self, store: Store, last: Last, listener: Listener, durability: str, group_s: float, checkpoint: CheckpointPlan,
         begin: Callable[[Store], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._listener = store, listener
@@ -129,14 +110,14 @@ class Keeper:
         self._items: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._ending = threading.Event()
         self._problem: JournalFailed | None = None
-        self._snapshot = snapshot
+        self._checkpoint = checkpoint
         self._life = 0  # counts how often the solver went back to where the journal ends
         self._commits, self._commit_s, self._longest_s, self._inserts = 0, 0.0, 0.0, 0
         self._thread = threading.Thread(target=self._run, name=f"journal {self._folder.name}", daemon=True)
 
     @property
     def waits(self) -> bool:
-        """Whether what is applied is told only when `Listener.kept` is called."""
+        """Whether what is applied is published only when `Listener.kept` is called."""
         return self._durability == "commit"
 
     def start(self) -> JournalFailed | None:
@@ -152,11 +133,11 @@ class Keeper:
         refused."""
         if inserts or events or further:
             self._number += 1
-            self._snapshot.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
+            self._checkpoint.steps_s += sum(event.solver_ms for event in events if isinstance(event, Stepped)) * 1e-3
             self._items.put(_Applied(self._number, inserts, events, further))
 
     def after(self, call: Callable[[], None], dropped: Callable[[JournalFailed], None]) -> None:
-        """Do `call` when all that was handed in so far is told; `dropped` if it never will be."""
+        """Do `call` when all that was handed in so far is published; `dropped` if it never will be."""
         if self.waits:
             self._items.put(_After(call, dropped))
         else:
@@ -177,15 +158,16 @@ class Keeper:
         self._life += 1
         self._items.put(_Reloaded())
 
-    def wants_snapshot(self) -> bool:
+    def wants_checkpoint(self) -> bool:
         """Whether a copy of the solver's state is to be handed in now."""
-        return self._snapshot.due() and self._problem is None
+        return self._checkpoint.due() and self._problem is None
 
-    def snapshot(self, state: dict[str, Any], copying_s: float) -> None:
+    def checkpoint(self, state: dict[str, Any], copying_s: float) -> None:
         """Write `state`, which is that after all that was handed in so far; on a thread of its own."""
-        plan, record = self._snapshot, self._number
+        plan, record = self._checkpoint, self._number
         plan.steps_s, plan.copying_s = 0.0, copying_s
-        plan.thread = threading.Thread(target=self._write_snapshot, args=(state, record, self._life), name="snapshot")
+        args = (state, record, self._life)
+        plan.thread = threading.Thread(target=self._write_checkpoint, args=args, name="checkpoint")
         plan.thread.daemon = True
         plan.thread.start()
 
@@ -204,7 +186,7 @@ class Keeper:
             "inserts": self._inserts,
             "commit_ms": 1e3 * self._commit_s,
             "longest_commit_ms": 1e3 * self._longest_s,
-            "snapshot_record": self._snapshot.record,
+            "checkpoint_record": self._checkpoint.record,
             "blocked": int(self._problem is not None),
             "problem": self._problem.message if self._problem else "",
         }
@@ -214,13 +196,13 @@ class Keeper:
         self._ending.set()
         self._items.put(None)
         self._thread.join()
-        if self._snapshot.thread is not None:
-            self._snapshot.thread.join()
+        if self._checkpoint.thread is not None:
+            self._checkpoint.thread.join()
         if self._problem is None and self._store.writable:
             try:
-                if dump is not None and self._snapshot.steps_s > 0.1 * self._snapshot.every_s:
-                    self._write_snapshot(dump(), self._number, self._life)
-                self._note_snapshots()
+                if dump is not None and self._checkpoint.steps_s > 0.1 * self._checkpoint.every_s:
+                    self._write_checkpoint(dump(), self._number, self._life)
+                self._note_checkpoints()
                 self._store.end()
             except JournalFailed as problem:
                 log.error("%s", problem)
@@ -371,37 +353,37 @@ class Keeper:
         if not self._store.writable:
             raise JournalFailed(self._store.path, "it is read-only")
 
-    # ---- snapshots --------------------------------------------------------------------------------------------------
+    # ---- checkpoints ------------------------------------------------------------------------------------------------
 
-    def _write_snapshot(self, state: dict[str, Any], record: int, life: int) -> None:
+    def _write_checkpoint(self, state: dict[str, Any], record: int, life: int) -> None:
         """On a thread of its own; the journal's thread notes it behind the record that it was made after."""
         started = time.perf_counter()
         path = file_of(self._folder, record)
         try:
-            size = write_snapshot(path, state)
+            size = write_checkpoint(path, state)
         except OSError as error:
-            log.warning("no snapshot in %s: %s; a restart takes longer without it", path, error)
+            log.warning("no checkpoint in %s: %s; a restart takes longer without it", path, error)
             return
         log.info("%s: %.1f MB in %.2f s", path, size / 1e6, time.perf_counter() - started)
-        self._items.put(_Noted(Saved(record, FORMAT, present_build(), self._snapshot.differs, size), life))
+        self._items.put(_Noted(Checkpoint(record, FORMAT, present_build(), self._checkpoint.differs, size), life))
 
     def _note(self, noted: _Noted) -> None:
-        """A snapshot counts once it is noted; one of records that did not happen must not."""
+        """A checkpoint counts once it is noted; one of records that did not happen must not."""
         saved = noted.saved
         if noted.life != self._life:
             file_of(self._folder, saved.record).unlink(missing_ok=True)
             return
         try:
-            old = self._store.add_snapshot(saved, _KEPT_SNAPSHOTS)
+            old = self._store.add_checkpoint(saved, _KEPT_CHECKPOINTS)
         except JournalFailed as problem:
-            log.warning("snapshot %d is not noted: %s", saved.record, problem)
+            log.warning("checkpoint %d is not noted: %s", saved.record, problem)
             file_of(self._folder, saved.record).unlink(missing_ok=True)
             return
-        self._snapshot.record = saved.record
+        self._checkpoint.record = saved.record
         for record in old:
             file_of(self._folder, record).unlink(missing_ok=True)
 
-    def _note_snapshots(self) -> None:
+    def _note_checkpoints(self) -> None:
         """Those that were written while the journal's thread ended."""
         while not self._items.empty():
             if isinstance(item := self._items.get(), _Noted):

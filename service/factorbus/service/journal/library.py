@@ -10,18 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from factorbus.journal.checkpoints import remove_strangers
 from factorbus.journal.folders import GONE, is_map, left_behind, maps_in, sync_folder
 from factorbus.journal.forking import fork_journal
 from factorbus.journal.lock import Owned, own
 from factorbus.journal.problems import JournalDamaged, JournalFailed, JournalOption, NoJournal
 from factorbus.journal.records import Epoch, Header, Maker
-from factorbus.journal.snapshots import remove_strangers
-from factorbus.journal.store import NAME, Last, Saved, Store, create, open_store
+from factorbus.journal.store import NAME, Checkpoint, Last, Store, create, open_store
 from factorbus.proto.nearest import nearest
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Config, Limits
 from factorbus.service.core.map_state import MapCore, Restored
-from factorbus.service.journal.keeping import Keeper, Listener, SnapshotPlan
+from factorbus.service.journal.checkpoint_plan import CheckpointPlan
+from factorbus.service.journal.keeping import Keeper, Listener
 from factorbus.service.journal.recovery import Recovered, answers, recover
 from factorbus.service.solving.apply import MapSolver
 from factorbus.solver.build import present_build
@@ -123,7 +124,7 @@ class Library:
         where, config, because = self._owned.folder, self._config, f"forked from {source} after record {record}"
         epoch = Epoch(secrets.randbits(62) | 1, record + 1, because)
         fork_journal(
-            where / source, where / target, epoch, state, Saved(record, FORMAT, present_build(), copied.differs)
+            where / source, where / target, epoch, state, Checkpoint(record, FORMAT, present_build(), copied.differs)
         )
         store = open_store(where / target, config.durability)
         try:
@@ -148,7 +149,7 @@ class Library:
             raise JournalFailed(path, str(error)) from None
 
     def say(self, text: str) -> None:
-        """Tell whoever else wants the folder who has it."""
+        """Tell other processes that want the folder who has it."""
         self._owned.say(text)
 
     def close(self) -> None:
@@ -183,7 +184,7 @@ class Kept:
         config, recovered = self._config, self.recovered
         # One that has other bits than those before is written as soon as may be: until then they cannot be had again.
         replayed_s = recovered.solver_s if recovered.same else math.inf
-        plan = SnapshotPlan(config.snapshot_s, replayed_s, recovered.differs)
+        plan = CheckpointPlan(config.checkpoint_s, replayed_s, recovered.differs)
         return Keeper(
             self.store, recovered.last, listener, config.durability, config.group_s, plan,
             lambda store: store.begin(config.durability, self._epoch, self._new_maker(store)),
@@ -223,13 +224,13 @@ def _reopened(store: Store, limits: Limits, config: Config) -> Kept:
     map_solver = make_map_solver(header.mode, header.options, header.epoch, limits)
     recovered = recover(store, map_solver)
     if store.writable:
-        remove_strangers(store.path.parent, {saved.record for saved in store.snapshots()})
+        remove_strangers(store.path.parent, {saved.record for saved in store.checkpoints()})
     epoch = None
     if because := _reason_for_an_epoch(header, recovered):
         epoch = Epoch(secrets.randbits(62) | 1, recovered.last.record + 1, because)
         log.warning("%s: a new epoch, because %s", store.path, because)
     log.info(
-        "map %s is back at revision %d in %.2f s: snapshot %d and %d records after it", header.map,
+        "map %s is back at revision %d in %.2f s: checkpoint %d and %d records after it", header.map,
         recovered.last.revision, time.perf_counter() - started, recovered.from_record, recovered.records,
     )  # fmt: skip
     if recovered.other_build:

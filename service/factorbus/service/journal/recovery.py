@@ -1,10 +1,10 @@
-"""A map as its journal has it: from the newest good snapshot and what came after it, or from the very beginning.
+"""A map as its journal has it: from the newest good checkpoint and what came after it, or from the very beginning.
 
 Applied again in the same groups by the same build of the solver, the inserts give the same revisions to the bit; the
 journal's digests of every record tell whether they do.  A further step, of a map that had not converged, is made again,
 too.
 
-A snapshot counts in the format of a state that this version reads, whichever build wrote it: where another one rounds
+A checkpoint counts in the format of a state that this version reads, whichever build wrote it: where another one rounds
 otherwise, the map has what it had up to there, and the rest, applied again, is as good as it was and has other bits.
 That is said, and is no reason to begin at the beginning.  See docs/decisions/state-format.md.
 """
@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from factorbus.journal import chain
+from factorbus.journal.checkpoints import file_of, read_checkpoint
 from factorbus.journal.problems import JournalDiffers
 from factorbus.journal.records import ACCEPTED, REFUSED, UNTRIED, Entry, JournalRecord, Sender
-from factorbus.journal.snapshots import file_of, read_snapshot
-from factorbus.journal.store import Last, Saved, Store
+from factorbus.journal.store import Checkpoint, Last, Store
 from factorbus.proto import codec
 from factorbus.service.core.events import Arrived, Verdict
 from factorbus.service.solving.apply import MapSolver
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 class Recovered(NamedTuple):
     """Where a folder is now.
 
-    from_record: the snapshot it began with, or 0.  records, solver_s: what was applied again, and what its steps took.
+    from_record: the checkpoint it began with, or 0.  records, solver_s: those applied again, and what their steps took.
     other_build: in what the build that made the map differs from this one; empty: in nothing.  same: no record gave
     other bits than it had.  differs: why the journal, run again from its first insert, may give other bits; empty: as
     far as is known it gives the same.
@@ -49,8 +49,8 @@ class Recovered(NamedTuple):
 
 def recover(store: Store, map_solver: MapSolver) -> Recovered:
     """Bring `map_solver` to where the journal ends.  Raises JournalDamaged, JournalDiffers."""
-    saved, whole = _from_snapshot(store, map_solver)
-    begin = store.at(saved.record) if saved else Last(0, 0, chain.START)
+    saved, whole = _from_checkpoint(store, map_solver)
+    begin = store.last_at(saved.record) if saved else Last(0, 0, chain.START)
     history, (other, compared) = _History(store, map_solver), _other_builds(store, saved)
     last, records, differs_from = begin, 0, 0
     for record in store.records(begin.record):
@@ -60,7 +60,7 @@ def recover(store: Store, map_solver: MapSolver) -> Recovered:
         last, records = Last(record.number, record.revision, record.chain), records + 1
     differs = _why_it_differs(saved, other, compared, differs_from)
     if not whole:
-        differs = f"R was computed anew: snapshot {begin.record} has it for vectors of another width ({other})"
+        differs = f"R was computed anew: checkpoint {begin.record} has it for vectors of another width ({other})"
     return Recovered(last, begin.record, records, history.solver_s, other, whole and not differs_from, differs)
 
 
@@ -113,7 +113,7 @@ class _History:
                     if not isinstance(outcome.answer, bytes):
                         log.debug("refused again: %s", outcome.answer)
             else:
-                present = chain.follow(present, event.delta)
+                present = chain.extend_chain(present, event.delta)
                 self.solver_s += event.solver_ms * 1e-3
         for entry in record.entries:
             if entry.outcome != UNTRIED and outcomes[entry.client, entry.sequence] != entry.outcome:
@@ -132,22 +132,22 @@ def answers(sender: Sender) -> Iterator[tuple[int, int, object]]:
         yield entry.sequence, message_digest(entry.message), answer
 
 
-def _from_snapshot(store: Store, map_solver: MapSolver) -> tuple[Saved | None, bool]:
-    """Begin with the newest snapshot that can be used, or with nothing; and whether `map_solver` has it to the bit."""
-    for saved in store.snapshots():
+def _from_checkpoint(store: Store, map_solver: MapSolver) -> tuple[Checkpoint | None, bool]:
+    """Begin with the newest checkpoint that can be used, or nothing; and whether `map_solver` has it to the bit."""
+    for saved in store.checkpoints():
         path = file_of(store.path.parent, saved.record)
         if saved.format != FORMAT:
             log.warning("%s has a state of format %d, this version reads %d: not used", path, saved.format, FORMAT)
             continue
         try:
-            return saved, map_solver.load(read_snapshot(path))
+            return saved, map_solver.load(read_checkpoint(path))
         except (OSError, ValueError, KeyError, TypeError, SolverError) as error:
             log.warning("%s cannot be used: %s", path, error)
     return None, map_solver.load(None)
 
 
-def _other_builds(store: Store, saved: Saved | None) -> tuple[str, int]:
-    """In what another build differs that made the snapshot or a record after it, and how many records it made."""
+def _other_builds(store: Store, saved: Checkpoint | None) -> tuple[str, int]:
+    """In what another build differs that made the checkpoint or a record after it, and how many records it made."""
     here, begin, makers = present_build(), saved.record if saved else 0, store.makers()
     found, count = differences(saved.build, here) if saved else "", 0
     ends = [*(maker.record for maker in makers[1:]), store.last().record + 1]
@@ -158,17 +158,17 @@ def _other_builds(store: Store, saved: Saved | None) -> tuple[str, int]:
     return found, count
 
 
-def _why_it_differs(saved: Saved | None, other: str, compared: int, differs_from: int) -> str:
+def _why_it_differs(saved: Checkpoint | None, other: str, compared: int, differs_from: int) -> str:
     """compared: records of another build that were applied again."""
     if differs_from:
         why = f"another build made them ({other})" if other else "the same build made them"
         return f"from revision {differs_from} on, values have other bits than they had: {why}"
     if saved is None:
         return ""
-    of_snapshot = differences(saved.build, present_build())
-    if not saved.differs and of_snapshot and not compared:
+    of_checkpoint = differences(saved.build, present_build())
+    if not saved.differs and of_checkpoint and not compared:
         none = "no record of it follows that could be compared"
-        return f"another build wrote the snapshot of record {saved.record} ({of_snapshot}), and {none}"
+        return f"another build wrote the checkpoint of record {saved.record} ({of_checkpoint}), and {none}"
     return saved.differs
 
 

@@ -22,7 +22,7 @@ def written(
             outcomes |= {id(outcome.insert): (outcome, event) for outcome in event.outcomes}
             revision = max(revision, event.revision)
         else:
-            present, revision = chain.follow(present, event.delta), event.revision
+            present, revision = chain.extend_chain(present, event.delta), event.revision
             rebuilt = rebuilt or event.rebuilt
     entries = tuple(_entry(insert, *outcomes[id(insert)]) for insert in inserts)
     return JournalRecord(number, revision, rebuilt, present, entries, further and not rebuilt)

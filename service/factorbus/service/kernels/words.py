@@ -1,13 +1,13 @@
 """The words of the wire as a table for kernels: what readers look up and writers copy.
 
-`WORDS` has a row for each, `LETTERS` their bytes one after the other.  The rows of kinds are made from the solver's
-tables, so a new kind needs nothing here; sights are left out, whose lenses are looked at on the usual way.
+`WORDS` has a row for each, `LETTERS` their bytes one after the other.  The rows of kinds and losses are made from the
+solver's tables, so a new one needs nothing here.
 """
 
 import numpy as np
 
 from factorbus.service.kernels.compile import I64, U8, inline_kernel
-from factorbus.solver.graph.factors import FACTOR_KINDS, LENS_AT
+from factorbus.solver.graph.factors import FACTOR_KINDS, LOSSES
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 
 # Columns of `WORDS`.
@@ -18,18 +18,22 @@ W_LENGTH = 3
 W_ARITY = 4
 W_SIZE = 5
 W_TRIANGLE = 6
-W_WIDTH = 7
+W_NIL = 7  # of a field: whether nil is the same as no such field
+W_WIDTH = 8
 
 # Roles.
 PIECE = 0
 IN_INSERT = 1
-IN_GROUP = 2
-VARIABLE_KIND = 3
-FACTOR_KIND = 4
+IN_VARIABLES = 2
+IN_FACTORS = 3
+VARIABLE_KIND = 4
+FACTOR_KIND = 5
+LOSS_NAME = 6
 
 # Codes of the fields of an insert, and of those of a group.
-SEQUENCE, EPOCH, SETTLE, VARIABLES, FACTORS = range(5)
-KIND, KEYS, VALUES, FIXED, MEASURED, INFORMATION, STAMPS = range(7)
+SEQUENCE, EPOCH, SETTLE, CONVERT_BELOW, VARIABLES, FACTORS = range(6)
+KIND, KEYS, NUMBERS, INFORMATION, SCALE, STAMPS, IDS, FIXED, LOSS = range(9)
+GROUP_FIELDS = 9
 
 # What stands between the numbers of the messages that are written; a piece's code is its row.
 _PIECES = (
@@ -37,7 +41,7 @@ _PIECES = (
     b"\xa5epoch",
     b"\xa8revision",
     b"\xacfirst_factor",
-    b"\xa7applied\x01",
+    b"\xa7applied",
     b"\xa6report",
     b"\x85\xa5epoch",
     b"\xa8previous",
@@ -53,22 +57,32 @@ _PIECES = (
     P_KEYS, P_VALUES, P_FIXED, P_STAMPS,
 ) = range(len(_PIECES))  # fmt: skip
 
+_MAY_BE_NIL = {"values", "stamps", "scale", "loss"}
+
 # The longest string that MessagePack gives a head of one byte; others are no words.
 LONGEST = 31
 
 
 def _table() -> tuple[I64, U8]:
-    insert = (b"sequence", b"epoch", b"settle", b"variables", b"factors")
-    group = (b"kind", b"keys", b"values", b"fixed", b"measured", b"information", b"stamps")
-    rows = [(piece, PIECE, code, 0, 0, 0) for code, piece in enumerate(_PIECES)]
-    rows += [(name, IN_INSERT, code, 0, 0, 0) for code, name in enumerate(insert)]
-    rows += [(name, IN_GROUP, code, 0, 0, 0) for code, name in enumerate(group)]
-    rows += [(k.name.encode(), VARIABLE_KIND, k.code, 1, k.size, 0) for k in VARIABLE_KINDS.values()]
-    quick = [kind for kind in FACTOR_KINDS.values() if kind.name not in LENS_AT]
-    rows += [(k.name.encode(), FACTOR_KIND, k.code, len(k.connects), k.size, k.triangle) for k in quick]
+    insert = ("sequence", "epoch", "settle", "convert_below", "variables", "factors")
+    variables = {"kind": KIND, "keys": KEYS, "values": NUMBERS, "stamps": STAMPS, "fixed": FIXED}
+    factors = {
+        "kind": KIND, "keys": KEYS, "measured": NUMBERS, "information": INFORMATION, "scale": SCALE, "ids": IDS,
+        "loss": LOSS,
+    }  # fmt: skip
+    rows: list[tuple[bytes, int, int, tuple[int, ...]]] = []
+    rows += [(piece, PIECE, code, ()) for code, piece in enumerate(_PIECES)]
+    rows += [(name.encode(), IN_INSERT, code, ()) for code, name in enumerate(insert)]
+    for role, fields in ((IN_VARIABLES, variables), (IN_FACTORS, factors)):
+        rows += [(name.encode(), role, code, (0, 0, 0, name in _MAY_BE_NIL)) for name, code in fields.items()]
+    rows += [(k.name.encode(), VARIABLE_KIND, k.code, (1, k.size)) for k in VARIABLE_KINDS.values()]
+    rows += [
+        (k.name.encode(), FACTOR_KIND, k.code, (len(k.connects), k.size, k.triangle)) for k in FACTOR_KINDS.values()
+    ]
+    rows += [(name.encode(), LOSS_NAME, code, ()) for name, code in LOSSES.items()]
     words, letters = np.zeros((len(rows), W_WIDTH), np.int64), b""
-    for row, (name, role, code, *sizes) in zip(words, rows, strict=True):
-        row[:] = role, code, len(letters), len(name), *sizes
+    for row, (name, role, code, sizes) in zip(words, rows, strict=True):
+        row[: W_ARITY + len(sizes)] = role, code, len(letters), len(name), *sizes
         letters += name
     return words, np.frombuffer(letters, np.uint8).copy()
 
@@ -77,13 +91,13 @@ WORDS, LETTERS = _table()
 
 
 @inline_kernel
-def look_up(raw: bytes, start: int, length: int, role: int, words: I64, letters: U8) -> int:
+def look_up(raw: bytes, start: int, length: int, role: int) -> int:
     """The row of the word raw[start : start + length] among those of a role, or −1."""
-    for row in range(words.shape[0]):
-        if words[row, W_ROLE] == role and words[row, W_LENGTH] == length:
+    for row in range(WORDS.shape[0]):
+        if WORDS[row, W_ROLE] == role and WORDS[row, W_LENGTH] == length:
             same, k = True, 0
             while same and k < length:
-                same = raw[start + k] == letters[words[row, W_START] + k]
+                same = raw[start + k] == LETTERS[WORDS[row, W_START] + k]
                 k += 1
             if same:
                 return row
@@ -91,9 +105,9 @@ def look_up(raw: bytes, start: int, length: int, role: int, words: I64, letters:
 
 
 @inline_kernel
-def row_of_variables(code: int, words: I64) -> int:
+def row_of_variables(code: int) -> int:
     """The row of a kind of variables."""
     row = 0
-    while words[row, W_ROLE] != VARIABLE_KIND or words[row, W_CODE] != code:
+    while WORDS[row, W_ROLE] != VARIABLE_KIND or WORDS[row, W_CODE] != code:
         row += 1
     return row

@@ -1,126 +1,121 @@
-"""The answer to an insert and the delta of its step, as bytes: those of `codec.encode_accepted` and `encode_delta`."""
+"""The answers to the inserts of a step and its delta, as bytes: those of `codec.encode_accepted` and `encode_delta`."""
 
 import numpy as np
 
 from factorbus.service.kernels import words as w
-from factorbus.service.kernels.compile import F64, I64, U8, inline_kernel, kernel, part
+from factorbus.service.kernels.compile import I64, U8, inline_kernel, kernel, part
+from factorbus.service.kernels.words import LETTERS, WORDS
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Graph, graph_at
 
+# In place of the revision before a delta: there is none to write.
+NO_DELTA = -1
 # No message is longer than this but for its columns and its report; nor is what a group adds to its columns.
 _MOST_HEAD, _MOST_GROUP = 128, 96
 
 
 @kernel(
-    "UniTuple(int64, 2)(int64, int64, int64, int64, Bytes(uint8, 1, 'C', readonly=True), int64[::1], int64[:,::1],"
-    " int64[::1], float64[::1], int64[::1], int64[:,::1], uint8[::1], uint8[::1])"
+    "int64(int64[:,::1], int64[::1], Bytes(uint8, 1, 'C', readonly=True), int64[::1], int64[::1], uint8[::1],"
+    " int64[::1])"
 )
-def write_messages(
-    sequence: int,
-    epoch: int,
-    revision: int,
-    first_factor: int,
-    report: bytes,
-    changed: I64,
-    var: I64,
-    keys: I64,
-    values: F64,
-    stamps: I64,
-    words: I64,
-    letters: U8,
-    out: U8,
-) -> tuple:
-    """Write the answer to the only insert of a step, and behind it the delta; gives their lengths, (0, 0): no room.
+def write_messages(answers: I64, step: I64, report: bytes, changed: I64, graph_table: I64, out: U8, ends: I64) -> int:
+    """Write the answers to the inserts of a step, one behind the other, and then its delta.
 
-    report: encoded, in both.  changed: the variables that the delta tells of, ascending.
+    Gives how much of `out` they take at most; where that is more than there is, nothing was written.
+
+    answers (n, 2): of each insert its sequence number and the id of its first factor.  step (3,): epoch, revision, and
+    the one before, or NO_DELTA.  report: encoded, in all of them.  changed: the variables that the delta tells of,
+    ascending.  graph_table: of the graph's arrays (`records`).  out ends (n + 1,): where each message ends.
     """
-    groups, stamped, columns = count_groups(changed, var, stamps, words)
-    size = 2 * (_MOST_HEAD + len(report)) + columns
-    for label in range(groups.size):
-        if groups[label] > 0:
-            size += _MOST_GROUP
+    graph, inserts = graph_at(graph_table), len(answers)
+    groups, stamped, columns = count_groups(changed, graph)
+    size = (inserts + 1) * (_MOST_HEAD + len(report)) + columns + _MOST_GROUP * np.count_nonzero(groups)
     if size > out.size:
-        return 0, 0
-    here = write_integer(out, write_piece(out, 0, w.P_SEQUENCE, words, letters), sequence)
-    here = write_integer(out, write_piece(out, here, w.P_EPOCH, words, letters), epoch)
-    here = write_integer(out, write_piece(out, here, w.P_REVISION, words, letters), revision)
-    here = write_integer(out, write_piece(out, here, w.P_FIRST_FACTOR, words, letters), first_factor)
-    here = write_piece(out, here, w.P_APPLIED, words, letters)
-    answer = write_bytes(out, write_piece(out, here, w.P_REPORT, words, letters), report, 0, len(report))
-    here = write_integer(out, write_piece(out, answer, w.P_DELTA, words, letters), epoch)
-    here = write_integer(out, write_piece(out, here, w.P_REVISION, words, letters), revision)
-    here = write_integer(out, write_piece(out, here, w.P_PREVIOUS, words, letters), revision - 1)
-    here = write_variables(out, write_piece(out, here, w.P_VARIABLES, words, letters), groups, stamped, changed, var,
-                           keys, values, stamps, words, letters)  # fmt: skip
-    here = write_bytes(out, write_piece(out, here, w.P_REPORT, words, letters), report, 0, len(report))
-    return answer, here - answer
+        return size
+    here = 0
+    for n in range(inserts):
+        here = write_integer(out, write_piece(out, here, w.P_SEQUENCE), answers[n, 0])
+        here = write_integer(out, write_piece(out, here, w.P_EPOCH), step[0])
+        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[1])
+        here = write_integer(out, write_piece(out, here, w.P_FIRST_FACTOR), answers[n, 1])
+        here = write_integer(out, write_piece(out, here, w.P_APPLIED), inserts)
+        here = write_bytes(out, write_piece(out, here, w.P_REPORT), report, 0, len(report))
+        ends[n] = here
+    if step[2] != NO_DELTA:
+        here = write_integer(out, write_piece(out, here, w.P_DELTA), step[0])
+        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[1])
+        here = write_integer(out, write_piece(out, here, w.P_PREVIOUS), step[2])
+        here = write_variables(out, write_piece(out, here, w.P_VARIABLES), groups, stamped, changed, graph)
+        here = write_bytes(out, write_piece(out, here, w.P_REPORT), report, 0, len(report))
+    ends[inserts] = here
+    return size
 
 
 @part
-def count_groups(changed: I64, var: I64, stamps: I64, words: I64) -> tuple:
+def count_groups(changed: I64, graph: Graph) -> tuple:
     """(how many there are of each kind, those that are not fixed before those that are; how many of them have a time
     stamp; bytes of their columns)."""
     kinds = 0
-    for row in range(words.shape[0]):
-        if words[row, w.W_ROLE] == w.VARIABLE_KIND:
-            kinds = max(kinds, words[row, w.W_CODE] + 1)
+    for row in range(WORDS.shape[0]):
+        if WORDS[row, w.W_ROLE] == w.VARIABLE_KIND:
+            kinds = max(kinds, WORDS[row, w.W_CODE] + 1)
+    var, stamps = graph.var, graph.stamps
     groups, stamped, size = np.zeros(2 * kinds, np.int64), np.zeros(2 * kinds, np.int64), 0
     for n in range(changed.size):
-        label = label_of(changed[n], var)
-        groups[label] += 1
-        stamped[label] += 1 if stamps[changed[n]] != at.NO_STAMP else 0
-    for label in range(groups.size):
-        if groups[label] > 0:
-            columns = 1 + words[w.row_of_variables(label // 2, words), w.W_SIZE] + (1 if stamped[label] > 0 else 0)
-            size += 8 * groups[label] * columns
+        group = label_of_variable(changed[n], var)
+        groups[group] += 1
+        stamped[group] += 1 if stamps[changed[n]] != at.NO_STAMP else 0
+    for group in range(groups.size):
+        if groups[group] > 0:
+            columns = 1 + WORDS[w.row_of_variables(group // 2), w.W_SIZE] + (1 if stamped[group] > 0 else 0)
+            size += 8 * groups[group] * columns
     return groups, stamped, size
 
 
 @part
-def write_variables(
-    out: U8, here: int, groups: I64, stamped: I64, changed: I64, var: I64, keys: I64, values: F64, stamps: I64,
-    words: I64, letters: U8,
-) -> int:  # fmt: skip
+def write_variables(out: U8, here: int, groups: I64, stamped: I64, changed: I64, graph: Graph) -> int:
     """The field `variables` of a delta; gives where to write on."""
+    var, keys, values, stamps = graph.var, graph.keys, graph.values, graph.stamps
     here = write_count(out, here, 0x90, np.count_nonzero(groups))
-    for label in range(groups.size):
-        count = groups[label]
+    for group in range(groups.size):
+        count = groups[group]
         if count == 0:
             continue
-        row = w.row_of_variables(label // 2, words)
-        size, fixed = words[row, w.W_SIZE], label % 2
-        out[here] = 0x83 + fixed + (1 if stamped[label] > 0 else 0)
-        here = write_piece(out, here + 1, w.P_KIND, words, letters)
-        out[here] = 0xA0 + words[row, w.W_LENGTH]
-        here = write_piece(out, here + 1, row, words, letters)
-        here = write_bin_head(out, write_piece(out, here, w.P_KEYS, words, letters), 8 * count)
+        row = w.row_of_variables(group // 2)
+        size, fixed = WORDS[row, w.W_SIZE], group % 2
+        out[here] = 0x83 + fixed + (1 if stamped[group] > 0 else 0)
+        here = write_piece(out, here + 1, w.P_KIND)
+        out[here] = 0xA0 + WORDS[row, w.W_LENGTH]
+        here = write_piece(out, here + 1, row)
+        here = write_bin_head(out, write_piece(out, here, w.P_KEYS), 8 * count)
         for n in range(changed.size):
-            if label_of(changed[n], var) == label:
+            if label_of_variable(changed[n], var) == group:
                 here = write_word(out, here, keys[changed[n]])
-        here = write_bin_head(out, write_piece(out, here, w.P_VALUES, words, letters), 8 * count * size)
+        here = write_bin_head(out, write_piece(out, here, w.P_VALUES), 8 * count * size)
         for n in range(changed.size):
-            if label_of(changed[n], var) == label:
+            if label_of_variable(changed[n], var) == group:
                 for c in range(size):
                     here = write_word(out, here, np.float64(values[var[changed[n], at.V_AT] + c]).view(np.int64))
         if fixed:
-            here = write_piece(out, here, w.P_FIXED, words, letters)
-        if stamped[label] > 0:
-            here = write_bin_head(out, write_piece(out, here, w.P_STAMPS, words, letters), 8 * count)
+            here = write_piece(out, here, w.P_FIXED)
+        if stamped[group] > 0:
+            here = write_bin_head(out, write_piece(out, here, w.P_STAMPS), 8 * count)
             for n in range(changed.size):
-                if label_of(changed[n], var) == label:
+                if label_of_variable(changed[n], var) == group:
                     here = write_word(out, here, stamps[changed[n]])
     return here
 
 
 @inline_kernel
-def label_of(variable: int, var: I64) -> int:
+def label_of_variable(variable: int, var: I64) -> int:
     """What tells groups apart: the kind, and whether it is fixed."""
     return 2 * var[variable, at.V_KIND] + (1 if var[variable, at.V_COLUMN] < 0 else 0)
 
 
 @part
-def write_piece(out: U8, here: int, row: int, words: I64, letters: U8) -> int:
+def write_piece(out: U8, here: int, row: int) -> int:
     """What is in a row of the table."""
-    return write_bytes(out, here, letters, words[row, w.W_START], words[row, w.W_LENGTH])
+    return write_bytes(out, here, LETTERS, WORDS[row, w.W_START], WORDS[row, w.W_LENGTH])
 
 
 @part

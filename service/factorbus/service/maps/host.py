@@ -1,13 +1,13 @@
 """One map at work: its core, its lock, its solver and the thread that the solver runs on.  Knows no bus.
 
-Whoever brings an event takes the lock for the microseconds that the core needs; what the core wants done is done
-after the lock is free again.
+The thread that brings an event takes the lock for the microseconds that the core needs; what the core wants done is
+done after the lock is free again.
 
-There is one InsertBatch at a time, and whoever has it has the solver.  It goes to the map's own thread, unless it is
-short: then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small
-exchange). That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps (the
-inline_run): however wrong the guess was, only the client that sent the insert is not heard meanwhile.  An InsertBatch
-ends (Applied) when its messages are sent or in the outbox, so deltas leave in order.
+There is one InsertBatch at a time, and the thread that has it has the solver.  It goes to the map's own thread, unless
+it is short: then the thread that brought the insert does it at once, which saves waking two others (a tenth of a small
+exchange).  That thread is one of the few with which Zenoh receives, so only one may do so at a time, over all maps
+(the inline_run): however wrong the guess was, only the client that sent the insert is not heard meanwhile.  An
+InsertBatch ends (Applied) when its messages are sent or in the outbox, so deltas leave in order.
 """
 
 import logging
@@ -25,7 +25,7 @@ from factorbus.service.core.events import (
     Answer,
     Applied,
     Arrived,
-    Asked,
+    ArrivedQuestion,
     Asker,
     Effect,
     InsertBatch,
@@ -45,7 +45,7 @@ from factorbus.solver.errors import SolverError
 
 log = logging.getLogger(__name__)
 
-# What a core wants done; answer(reads, snapshot) turns snapshots into answers, elsewhere.
+# What a core wants done; answer(reads, copies) turns copies into answers, elsewhere.
 Perform: TypeAlias = Callable[[list[Effect]], None]
 SendBoth: TypeAlias = Callable[[Asker, bytes, bytes], None]
 AnswerReads: TypeAlias = Callable[[Sequence[Read], QuestionCopies], None]
@@ -122,10 +122,10 @@ class Host:
             effects = self.core.unread(client, refuse)
         self._perform(effects)
 
-    def ask(self, asked: Asked) -> None:
+    def ask(self, question: ArrivedQuestion) -> None:
         """A question came in."""
         with self._lock:
-            effects = self.core.ask(asked, time.monotonic())
+            effects = self.core.ask(question, time.monotonic())
         self._perform(effects)
 
     def read(self, read: Read) -> None:
@@ -287,9 +287,9 @@ class Host:
                 effects = self.core.kept(events, time.monotonic())
             tell(effects)
         replaced = any(isinstance(event, Stepped) and event.rebuilt for event in events)
-        if replaced or ((run.inserts or run.further) and keeper.wants_snapshot()):
+        if replaced or ((run.inserts or run.further) and keeper.wants_checkpoint()):
             started = time.perf_counter()
-            keeper.snapshot(self._map_solver.dump(), time.perf_counter() - started)
+            keeper.checkpoint(self._map_solver.dump(), time.perf_counter() - started)
         with self._lock:
             effects = self.core.applied(applied)
         self._perform(effects)
@@ -301,7 +301,7 @@ class Host:
             self._refuse(reads, problem)
         except Exception:
             reference = secrets.token_hex(4)
-            log.exception("fault %s: no snapshot of map %s", reference, self.core.name)
+            log.exception("fault %s: no copies of map %s", reference, self.core.name)
             self._refuse(reads, Internal(reference))
         else:
             self._answer_after(reads, taken)

@@ -13,7 +13,7 @@ from typing import Any
 
 
 class CompileSplit:
-    """What is taken and what is left.  claims: a folder where whoever comes first makes a file with a kernel's name.
+    """What is taken and what is left.  claims: a folder where the first process makes a file with a kernel's name.
 
     functions: of every kernel those that it calls, directly or not, and itself, with how large they are.
     """

@@ -49,7 +49,7 @@ class HealthReport:
 
     def account(self) -> dict[str, Any]:
         """What admin/stats says, and what the metrics are made of."""
-        from factorbus.service.operations.warm import compiled_seconds
+        from factorbus.service.operations.warm import seconds_compiling
 
         return {
             "service": self._service,
@@ -62,7 +62,7 @@ class HealthReport:
             "missing": self.health.missing(),
             "silent_s": self.health.silent_s(),
             "memory": {"resident_bytes": self.memory.resident, "limit_bytes": self.memory.limit},
-            "kernels_compiled_s": compiled_seconds(),
+            "kernels_compiled_s": seconds_compiling(),
             "maps": [host.account() for host in self._hosts().values()],
             **{name: read() for name, read in self.chapters.items()},
         }

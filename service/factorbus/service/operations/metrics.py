@@ -4,7 +4,7 @@
     /live      200 while no thread is stuck, else 503, with the names of those that are
     /ready     200 while it is alive and takes inserts, else 503
 
-Whoever reaches the port can read: what it says has names of maps and workers in it, and nothing of what is in maps.
+All who reach the port can read: what it says has names of maps and workers in it, and nothing of what is in maps.
 """
 
 import logging
@@ -209,7 +209,7 @@ class _Server(ThreadingHTTPServer):
         self._room = threading.BoundedSemaphore(self._THREADS)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Whoever opens many connections and says nothing gets no more threads than there is room for."""
+        """A client that opens many connections and says nothing gets no more threads than there is room for."""
         if self._room.acquire(blocking=False):
             super().process_request(request, client_address)
         else:

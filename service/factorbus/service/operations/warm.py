@@ -1,8 +1,8 @@
 """Compile every kernel of the service ahead of its first use: the solver's, those of features, those of the wire.
 
 A cold start is shared out: one process for each core, and each takes one kernel after the other that nobody has
-(`compile_split.py`).  Who has what is told by files, made by whoever comes first; the kernels themselves meet on disk.
-Then this process loads them all.
+(`compile_split.py`).  Files, made by the process that comes first, show who has what; the kernels themselves meet on
+disk.  Then this process loads them all.
 
 It compiles none itself.  Code that has just been compiled and the same from disk are linked in another order, and may
 round the last bit otherwise; what comes of a journal after a restart is to be what it was, to the bit.
@@ -50,9 +50,9 @@ def warm(progress: Callable[[str], None] | None = None) -> float:
     return time.monotonic() - started
 
 
-def compiled_seconds() -> float:
+def seconds_compiling() -> float:
     """Seconds that this process spent compiling kernels, or waiting for those that did it for it."""
-    return solver.compiled_seconds() + sum(_apart)
+    return solver.compile_seconds() + sum(_apart)
 
 
 def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:

@@ -57,7 +57,7 @@ class Health:
         self._signs = signs
 
     def silent_s(self) -> dict[str, float]:
-        """Every thread's silence up to now, with that of whoever looks."""
+        """Every thread's silence up to now, with that of the thread that looks."""
         signs = self._signs
         since_s = time.monotonic() - signs.at
         silent = {name: seconds + since_s if seconds else 0.0 for name, seconds in signs.silent_s.items()}

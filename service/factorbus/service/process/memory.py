@@ -1,7 +1,7 @@
 """The memory of this process: how much it has, how much it may have, and whether there is room for more.
 
 The kernel's own answer to too much memory is to kill the process.  So from a limit below that on, what would make maps
-grow is refused, and who is refused is told why; questions, jobs and dropping maps go on.
+grow is refused, and a refusal says why; questions, jobs and dropping maps go on.
 """
 
 import os

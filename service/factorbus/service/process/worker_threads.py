@@ -31,7 +31,7 @@ class WorkerThreads:
 
     From when a map has `from_bytes` of memory: the steps of a smaller one are over before another core has brought
     anything.  And from when the kernel that eliminates is at hand: threads that asked for it before would compile it,
-    for nobody yet, and whoever closes this would have to wait for them.
+    for nobody yet, and a thread that closes this would have to wait for them.
     """
 
     def __init__(self, cores: int, from_bytes: int) -> None:

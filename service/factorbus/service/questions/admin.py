@@ -20,7 +20,7 @@ class OtherMode(Problem):
 
 
 class MovedOn(Problem):
-    """The map is not at the revision that whoever wants to drop it has in mind."""
+    """The map is not at the revision that the client who wants to drop it has in mind."""
 
     code = "moved_on"
 
@@ -92,7 +92,7 @@ class Fork(NamedTuple):
 def read_create(payload: bytes) -> tuple[str, str]:
     """(map, mode) of an admin/create.  Raises BadMessage, BadOption, BadName, TooLarge."""
     content = codec.decode_map(payload, REQUEST_LIMITS, what="create")
-    return _map_name(content, "create"), fields.word("create", content, "mode", tuple(MODES), "auto")
+    return _map_name(content, "create"), fields.choice_of("create", content, "mode", tuple(MODES), "auto")
 
 
 class Drop(NamedTuple):

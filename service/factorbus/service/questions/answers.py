@@ -1,6 +1,6 @@
-"""What may be asked of a map, and the answers, made from a snapshot of one revision.
+"""What may be asked of a map, and the answers, made from copies of one revision.
 
-A snapshot is taken on the solver's thread between two steps and is a copy: making and sending the answer is
+The copies are made on the solver's thread between two steps: making and sending the answer is
 somebody else's time, and no reader sees half a step or holds one up.
 """
 
@@ -83,7 +83,7 @@ class QuestionCopies:
 
     @property
     def graph(self) -> Graph:
-        """The whole map, if the snapshot was taken for a question that needs it."""
+        """The whole map, if it was copied for a question that needs it."""
         return Graph(self.epoch, self.revision, Batch(self.variables, self.factors))
 
 
@@ -107,8 +107,8 @@ def parse(name: str, payload: bytes) -> Question:
 
 def _export(content: dict[str, Any]) -> Question:
     """The question for a file.  Raises BadMessage, BadOption."""
-    format = fields.word("question", content, "format", _FORMATS, "g2o")
-    ids = fields.word("question", content, "ids", _IDS, "auto")
+    format = fields.choice_of("question", content, "format", _FORMATS, "g2o")
+    ids = fields.choice_of("question", content, "ids", _IDS, "auto")
     robot = fields.text("question", content, "robot", "") if content.get("robot") is not None else None
     if robot is not None and (len(robot) > 1 or (robot and not (robot.isascii() and robot.isalpha()))):
         raise BadOption("question.robot", f"is {robot[:40]!r}", "one ASCII letter, or an empty string")
@@ -208,7 +208,7 @@ def is_computed(question: Question, taken: QuestionCopies) -> bool:
 
 
 def check_ready(question: Question, taken: QuestionCopies) -> None:
-    """Raises what `question` was refused with when the snapshot was taken."""
+    """Raises what `question` was refused with when copies were made."""
     if isinstance(ready := taken.ready.get(id(question)), Exception):
         raise ready
 
@@ -261,7 +261,7 @@ def _answer_or_problem(uncertain: Uncertain, question: Question) -> bytes | Exce
 
 def _uncertain(taken: QuestionCopies) -> Uncertain:
     if taken.uncertain is None:
-        raise ValueError("the snapshot was not taken for this question")
+        raise ValueError("nothing was copied for this question")
     return taken.uncertain
 
 

@@ -49,7 +49,7 @@ def of_blocks(blocks: CovarianceBlocks, variables: I64) -> Cost:
 
 
 def of_candidates(blocks: CovarianceBlocks, count: int, numbers: int) -> Cost:
-    """Candidate factors, with so many numbers in the answer for each."""
+    """Candidate factors, with `numbers` numbers in the answer for each."""
     square, answer = blocks.width * blocks.width, _NUMBER * numbers * count
     whole = 2 * blocks.factored.count if blocks.prefers_all(2 * count) else 0
     memory = _NUMBER * square * (whole + _BLOCKS * count) + _OF_A_CANDIDATE * count
@@ -57,7 +57,7 @@ def of_candidates(blocks: CovarianceBlocks, count: int, numbers: int) -> Cost:
 
 
 def of_joint_innovations(blocks: CovarianceBlocks, variables: I64, numbers: int) -> int:
-    """Memory for the covariance of so many numbers that candidates on `variables` measure, all together."""
+    """Memory for the covariance of `numbers` numbers that candidates on `variables` measure, all together."""
     inner = int(blocks.factored.dims[variables].sum())
     substituted = (blocks.path_scalars(variables) + inner) * (inner + 16)
     return _NUMBER * (substituted + 3 * inner * inner + 2 * numbers * inner + 3 * numbers * numbers)

@@ -7,7 +7,7 @@
     4  a step that left anything that is not finite, or beyond its bounds, has failed as well (`divergence`)
 
 An insert that changes what the map has, rather than only adding to it, is a step by itself.  Changes of factors are a
-step of the solver as it is, if it can make them (`Solver.try_change`); for all others another solver is made with the
+step of the solver as it is, if it can make them (`try_change`); for all others another solver is made with the
 change in it, and takes the place of the old one if all went well.  The delta of that has the whole estimate.
 
 Where the map is not at its optimum and nothing waits, a further step goes on, with nothing staged.
@@ -24,21 +24,17 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any, NamedTuple, cast
 
-import numpy as np
-
-from factorbus.proto import codec
-from factorbus.proto.messages import Accepted, Batch, Insert
+from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Applied, Arrived, Outcome, ParsedInsert, SingleInsertResult, Stepped, Verdict
-from factorbus.service.kernels.words import LETTERS, WORDS
-from factorbus.service.kernels.write import write_messages
 from factorbus.service.solving.holding import Broken, Holding
-from factorbus.solver.divergence import check_step, copied, is_sound, is_usual, unstage
-from factorbus.solver.errors import Diverged, SolverError
-
-# The answer and the delta of one insert, if they are to be written in one piece; their reports count twice.
-_ALONE_BYTES = 48 << 10
+from factorbus.solver.changing import try_change, with_changes, with_converted
+from factorbus.solver.divergence import check_step, copied, find_diverged, is_usual
+from factorbus.solver.errors import SolverError
+from factorbus.solver.graph.columns import Columns
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import I64
 
 GOES_ON = "the map goes on converging, without an insert"
 
@@ -46,14 +42,25 @@ log = logging.getLogger(__name__)
 
 
 class _Staged(NamedTuple):
+    """An insert that the solver has taken; of its first factor the id."""
+
     insert: Arrived
     first_factor: int
-    settle: bool
-    convert_below: float = 0.0
+
+
+class _Added(NamedTuple):
+    """What came of inserts: the verdict on them, and the steps that were made."""
+
+    verdict: Verdict
+    steps: Sequence[Stepped] = ()
 
 
 class _TakenBack(Exception):
-    """A step with several inserts failed: the solver is as it was before them."""
+    """A step with several inserts failed: the solver is as it was before them, by way of these steps."""
+
+    def __init__(self, steps: Sequence[Stepped] = ()) -> None:
+        self.steps = steps
+        super().__init__()
 
 
 class MapSolver(Holding):
@@ -64,10 +71,6 @@ class MapSolver(Holding):
     ) -> None:
         super().__init__(make_solver, epoch, limits, options)
         self._cpu_s = 0.0  # of every thread that applied
-        self._out = np.empty(_ALONE_BYTES, np.uint8)
-        self._out_bytes = self._out.data
-        self._pack = codec.report_encoder()
-        self._fault_before: Exception | None = None  # a fault of the solver that is still to be dealt with
 
     def apply_again(
         self, inserts: Sequence[Arrived], rebuilt: bool = False, further: bool = False
@@ -105,10 +108,26 @@ class MapSolver(Holding):
     def apply_batch(
         self, inserts: Sequence[Arrived], further: bool
     ) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
-        """All that an InsertBatch asks for: `inserts`, or a `further` step where there are none."""
+        """All that an InsertBatch asks for: `inserts`, or a `further` step where there are none.
+
+        Of one insert that only adds, and is accepted, all of it in one.
+        """
         if further:
             return self.go_on()
-        return self.apply_single(inserts[0]) if len(inserts) == 1 else self.apply(inserts)
+        if len(inserts) != 1 or inserts[0].is_change or getattr(inserts[0].content, "convert_below", 0.0):
+            return self.apply(inserts)
+        started = time.perf_counter()
+        verdict, steps = self._add_together(inserts)
+        now = time.monotonic()
+        # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
+        self._cpu_s += time.perf_counter() - started
+        if not verdict.together or len(steps) != 1 or steps[0].rebuilt:
+            return iter((verdict, *steps, Applied(*self.size, self._cpu_s, now)))
+        (outcome,), (step,) = verdict.outcomes, steps
+        return SingleInsertResult(
+            outcome.insert, outcome.answer, step.delta, outcome.first_factor, step.revision, step.strategy, step.chi2,
+            step.solver_ms, *self._held, self._cpu_s, now, step.converged, step.unfinished,
+        )  # fmt: skip
 
     def go_on(self) -> Iterator[Stepped | Applied]:
         """One step without an insert: Stepped, unless the solver refuses it and is as it was; Applied."""
@@ -163,13 +182,129 @@ class MapSolver(Holding):
                 yield from self._add(list(group))
         yield self._applied(cpu_s)
 
+    def _applied(self, cpu_s: float) -> Applied:
+        self._cpu_s += time.thread_time() - cpu_s
+        return Applied(*self.size, self._cpu_s, time.monotonic())
+
     def _add(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped]:
         """Inserts that only add: in one step, or one at a time where that fails."""
         try:
-            yield from self._together(inserts)
-        except _TakenBack:
+            added = self._add_together(inserts)
+        except _TakenBack as taken_back:
+            yield from taken_back.steps
             for insert in inserts:
-                yield from self._together([insert])
+                yield from self._add([insert])
+            return
+        yield added.verdict
+        yield from added.steps
+        accepted = [outcome.insert.content for outcome in added.verdict.outcomes if outcome.first_factor >= 0]
+        if below := max((cast(Insert, content).convert_below for content in accepted), default=0.0):
+            yield from self._convert_to_points(below)
+
+    def _add_together(self, inserts: Sequence[Arrived]) -> _Added:
+        """All of `inserts` in one step.  Raises _TakenBack if it failed with several staged."""
+        started = time.perf_counter()
+        staged: list[_Staged] = []
+        refused: list[Outcome] = []
+        kept: Any = None  # the solver as it was, where inserts are tried on a copy
+        held = self._held
+        try:
+            for insert in inserts:
+                try:
+                    first_factor, held = self._stage(insert, held)
+                    staged.append(_Staged(insert, first_factor))
+                except (Problem, SolverError) as problem:
+                    refused.append(Outcome(insert, problem))
+            if not staged:
+                return _Added(Verdict(tuple(refused)))
+            if self._wary or not is_usual(self._solver, *self._held):
+                kept, self._solver, held = self._solver, copied(self._solver), self._held
+                for each in staged:
+                    _, held = self._stage(each.insert, held)
+            report = self._solver.step(settle=any(each.insert.content.settle for each in staged))  # type: ignore[union-attr]
+        except SolverError as problem:
+            self._solver = kept or self._solver
+            if len(staged) > 1:
+                raise _TakenBack from problem
+            return _Added(Verdict((*refused, Outcome(staged[0].insert, problem))))
+        except Exception:
+            self._solver = kept or self._solver
+            reference = self._fault()
+            steps = list(self._replace_solver(reference))
+            if len(inserts) > 1:
+                raise _TakenBack(steps) from None
+            return _Added(Verdict((Outcome(inserts[0], Internal(reference)),)), steps)
+        try:
+            changed, graph = self._solver.pick_changed()
+            diverged = find_diverged(changed, graph, report)
+        except Exception:
+            return self._told_nothing(staged, refused, self._account_of(report, started, {}))
+        if diverged is not None:
+            steps = []
+            if kept is not None:
+                self._solver = kept
+            else:
+                steps = list(self._go_back(report))
+            if len(staged) > 1:
+                raise _TakenBack(steps)
+            return _Added(Verdict((*refused, Outcome(staged[0].insert, diverged))), steps)
+        self._wary = self._wary or kept is not None
+        return self._told_of(staged, refused, self._account_of(report, started, {}), (changed, graph))
+
+    def _stage(self, insert: Arrived, held: tuple[int, int]) -> tuple[int, tuple[int, int]]:
+        """Hand one insert to the solver, which holds so many variables and factors; gives the id of its first factor,
+        and how many it holds then.  Raises Problem, SolverError: then nothing changed."""
+        content = insert.content
+        if self._broken:
+            raise Broken(self._broken)
+        if isinstance(content, ParsedInsert):
+            held = self._check_room(held, content.variables, content.factors)
+            return self._solver.stage(Columns(content.groups, content.message)), held
+        if isinstance(content, Problem):
+            raise content
+        held = self._check_room(held, content.batch.variable_count, content.batch.factor_count)
+        return self._solver.stage(content.batch), held
+
+    def _check_room(self, held: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
+        """How many variables and factors the map has with so many more.  Raises TooLarge beyond its limits."""
+        limits, with_them = self._limits, (held[0] + variables, held[1] + factors)
+        if with_them[0] > limits.variables:
+            raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables")
+        if with_them[1] > limits.factors:
+            raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors")
+        return with_them
+
+    def _account_of(self, report: Any, started: float, counted: Mapping[str, int]) -> dict[str, Any]:
+        """What the answers and the delta of a step say of it; the map is at its revision then."""
+        account = report.as_dict() | counted
+        account["solver_ms"] = (time.perf_counter() - started) * 1e3
+        self._next(account)
+        self._held = self._held[0] + report.new_variables, self._held[1] + report.new_factors
+        return account
+
+    def _told_of(
+        self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any],
+        changed: tuple[I64, Graph], previous: int | None = None,
+    ) -> _Added:  # fmt: skip
+        """The step went well: the answers and the delta; previous: 0 where that has everything."""
+        step = self._step(self._revision - 1 if previous is None else previous)
+        try:
+            *answers, delta = self._messages.write(_numbers(staged), step, account, *changed)
+        except Exception:
+            return self._told_nothing(staged, refused, account)
+        return _Added(self._accepted(staged, refused, answers), (self._stepped_to(delta),))
+
+    def _told_nothing(self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any]) -> _Added:
+        """The step is done and is answered, but its delta cannot be made: who misses it sees the gap."""
+        answers = self._messages.write_answers(_numbers(staged), self._epoch, self._revision, account)
+        accepted = self._accepted(staged, refused, answers)
+        return _Added(accepted, list(self._replace_solver(self._fault())))
+
+    def _accepted(self, staged: Sequence[_Staged], refused: Sequence[Outcome], answers: Sequence[bytes]) -> Verdict:
+        accepted = [
+            Outcome(each.insert, answer, each.first_factor) for each, answer in zip(staged, answers, strict=True)
+        ]
+        return Verdict((*accepted, *refused), self._revision, len(staged))
 
     def _change(self, insert: Arrived) -> Iterator[Verdict | Stepped]:
         """One that changes what the map has: in place, or in a new solver; the map is as it was where that fails."""
@@ -177,9 +312,9 @@ class MapSolver(Holding):
         try:
             if self._broken:
                 raise Broken(self._broken)
-            self._check_room(insert.size, content.batch)
+            self._check_room(self._held, content.batch.variable_count, content.batch.factor_count)
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
-            came = None if self._wary else self._solver.try_change(content.changes, content.batch, content.settle)
+            came = None if self._wary else try_change(self._solver, content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:
             yield Verdict((Outcome(insert, problem),))
             return
@@ -199,8 +334,8 @@ class MapSolver(Holding):
         """The same in a new solver."""
         content = cast(Insert, insert.content)
         try:
-            solver, first_factor, report, counted = self._solver.with_changes(
-                content.changes, content.batch, content.settle
+            solver, first_factor, report, counted = with_changes(
+                self._solver, content.changes, content.batch, content.settle
             )
             check_step(solver, report)
         except (Problem, SolverError) as problem:
@@ -219,207 +354,16 @@ class MapSolver(Holding):
         previous: int | None,
     ) -> Iterator[Verdict | Stepped]:  # fmt: skip
         """The step went well; previous: 0 where its delta is to have everything."""
-        content = cast(Insert, insert.content)
-        staged = _Staged(insert, first_factor, content.settle, content.convert_below)
-        yield from self._stepped([staged], [], report, started, counted, previous)
-        if content.convert_below:
-            yield from self._convert_to_points(content.convert_below)
-
-    def apply_single(self, insert: Arrived) -> SingleInsertResult | Iterator[Verdict | Stepped | Applied]:
-        """What `apply` comes to for one insert: in one piece where all goes as usual, in a third of the time.
-
-        That time is mostly one of code that is not in the caches: so it is written in few calls.
-        """
-        content, solver, limits, most = insert.content, self._solver, self._limits, insert.size // 8
-        variables, factors = self._held
-        has_room = variables + most <= limits.variables and factors + most <= limits.factors
-        if not isinstance(content, ParsedInsert) or self._broken or not has_room:
-            return self.apply((insert,))
-        started = time.perf_counter()
-        try:
-            first_factor = solver.try_stage(content.message, content.groups)
-            if first_factor is None:
-                return self.apply((insert,))
-            if self._wary or not is_usual(solver, variables, factors):
-                unstage(solver)
-                return self.apply((insert,))
-            report = solver.step(content.settle)
-        except SolverError:
-            return self.apply((insert,))  # it was taken back, and is now refused in the usual way
-        except Exception as fault:
-            self._fault_before = fault
-            return self.apply((insert,))
-        try:
-            changed, graph = solver.pick_changed()
-            if not is_sound(changed, graph, report):
-                return self._diverged_alone(insert, report)
-            account = report.as_dict()
-            account["solver_ms"] = solver_ms = (time.perf_counter() - started) * 1e3
-            account["converging"] = solver.unfinished or not report.converged
-            answer, delta = write_messages(
-                insert.sequence, self._epoch, self._revision + 1, first_factor, self._pack(account), changed,
-                graph.var, graph.keys, graph.values, graph.stamps, WORDS, LETTERS, self._out,
-            )  # fmt: skip
-        except Exception:
-            log.exception("the messages of a step could not be written in one piece")
-            answer = 0
-        if not answer:
-            return self._in_pieces(_Staged(insert, first_factor, content.settle), report, started)
-        self._next(account)
-        self._held = variables, factors = variables + report.new_variables, factors + report.new_factors
-        # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
-        self._cpu_s += 1e-3 * solver_ms
-        out = self._out_bytes
-        return SingleInsertResult(
-            insert, out[:answer].tobytes(), out[answer : answer + delta].tobytes(), first_factor, self._revision,
-            report.strategy, report.chi2, solver_ms, variables, factors, self._cpu_s, time.monotonic(), self._converged,
-            self._unfinished,
-        )  # fmt: skip
-
-    def _diverged_alone(self, insert: Arrived, report: Any) -> Iterator[Verdict | Stepped | Applied]:
-        """The step of one insert left what cannot be kept: it is refused."""
-        cpu_s = time.thread_time()
-        problem = self._find_diverged(report)
-        yield Verdict((Outcome(insert, problem or Internal("a step that was sound")),))
-        yield from self._go_back(report)
-        yield self._applied(cpu_s)
-
-    def _find_diverged(self, report: Any) -> Diverged | None:
-        """What the last step left beyond its bounds."""
-        try:
-            check_step(self._solver, report)
-        except Diverged as diverged:
-            return diverged
-        return None
-
-    def _in_pieces(self, staged: _Staged, report: Any, started: float) -> Iterator[Verdict | Stepped | Applied]:
-        """The rest of `apply`, after the step."""
-        cpu_s = time.thread_time()
-        self._cpu_s += time.perf_counter() - started
-        yield from self._stepped([staged], [], report, started)
-        yield self._applied(cpu_s)
-
-    def _applied(self, cpu_s: float) -> Applied:
-        solver = self._solver
-        self._cpu_s += time.thread_time() - cpu_s
-        return Applied(solver.variable_count, solver.factor_count, self._cpu_s, time.monotonic())
-
-    def _together(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped]:
-        """All of `inserts` in one step.  Raises _TakenBack, before anything else, if it failed with several staged."""
-        started = time.perf_counter()
-        staged: list[_Staged] = []
-        outcomes: list[Outcome] = []
-        fault, self._fault_before = self._fault_before, None
-        kept: Any = None  # the solver as it was, where inserts are tried on a copy
-        try:
-            if fault is not None:
-                raise fault
-            for insert in inserts:
-                try:
-                    staged.append(self._stage(insert))
-                except (Problem, SolverError) as problem:
-                    outcomes.append(Outcome(insert, problem))
-            if staged and (self._wary or not is_usual(self._solver, *self._held)):
-                kept, self._solver = self._solver, copied(self._solver)
-                staged = [self._stage(each.insert) for each in staged]
-            report = self._solver.step(settle=any(s.settle for s in staged)) if staged else None
-        except SolverError as problem:
-            self._solver = kept or self._solver
-            if len(staged) > 1:
-                raise _TakenBack from problem
-            report = None
-            outcomes.append(Outcome(staged[0].insert, problem))
-        except Exception:
-            self._solver = kept or self._solver
-            reference = self._fault()
-            yield from self._replace_solver(reference)
-            if len(inserts) > 1:
-                raise _TakenBack from None
-            report = None
-            outcomes = [Outcome(inserts[0], Internal(reference))]
-        diverged = None if report is None else self._find_diverged(report)
-        if report is None:
-            yield Verdict(tuple(outcomes))
-        elif diverged is not None:
-            if len(staged) == 1:
-                yield Verdict((*outcomes, Outcome(staged[0].insert, diverged)))
-            if kept is not None:
-                self._solver = kept
-            else:
-                yield from self._go_back(report)
-            if len(staged) > 1:
-                raise _TakenBack
-        else:
-            self._wary = self._wary or kept is not None
-            yield from self._stepped(staged, outcomes, report, started)
-            if below := max((s.convert_below for s in staged), default=0.0):
-                yield from self._convert_to_points(below)
-
-    def _stage(self, insert: Arrived) -> _Staged:
-        """Hand one insert to the solver.  Raises Problem, SolverError: then nothing changed."""
-        content = insert.content
-        if self._broken:
-            raise Broken(self._broken)
-        if isinstance(content, Problem):
-            raise content
-        if isinstance(content, ParsedInsert):
-            if self._has_room(insert.size):
-                first_factor = self._solver.try_stage(content.message, content.groups)
-                if first_factor is not None:
-                    return _Staged(insert, first_factor, content.settle)
-            content = codec.decode_insert(content.message)
-        self._check_room(insert.size, content.batch)
-        return _Staged(insert, self._solver.stage(content.batch), content.settle, content.convert_below)
-
-    def _has_room(self, size: int) -> bool:
-        """Whether a message of `size` bytes surely keeps the map within its limits."""
-        solver, limits = self._solver, self._limits
-        most = size // 8  # a key is eight bytes: without counting, no more than this can be in it
-        return solver.variable_count + most <= limits.variables and solver.factor_count + most <= limits.factors
-
-    def _check_room(self, size: int, batch: Batch) -> None:
-        """Raises TooLarge when the map would grow over its limits."""
-        solver, limits = self._solver, self._limits
-        if not self._has_room(size):
-            for what, count, more, limit in (
-                ("variables", solver.variable_count, batch.variable_count, limits.variables),
-                ("factors", solver.factor_count, batch.factor_count, limits.factors),
-            ):
-                if count + more > limit:
-                    raise TooLarge("the map with this insert", count + more, limit, what)
-
-    def _stepped(
-        self,
-        staged: Sequence[_Staged],
-        refused: Sequence[Outcome],
-        report: Any,
-        started: float,
-        changed: Mapping[str, int] | None = None,
-        previous: int | None = None,
-    ) -> Iterator[Verdict | Stepped]:
-        """The step went well: the answers, then the delta; previous: 0 where that has everything."""
-        account = report.as_dict() | (changed or {})
-        account["solver_ms"] = (time.perf_counter() - started) * 1e3
-        self._next(account)
-        accepted = [
-            Outcome(
-                s.insert,
-                codec.encode_accepted(
-                    Accepted(s.insert.sequence, self._epoch, self._revision, s.first_factor, len(staged), account)
-                ),
-                s.first_factor,
-            )
-            for s in staged
-        ]
+        staged, account = [_Staged(insert, first_factor)], self._account_of(report, started, counted)
         self._held = self._solver.variable_count, self._solver.factor_count
-        yield Verdict((*accepted, *refused), self._revision, len(staged))
         try:
-            told = self._told(account, previous)
+            added = self._told_of(staged, [], account, self._solver.pick_changed(), previous)
         except Exception:
-            # The step is done and answered; who misses its delta sees the gap.
-            yield from self._replace_solver(self._fault())
-        else:
-            yield told
+            added = self._told_nothing(staged, [], account)
+        yield added.verdict
+        yield from added.steps
+        if below := cast(Insert, insert.content).convert_below:
+            yield from self._convert_to_points(below)
 
     def _convert_to_points(self, below: float) -> Iterator[Stepped]:
         """Features whose linearity index is below this become points, in a step of its own whose delta has everything.
@@ -431,7 +375,7 @@ class MapSolver(Holding):
         if not keys.size:
             return
         try:
-            solver, report = self._solver.with_points(keys)
+            solver, report = with_converted(self._solver, keys)
             check_step(solver, report)
         except SolverError as problem:
             log.warning("%d features stay features: as points %s", keys.size, problem)
@@ -444,3 +388,8 @@ class MapSolver(Holding):
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
         yield self._told(account, previous=0)
+
+
+def _numbers(staged: Sequence[_Staged]) -> list[tuple[int, int]]:
+    """Of each insert its sequence number and the id of its first factor."""
+    return [(each.insert.sequence, each.first_factor) for each in staged]

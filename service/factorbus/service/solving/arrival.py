@@ -3,31 +3,28 @@
 import numpy as np
 
 from factorbus.proto import codec
-from factorbus.proto.limits import ANSWER_LIMITS, Limits
+from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
 from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
 from factorbus.proto.problems import Problem
 from factorbus.service.core.events import Arrived, Asker, ParsedInsert, Refuse
 from factorbus.service.kernels.digest import digest
-from factorbus.service.kernels.read import read_insert as read_usual
-from factorbus.service.kernels.words import LETTERS, WORDS
-from factorbus.solver.kernels.model import layout
+from factorbus.service.kernels.read import MORE_GROUPS, locate_insert
+from factorbus.solver.kernels.graph import group_table as gt
 
-# Of messages above this size, looking closely is a small part of the work; and so many groups are no usual message.
-_SHORT_BYTES = 16 << 10
-_GROUPS = 30
-_SHAPE = (_GROUPS + 1, layout.G_WIDTH)
+# Groups of a usual message, and the most that a decoder of requests takes: the first are read in one go.
+_GROUPS, _MOST_GROUPS = 30, 512
 
 
-def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: float) -> Arrived | Refuse:
+def read_insert(asker: Asker, client: str, payload: bytes, limits: MessageLimits, now: float) -> Arrived | Refuse:
     """The arrival of the insert in `payload`; a refusal when not even its sequence number can be read.
 
     A message that is wrong inside still uses up its number, so that the ones after it need not wait for it; whether it
     did, `detail.next` tells.
     """
     size = len(payload)
-    if size <= _SHORT_BYTES and (located := try_locate(payload, limits)):
-        sequence, epoch, digest, content = located
+    if parsed := try_parse(payload, limits):
+        sequence, epoch, digest, content = parsed
         return Arrived([asker], client, sequence, epoch, size, digest, content, now, payload)
     try:
         insert = codec.decode_insert(payload, limits)
@@ -41,25 +38,28 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: Limits, now: 
 
 def read_again(payload: bytes) -> tuple[int, Insert | ParsedInsert | Problem]:
     """(digest, content) of an insert that was read before, as `read_insert` has them."""
-    if len(payload) <= _SHORT_BYTES and (located := try_locate(payload, ANSWER_LIMITS)):
-        return located[2:]
+    if parsed := try_parse(payload, ANSWER_LIMITS):
+        return parsed[2:]
     try:
         return message_digest(payload), codec.decode_insert(payload, ANSWER_LIMITS)
     except Problem as problem:
         return message_digest(payload), problem
 
 
-def try_locate(payload: bytes, limits: Limits) -> tuple[int, int, int, ParsedInsert] | None:
-    """(sequence, epoch, digest, content) of a usual insert, which `codec.decode_insert` accepts; None: ask that."""
-    size = len(payload)
-    # A key is eight bytes: without counting, no more than this can be in it.
-    if size > limits.max_bytes or size > 8 * limits.max_variables or size > 8 * limits.max_factors:
+def try_parse(payload: bytes, limits: MessageLimits) -> tuple[int, int, int, ParsedInsert] | None:
+    """(sequence, epoch, digest, content) of an insert that only adds and that `codec.decode_insert` accepts; None: it
+    has changes or fields of a later version, or there is something wrong with it, which that says."""
+    if len(payload) > limits.max_bytes:
         return None
-    groups = np.empty(_SHAPE, np.int64)
-    sequence, epoch, settle, digest = read_usual(payload, WORDS, LETTERS, groups)
-    if not sequence:
+    groups = np.empty((_GROUPS + 1, gt.G_WIDTH), np.int64)
+    found = locate_insert(payload, groups)
+    if found[0] == MORE_GROUPS:
+        groups = np.empty((_MOST_GROUPS + 1, gt.G_WIDTH), np.int64)
+        found = locate_insert(payload, groups)
+    sequence, epoch, settle, below, digest, variables, factors = found
+    if sequence <= 0 or variables > limits.max_variables or factors > limits.max_factors:
         return None
-    return int(sequence), int(epoch), int(digest), ParsedInsert(payload, groups, bool(settle))
+    return sequence, epoch, digest, ParsedInsert(payload, groups, settle, below, variables, factors)
 
 
 def message_digest(message: bytes) -> int:

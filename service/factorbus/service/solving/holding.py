@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from factorbus.proto import codec
-from factorbus.proto.messages import Delta
 from factorbus.proto.problems import Problem
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Stepped
 from factorbus.service.questions.answers import Copied, Question, QuestionCopies, snapshot
 from factorbus.service.questions.question_memory import Room
 from factorbus.service.questions.uncertainty import Uncertain
+from factorbus.service.solving.messages import StepMessages
 from factorbus.solver.divergence import check_step, is_usual, undone
 
 # Until a copy of a map is at work there are the state on its way, the same as bytes of a file, and the copy itself;
@@ -60,6 +59,7 @@ class Holding:
         self._broken = ""
         self._wary = False  # the map has numbers of unusual sizes: what comes is tried on a copy
         self._room = Room()
+        self._messages = StepMessages()
 
     def bound(self, room: Room) -> None:
         """Questions may take no more than this."""
@@ -156,9 +156,17 @@ class Holding:
         """The solver's last step, with its delta; what it takes to find out what changed is the solver's time, too."""
         previous = self._revision - 1 if previous is None else previous
         started = time.perf_counter()
-        changed = self._solver.changed()
+        changed, graph = self._solver.pick_changed()
         account["solver_ms"] += (time.perf_counter() - started) * 1e3
-        delta = codec.encode_delta(Delta(self._epoch, self._revision, previous, tuple(changed), account))
+        return self._stepped_to(self._messages.write_delta(self._step(previous), account, changed, graph))
+
+    def _step(self, previous: int) -> tuple[int, int, int]:
+        """Epoch and revision of the last step, and the one before."""
+        return self._epoch, self._revision, previous
+
+    def _stepped_to(self, delta: bytes) -> Stepped:
+        """The last step, which `delta` tells of."""
+        account = self._account
         told = account["strategy"], account["chi2"], account["solver_ms"]
         return Stepped(self._revision, delta, *told, converged=self._converged, unfinished=self._unfinished)
 

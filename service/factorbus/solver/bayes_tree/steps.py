@@ -14,12 +14,13 @@ from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.step import FINISHED, LEAST_CHI2
+from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
+from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.kernels.model.retract import differing
-from factorbus.solver.optimize.gauss_newton import Course, minimize
+from factorbus.solver.optimize.gauss_newton import Minimization, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
@@ -30,7 +31,7 @@ from factorbus.wording import counted
 
 _START: Mark = (0,) * at.COUNTS
 _ROUNDING, _LEAST_GAIN = 1e-12, 1e-15
-_COUNTS = tl.S_CYCLES - tl.S_TOLD_FROM
+_COUNTS = tl.S_CYCLES - tl.S_REPORT_BEGIN
 _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 # What back-substitution left undone, below which there is no need to go on, as a share of χ²: by the bound (9.17), some
 # hundred times what it comes to.
@@ -128,7 +129,7 @@ class TreeSteps:
         """The variables whose values have other bits than before the last step, new ones included."""
         if self._batched:
             return self._moved
-        return self._tree.list_moved(self._first_new)
+        return self._tree.list_changed(self._first_new)
 
     @property
     def unfinished(self) -> bool:
@@ -165,7 +166,7 @@ class TreeSteps:
         system.factorize(0.0)
         return f"only several factors together hold {counted(suspects.size, 'new variable')}"
 
-    def _complete(self, settle: bool, because: str) -> tuple[Course | None, str]:
+    def _complete(self, settle: bool, because: str) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
         chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
@@ -215,7 +216,7 @@ class TreeSteps:
         system.factor.moved()
         return system
 
-    def _batch(self, before: F64, settle: bool, continues: bool) -> Course:
+    def _batch(self, before: F64, settle: bool, continues: bool) -> Minimization:
         """Gauss-Newton or Levenberg-Marquardt on everything from the estimate; the tree follows, and stays where they
         end if its own step from there would raise χ².
 
@@ -245,12 +246,12 @@ class TreeSteps:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, started: float, compiled: float, course: Course | None, because: str) -> StepReport:
+    def _account(self, started: float, compiled: float, course: Minimization | None, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
         self._first_new, self._batched = before[at.VARIABLES], course is not None
-        told = self._tree.state[tl.S_TOLD_FROM : tl.S_TOLD_TO].tolist()
-        nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = told[:_COUNTS]
+        reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
+        nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
         _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
@@ -281,7 +282,7 @@ class TreeSteps:
             float(flops),
             0.0,  # damping
             converged,
-            PhaseShares(tl.PHASES, told[_COUNTS:], compiled_ms),
+            PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,
             compiled_ms,
         ))  # fmt: skip

@@ -14,7 +14,7 @@ from factorbus.solver.graph.factor_graph import Graph, grown, roomy
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
-from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_moved
+from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_changed
 from factorbus.solver.kernels.bayes_tree.reset_estimate import hold_at_linearization
 from factorbus.solver.kernels.bayes_tree.step import tree_step
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -31,7 +31,7 @@ class CliqueTree(Arenas):
     """R, d, δ and linearization points of a graph, kept by cliques.  The arrays are public: tests look at them."""
 
     ARENAS = records.Tree._fields
-    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "places")
+    NOT_KEPT = ("_graph", "_rest", "settings", "marked", "array_table")
 
     def __init__(self, graph: Graph, options: Options) -> None:
         self._graph, self._rest = graph, options.tuning.relinearize_cooldown_steps
@@ -79,7 +79,7 @@ class CliqueTree(Arenas):
         """
         if sure:
             self.state[tl.S_CHECKED] = 1
-        while (status := tree_step(self._graph.places, self.places, TASK_QUEUE, NOBODY)) == tl.NO_ROOM:
+        while (status := tree_step(self._graph.array_table, self.array_table, TASK_QUEUE, NOBODY)) == tl.NO_ROOM:
             self._make_room()
         return status
 
@@ -110,13 +110,13 @@ class CliqueTree(Arenas):
 
     def hold(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""
-        hold_at_linearization(self._graph.places, self.places)
+        hold_at_linearization(self._graph.array_table, self.array_table)
 
-    def list_moved(self, first_new: int) -> I64:
+    def list_changed(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
         graph = self._graph
         found = np.empty(self.state.item(tl.S_CHANGED) + graph.counts.item(at.VARIABLES) - first_new, np.int64)
-        return found[: list_moved(first_new, graph.places, self.places, found)]
+        return found[: list_changed(first_new, graph.array_table, self.array_table, found)]
 
     def exchange(self) -> None:
         """Exchange the estimate and the one from before the last step, of the variables that it changed."""
@@ -150,7 +150,6 @@ class CliqueTree(Arenas):
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
             self.lists = grown(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
-            state[tl.S_FRESH] = min(int(state[tl.S_FRESH]), self.numbers.size)  # of a copy it may be more
             pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
 

@@ -11,7 +11,7 @@ from factorbus.solver import errors
 from factorbus.solver.graph.factor_graph import Graph, table_size
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
-from factorbus.solver.kernels.graph.admit import enter_keys
+from factorbus.solver.kernels.graph.key_table import enter_keys
 from factorbus.solver.kernels.graph.linearity_index import linearity
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at

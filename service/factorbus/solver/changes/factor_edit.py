@@ -31,7 +31,7 @@ from factorbus.solver.sparse.anchors import find_unheld
 _MOST_HOLES = 0.5
 # Changes of anything else than factors.
 _OTHERS = ("removed_variables", "fixed_variables", "freed_variables", "placed_variables", "added_factors")
-_COUNTED = (tl.S_EXACT, tl.S_ASLEEP, tl.S_HOLES, tl.S_EDITED_AT)
+_COUNTED = (tl.S_EXACT, tl.S_INACTIVE, tl.S_HOLES, tl.S_EDITED_AT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +87,13 @@ class FactorEdit:
         self._before = self._remember()
         for row in self.renewed.tolist():
             self._rewrite(row)
-        linked = int(edit_factors(self.gone, self.renewed, graph.places, tree.places, self._log))
+        linked = int(edit_factors(self.gone, self.renewed, graph.array_table, tree.array_table, self._log))
         self._linked = linked if linked >= 0 else -1 - linked
         if self.gone.size:
             last = max(graph.ids.size, int(self.gone[-1]) + 1)
             ids = np.delete(graph.ids_of(np.arange(last)), self.gone)
             graph.holes += int(self._widths(self.gone).sum())
-            close_gaps(self.gone, graph.places, tree.places)
+            close_gaps(self.gone, graph.array_table, tree.array_table)
             graph.ids, graph.id_shift = ids, graph.id_shift + self.gone.size
             self._closed = True
         return linked >= 0
@@ -104,14 +104,14 @@ class FactorEdit:
         if before is None:
             return
         if self._closed:
-            open_gaps(self.gone, graph.places, tree.places)
+            open_gaps(self.gone, graph.array_table, tree.array_table)
         graph.ids, graph.id_shift, graph.holes = before.ids, before.id_shift, before.holes
         graph.fac[self._rows] = before.fac
         for row, numbers in zip(self.renewed.tolist(), before.weighed, strict=True):
             start = graph.fac[row, at.F_AT]
             graph.payload[start : start + numbers.size] = numbers
         tree.link[self._rows], tree.stiff[self._rows] = before.link, before.stiff
-        relink(self._linked, self._log, tree.places)
+        relink(self._linked, self._log, tree.array_table)
         for row, hessian in zip(self.renewed.tolist(), before.hessians, strict=True):
             start = tree.link[row, tl.L_AT]
             tree.hessian[start : start + hessian.size] = hessian

@@ -56,7 +56,7 @@ def _take_back(steps: TreeSteps, edit: FactorEdit, count: int) -> None:
 
 def _is_sound(graph: Graph, steps: TreeSteps, report: StepReport) -> bool:
     """Whether everything that the step moved, and χ², is within bounds."""
-    escaped = find_escaped(steps.changed(), graph.places) >= 0
+    escaped = find_escaped(steps.changed(), graph.array_table) >= 0
     return not escaped and bool(np.isfinite(report.chi2) and np.isfinite(report.chi2_before))
 
 

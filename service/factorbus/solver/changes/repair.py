@@ -11,6 +11,7 @@ however far off it is.
 """
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,7 @@ from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
-from factorbus.solver.optimize.gauss_newton import Rule, minimize
+from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
@@ -132,10 +133,11 @@ def _beginnings(graph: Graph, rows: I64) -> Iterable[F64]:
     yield graph.values
     trusted = np.ones(int(graph.counts[at.FACTORS]), bool)
     trusted[rows] = False
-    fac, values = np.ascontiguousarray(graph.fac[: trusted.size][trusted]), graph.values.copy()
+    composed = copy(graph)
+    composed.fac, composed.values = graph.fac[: trusted.size][trusted], graph.values.copy()
     reached = (graph.var[: graph.counts[at.VARIABLES], at.V_COLUMN] < 0).astype(np.int64)
-    if reach(True, 0, 0, len(fac), graph.var, fac, values, graph.payload, reached) < 0:
-        yield values
+    if reach(True, 0, 0, len(composed.fac), composed.array_table, reached) < 0:
+        yield composed.values
 
 
 class _Problem:
@@ -178,7 +180,7 @@ class _Problem:
         self._system.begin(_NONE, Stopwatch(None))
         self._system.anew()
         chi2 = float(sum_chi2(0, int(g.counts[at.FACTORS]), g.var, g.fac, g.values, g.payload))
-        minimize(self._system, chi2, 0.0, Rule(tolerance, 1e-12, limit))
+        minimize(self._system, chi2, 0.0, StoppingRule(tolerance, 1e-12, limit))
 
 
 def _graduate(problem: _Problem, begin: F64) -> tuple[F64, int]:

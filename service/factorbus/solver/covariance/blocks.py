@@ -44,7 +44,7 @@ class CovarianceBlocks:
             hub = hub if hub >= 0 and f.scalar[hub] >= 0 else -1
             diagonal = np.zeros((f.count, self.width, self.width))
             column = np.zeros_like(diagonal) if hub >= 0 else self._column
-            whole_blocks(f.order, hub, f.tree.places, f.dims, f.scalar, diagonal, column)
+            whole_blocks(f.order, hub, f.tree.array_table, f.dims, f.scalar, diagonal, column)
             self._diagonal, self._hub, self._column = diagonal, hub, column
         return self._diagonal
 
@@ -96,7 +96,7 @@ class CovarianceBlocks:
         different = np.unique(np.concatenate([rows, columns]))
         free = different[f.scalar[different] >= 0]
         inner = np.zeros((int(f.dims[free].sum()),) * 2)
-        joint_block(free, f.graph.var, DIMS, f.tree.places, inner)
+        joint_block(free, f.graph.var, DIMS, f.tree.array_table, inner)
         # Where the scalars of `variables` are in `inner`; the last row and column of zeros serve the fixed ones.
         starts = np.full(different.size, -1)
         starts[f.scalar[different] >= 0] = np.cumsum(f.dims[free]) - f.dims[free]
@@ -140,7 +140,7 @@ class CovarianceBlocks:
         order = np.argsort(hubs, kind="stable") if _changes(hubs) else np.arange(hubs.size)
         blocks = np.zeros((first.size, self.width, self.width))
         by_hub = blocks.transpose(0, 2, 1) if turned else blocks
-        cross_blocks(hubs[order], partners[order], order, f.tree.places, f.order, f.dims, f.scalar, by_hub)
+        cross_blocks(hubs[order], partners[order], order, f.tree.array_table, f.order, f.dims, f.scalar, by_hub)
         return blocks
 
     def _single_pairs(self, first: I64, second: I64) -> F64:

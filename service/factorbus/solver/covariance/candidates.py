@@ -92,7 +92,7 @@ def evaluate_rows(blocks: CovarianceBlocks, first: int, last: int) -> Candidates
     for start in range(0, n, _CHUNK):
         stop = min(start + _CHUNK, n)
         rows = slice(start, stop)
-        evaluate_factors(first + start, first + stop, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+        evaluate_factors(np.arange(first + start, first + stop), graph.array_table, graph.values, r, A, B, W)
         predicted_covariances(places[rows], sizes[rows], A, B, diagonal, cross[rows], predicted[rows])
         distances_and_gains(sizes[rows], r, W, predicted[rows], distance[rows], gain[rows])
     if not np.isfinite(distance).all():
@@ -122,7 +122,7 @@ def _diagonal(blocks: CovarianceBlocks, ends: I64, hub: int) -> tuple[F64, I64]:
 def linearized(graph: Graph, first: int, last: int) -> Linear:
     """The factors first .. last−1 at the estimate."""
     r, A, B, W = _room(last - first)
-    evaluate_factors(first, last, graph.var, graph.fac, graph.values, graph.payload, r, A, B, W)
+    evaluate_factors(np.arange(first, last), graph.array_table, graph.values, r, A, B, W)
     r = np.ascontiguousarray(r[:, :LARGEST])  # without why an observation is inactive
     fac = graph.fac[first:last]
     ends = np.ascontiguousarray(fac[:, at.F_I : at.F_J + 1])

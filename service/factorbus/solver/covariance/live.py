@@ -23,5 +23,5 @@ class Live:
         for v in variables.tolist():
             size += int(DIMS[var[v, at.V_KIND]])
         out = np.empty((size, size))
-        joint_block(variables, var, DIMS, tree.places, out)
+        joint_block(variables, var, DIMS, tree.array_table, out)
         return out

@@ -92,7 +92,7 @@ class Upkeep:
         roots = np.empty(count, np.int64)
         roots = roots[: list_root_cliques(tree.node[:count], tree.clique, roots)]
         dims, changed_at = self._dims[:count], self._changed_at[:count]
-        diagonal_blocks(roots, tree.places, dims, since, step, changed_at, self._blocks[:count])
+        diagonal_blocks(roots, tree.array_table, dims, since, step, changed_at, self._blocks[:count])
         self.anew += 1
         self.whole += since < 0
 
@@ -126,7 +126,7 @@ class Upkeep:
             if self._scalar[v] >= 0:
                 d = int(self._dims[v])
                 out = np.empty((d, d))
-                joint_block(np.array([v]), self._graph.var, DIMS, tree.places, out)
+                joint_block(np.array([v]), self._graph.var, DIMS, tree.array_table, out)
                 self._blocks[v, :d, :d] = out
         return True
 
@@ -139,13 +139,13 @@ class Upkeep:
             return False
         n = len(fac)
         r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, LARGEST, LARGEST)) for _ in range(3))
-        evaluate_factors(first, self._factors, graph.var, graph.fac, tree.lin[0], graph.payload, r, A, B, W)
+        evaluate_factors(np.arange(first, self._factors), graph.array_table, tree.lin[0], r, A, B, W)
         dims, scalar, changed_at = self._dims[:count], self._scalar[:count], self._changed_at[:count]
         ends = fac[loops, at.F_I : at.F_J + 1]
         ends = np.where((ends >= 0) & (scalar[ends] >= 0), ends, -1)
         H = np.zeros((ends.size, LARGEST, int(sizes[loops].sum())))
         weighted_jacobians(ends, sizes[loops], A[loops], B[loops], W[loops], H)
         found = downdate_blocks(
-            ends.reshape(-1), H, tree.places, dims, scalar, step, changed_at, self._blocks[:old]
+            ends.reshape(-1), H, tree.array_table, dims, scalar, step, changed_at, self._blocks[:old]
         )  # fmt: skip
         return found == DONE

@@ -1,20 +1,22 @@
-"""Judging a batch: everything about it is checked before any of it counts.
+"""A batch is checked and taken into the graph, whole or not at all.
 
-Shapes and kinds are checked here; what concerns single rows is checked by the kernels in the pass that writes them
-behind the rows in use.  The caller goes back to its mark when this raises, so a batch is taken whole or not at all.
+Kinds and shapes are checked where the columns are located (`columns`), rows by the kernel that writes them behind those
+in use; what concerns rows together is checked when all are there.
 """
 
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph import observations as sights
-from factorbus.solver.graph.factor_graph import Graph
-from factorbus.solver.graph.factors import FACTOR_KINDS, LENS_AT, LOSSES, FactorKind
-from factorbus.solver.graph.groups import BatchLike, FactorsLike, VariablesLike
-from factorbus.solver.graph.joints import SINGLE, check_joints
+from factorbus.solver.graph import observations
+from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
+from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
+from factorbus.solver.graph.groups import BatchLike
+from factorbus.solver.graph.joints import check_joints
 from factorbus.solver.graph.triangulation import place_by_bearings
-from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
-from factorbus.solver.kernels.graph.admit import admit_factors, admit_variables
+from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.kernels.graph import group_table as gt
+from factorbus.solver.kernels.graph.admit import admit_groups
 from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -26,110 +28,59 @@ from factorbus.solver.kernels.model.bounds import (
     MOST_NUMBER,
     find_first_outside,
 )
-from factorbus.solver.kernels.model.kinds import LINEAR
-
-_I64 = np.dtype(np.int64)
-_F64 = np.dtype(np.float64)
-_NO_SCALE = np.empty(0)
-_NONE = np.empty(0, np.int64)
-_NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIABLE_KINDS.values()}}
+from factorbus.solver.kernels.model.kinds import LINEAR, LINEAR_OF_ONE
 
 
-def admit(graph: Graph, batch: BatchLike, whole: bool = True) -> None:
-    """Append `batch` to `graph` and give values to the variables that come without.
+def admit(graph: Graph, batch: BatchLike | Columns, whole: bool = True) -> int:
+    """Append `batch` to `graph` and give values to the variables that come without; gives the id of its first factor.
 
     whole: a linear factor of one variable may have a negative definite Ω where those that came together make a form
     that is positive semidefinite (`joints`); else it may not.
 
     Raises UnknownKind, BadShape, DuplicateVariable, UnknownVariable, KindMismatch, SelfLoop, NotFinite, OutOfBounds,
-    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` then
-    holds a part of the batch and must go back to its mark.
+    BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` is as it
+    was then.
     """
-    counts = graph.counts.tolist()
-    first, first_factor = counts[at.VARIABLES], counts[at.FACTORS]
-    new, given = 0, []
-    for group in batch.variables:
-        count, has_values = _admit_variables(graph, group)
-        if has_values:
-            given.append((new, new + count))
-        new += count
-    negative = [_admit_factors(graph, group, whole) for group in batch.factors]
-    if len(given) < len(batch.variables):
-        reached = np.zeros(new, np.int64)
-        for begin, behind in given:
-            reached[begin:behind] = 1
-        _compose(graph, first, first_factor, reached)
-    if any(group.kind in LENS_AT for group in batch.factors):
-        sights.check(graph, first_factor)
-    if any(negative):
-        check_joints(graph, first_factor)
+    columns, problem = (batch, None) if isinstance(batch, Columns) else locate_columns(batch)
+    mark = graph.mark()
+    try:
+        fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+        if fault == gt.NO_LIMITS:
+            columns, lens = limit_lenses(columns)
+            problem = lens or problem
+            fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+        if fault == gt.NO_ROOM:
+            graph.make_room(columns.groups)
+            fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+        if g >= 0:
+            raise _find_bad_row(graph, columns.groups[g], row, fault, whole)
+        if problem is not None:
+            raise problem
+        if fault == gt.COMPOSED_OUT_OF_BOUNDS:
+            raise value_out_of_bounds(graph, row)
+        if rest:
+            _finish(graph, columns.groups, mark, rest)
+    except BaseException:
+        graph.forget(mark)
+        raise
+    return mark[at.FACTORS] + graph.id_shift
 
 
-def _admit_variables(graph: Graph, group: VariablesLike) -> tuple[int, bool]:
-    """(how many, whether they come with values)."""
-    kind = VARIABLE_KINDS.get(group.kind)
-    if kind is None:
-        raise errors.UnknownKind("variable", group.kind, tuple(VARIABLE_KINDS))
-    keys = _column(group.keys, _I64, (-1,), group.kind, "keys")
-    if group.values is None:
-        values = _NO_VALUES[kind.size]
-    else:
-        values = _column(group.values, _F64, (keys.size, kind.size), group.kind, "values")
-    graph.reserve_variables(keys.size, keys.size * kind.size)
-    row, wrong = admit_variables(
-        kind.code, bool(group.fixed), keys, values, graph.table, graph.keys, graph.var, graph.values, graph.dims,
-        graph.counts,
-    )  # fmt: skip
-    if wrong != at.GOOD:
-        raise _bad_variable(kind.name, wrong, int(keys[row]), values[row] if len(values) else None)
-    stamps = None if group.stamps is None else _column(group.stamps, _I64, (keys.size,), group.kind, "stamps")
-    graph.stamp_last(keys.size, stamps)
-    return keys.size, group.values is not None
+def _finish(graph: Graph, groups: I64, mark: Mark, rest: int) -> None:
+    """What the kernel leaves to be done for groups that are in order."""
+    if rest & gt.UNREACHED:
+        _compose(graph, mark[at.VARIABLES], mark[at.FACTORS], _list_given(groups))
+    if rest & gt.OBSERVED:
+        observations.check(graph, mark[at.FACTORS])
+    if rest & gt.NEGATIVE:
+        check_joints(graph, mark[at.FACTORS])
 
 
-def _admit_factors(graph: Graph, group: FactorsLike, whole: bool) -> bool:
-    """Gives whether there are any of negative weight."""
-    kind = FACTOR_KINDS.get(group.kind)
-    if kind is None:
-        raise errors.UnknownKind("factor", group.kind, tuple(FACTOR_KINDS))
-    ends = _column(group.keys, _I64, (-1, len(kind.connects)), group.kind, "keys")
-    measured = _column(group.measured, _F64, (len(ends), kind.size), group.kind, "measured")
-    information = _column(group.information, _F64, (len(ends), kind.triangle), group.kind, "information")
-    if kind.name in LENS_AT:
-        measured = sights.with_limits(kind, measured)
-    loss, scale = at.NO_LOSS, _NO_SCALE
-    if group.loss:
-        loss, scale = _loss(group, len(ends))
-    negative = _NONE
-    if whole and kind.name in SINGLE and loss == at.NO_LOSS:
-        negative = np.flatnonzero(information[:, 0] < 0.0)
-        if negative.size:
-            information = information.copy()
-            information[negative] *= -1.0
-    graph.reserve_factors(len(ends), len(ends) * (kind.size + kind.triangle + 1))
-    first = int(graph.counts[at.FACTORS])
-    row, wrong = admit_factors(
-        kind.code, loss, ends, measured, information, scale, graph.table, graph.keys, graph.var, graph.fac,
-        graph.payload, graph.counts,
-    )  # fmt: skip
-    if wrong == at.BAD_SCALE:
-        wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
-        raise errors.BadLoss(f"{kind} {group.loss}", f"the scale {scale[row]:g}", wanted)
-    if wrong != at.GOOD:
-        raise _bad_factor(graph, kind, wrong, ends[row], measured[row], information[row])
-    for begin in (graph.fac[first + negative, at.F_AT] + kind.size).tolist():
-        graph.payload[begin : begin + kind.triangle] *= -1.0
-    return negative.size > 0
-
-
-def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
-    """(code, scales) of the loss of a group."""
-    code = LOSSES.get(group.loss)
-    if code is None:
-        raise errors.BadLoss(group.kind, f"the loss {group.loss!r}", f"none, or one of {', '.join(LOSSES)}")
-    if group.scale is None:
-        raise errors.BadLoss(f"{group.kind} {group.loss}", "no scale", "one for each factor, standard deviations")
-    return code, _column(group.scale, _F64, (count,), group.kind, "scale")
+def _list_given(groups: I64) -> I64:
+    """For each new variable whether it came with a value: 1 or 0."""
+    groups = groups[: int(np.argmax(groups[:, gt.G_KIND] == gt.END))]
+    groups = groups[groups[:, gt.G_FACTORS] == 0]
+    return np.repeat((groups[:, gt.G_NUMBERS] != gt.NOWHERE).astype(np.int64), groups[:, gt.G_COUNT])
 
 
 def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
@@ -160,28 +111,34 @@ def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER) -> errors
 
 def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> int:
     """Compose values for those that are not `reached` yet; gives one that nothing leads to, or −1."""
-    return reach(
-        True, first, first_factor, int(graph.counts[at.FACTORS]), graph.var, graph.fac, graph.values, graph.payload,
-        reached,
-    )  # fmt: skip
+    return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
 
 
-def _column(array: np.ndarray, dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> np.ndarray:
-    """`array` if it is fit for a kernel, a copy that is where it is not writable, aligned or contiguous."""
-    if not isinstance(array, np.ndarray) or array.dtype != dtype:
-        seen = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
-        raise errors.BadShape(f"{kind} {name}", seen, f"an array of {dtype}")
-    if array.shape != shape and (len(array.shape) != len(shape) or array.shape[1:] != shape[1:] or shape[0] >= 0):
-        wanted = " × ".join("n" if n < 0 else str(n) for n in shape)
-        raise errors.BadShape(f"{kind} {name}", " × ".join(map(str, array.shape)), wanted)
-    return array if array.flags.carray else np.array(array, dtype, order="C")
+def _find_bad_row(graph: Graph, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
+    """What is wrong with the n-th row of a group."""
+    code, keys, numbers = (int(group[column]) for column in (gt.G_KIND, gt.G_KEYS, gt.G_NUMBERS))
+    if not group[gt.G_FACTORS]:
+        kind = VARIABLE_KIND_OF_CODE[code]
+        value = floats_at(numbers + 8 * n * kind.size, kind.size) if numbers != gt.NOWHERE else None
+        return _bad_variable(kind.name, fault, int(ints_at(keys + 8 * n, 1)[0]), value)
+    kind, loss = FACTOR_KIND_OF_CODE[code], int(group[gt.G_LOSS])
+    if fault == gt.BAD_SCALE:
+        scale = floats_at(int(group[gt.G_SCALE]) + 8 * n, 1)[0]
+        wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
+        return errors.BadLoss(f"{kind} {LOSS_OF_CODE[loss]}", f"the scale {scale:g}", wanted)
+    arity, triangle = len(kind.connects), kind.triangle
+    information = floats_at(int(group[gt.G_INFORMATION]) + 8 * n * triangle, triangle)
+    if whole and LINEAR_OF_ONE[code] and loss == at.NO_LOSS and information[0] < 0.0:
+        information = -information  # as it was looked at
+    measured = floats_at(numbers + 8 * n * kind.size, kind.size)
+    return _bad_factor(graph, kind, fault, ints_at(keys + 8 * n * arity, arity), measured, information)
 
 
 def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.SolverError:
     where = f"{kind} {errors.printed(key)}"
-    if wrong == at.DUPLICATE:
+    if wrong == gt.DUPLICATE:
         return errors.DuplicateVariable(key)
-    if wrong == at.BAD_QUATERNION and value is not None:
+    if wrong == gt.BAD_QUATERNION and value is not None:
         return errors.BadQuaternion(where, float(np.linalg.norm(value[3:])))
     return out_of_bounds(f"the value of {where}", np.zeros(0) if value is None else value)
 
@@ -191,21 +148,21 @@ def _bad_factor(
 ) -> errors.SolverError:
     keys = [int(key) for key in ends]
     where = f"{kind} ({', '.join(map(errors.printed, keys))})"
-    if wrong in (at.UNKNOWN_FIRST, at.UNKNOWN_SECOND):
-        return errors.UnknownVariable(keys[wrong - at.UNKNOWN_FIRST], where)
-    if wrong in (at.WRONG_KIND_FIRST, at.WRONG_KIND_SECOND):
-        end = wrong - at.WRONG_KIND_FIRST
+    if wrong in (gt.UNKNOWN_FIRST, gt.UNKNOWN_SECOND):
+        return errors.UnknownVariable(keys[wrong - gt.UNKNOWN_FIRST], where)
+    if wrong in (gt.WRONG_KIND_FIRST, gt.WRONG_KIND_SECOND):
+        end = wrong - gt.WRONG_KIND_FIRST
         seen = VARIABLE_KIND_OF_CODE[int(graph.var[graph.find(keys[end]), at.V_KIND])]
         return errors.KindMismatch(keys[end], where, seen.name, kind.connects[end].name)
-    if wrong == at.SELF_LOOP:
+    if wrong == gt.SELF_LOOP:
         return errors.SelfLoop(keys[0], where)
-    if wrong == at.BAD_QUATERNION:
+    if wrong == gt.BAD_QUATERNION:
         return errors.BadQuaternion(where, float(np.linalg.norm(measured[3:7])))
-    if wrong == at.BAD_RANGE:
+    if wrong == gt.BAD_RANGE:
         return errors.BadRange(where, float(measured[min(1, kind.size - 1)]))
-    if wrong == at.BAD_DIRECTION:
+    if wrong == gt.BAD_DIRECTION:
         return errors.BadDirection(where)
-    if wrong == at.NOT_POSITIVE_DEFINITE:
+    if wrong == gt.NOT_POSITIVE_DEFINITE:
         matrix = np.zeros((kind.dim, kind.dim))
         matrix[np.triu_indices(kind.dim)] = information
         return errors.NotPositiveDefinite(where, float(np.linalg.eigvalsh(matrix, UPLO="U")[0]))

@@ -22,26 +22,26 @@ def lines(shape: int | tuple[int, ...], kind: type[np.generic] | np.dtype[Any]) 
 
 
 class Arenas:
-    """What has arrays as attributes, `ARENAS` in the order of its table, and the table: `places`, for kernels.
+    """What has arrays as attributes, `ARENAS` in the order of its table, and the table: `array_table`, for kernels.
 
     Inherited, since every assignment to one of them has to be seen: a table must not tell of an array that is gone.
     """
 
     ARENAS: ClassVar[tuple[str, ...]] = ()
-    places: I64
+    array_table: I64
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Raises TypeError for an arena that no kernel can work on in place."""
         if name in self.ARENAS:
             row = _placed(name, value)
-            if "places" not in vars(self):
-                object.__setattr__(self, "places", np.zeros(WIDTH * len(self.ARENAS), np.int64))
+            if "array_table" not in vars(self):
+                object.__setattr__(self, "array_table", np.zeros(WIDTH * len(self.ARENAS), np.int64))
             first = WIDTH * self.ARENAS.index(name)
-            self.places[first : first + WIDTH] = row
+            self.array_table[first : first + WIDTH] = row
         object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "places"}
+        return {name: value for name, value in vars(self).items() if name != "array_table"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """For copies: what has other arrays needs another table."""

@@ -19,12 +19,13 @@ from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, Fa
 from factorbus.solver.graph.groups import FactorGroup, Group
 from factorbus.solver.graph.rows import Rows, Span
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
-from factorbus.solver.kernels.graph.admit import enter_keys, find_variable, remove_keys
+from factorbus.solver.kernels.graph import group_table as gt
+from factorbus.solver.kernels.graph.key_table import enter_keys, find_variable, remove_keys
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model import records
 from factorbus.solver.kernels.model.kinds import CAMERA
-from factorbus.solver.kernels.model.retract import gather, label_of
+from factorbus.solver.kernels.model.retract import common_label, gather_values
 
 Mark: TypeAlias = tuple[int, ...]
 
@@ -36,7 +37,7 @@ class Graph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
-    NOT_KEPT = ("_rows", "places")  # of a solver's state: they follow from the rest
+    NOT_KEPT = ("_rows", "array_table")  # of a solver's state: they follow from the rest
 
     def __init__(self) -> None:
         # Room for the first few hundred factors: the step that finds none takes several times as long.
@@ -87,12 +88,15 @@ class Graph(Arenas):
         return other
 
     def make_room(self, groups: I64) -> None:
-        """For groups of variables and factors as `kernels/model/layout.py` has them."""
-        groups = groups[: int(np.argmax(groups[:, at.G_KIND] == at.END))]
-        of_factors, rows = groups[:, at.G_FACTORS] != 0, groups[:, at.G_COUNT]
-        numbers = rows * (groups[:, at.G_SIZE] + groups[:, at.G_TRIANGLE])
-        self.reserve_variables(int(rows[~of_factors].sum()), int(numbers[~of_factors].sum()))
-        self.reserve_factors(int(rows[of_factors].sum()), int(numbers[of_factors].sum()))
+        """For groups of variables and factors as `kernels/graph/group_table.py` has them."""
+        groups = groups[: int(np.argmax(groups[:, gt.G_KIND] == gt.END))]
+        variables, factors = groups[groups[:, gt.G_FACTORS] == 0], groups[groups[:, gt.G_FACTORS] != 0]
+        kinds = [VARIABLE_KIND_OF_CODE[code] for code in variables[:, gt.G_KIND].tolist()]
+        counts = variables[:, gt.G_COUNT].tolist()
+        self.reserve_variables(sum(counts), sum(n * kind.size for n, kind in zip(counts, kinds, strict=True)))
+        widths = [FACTOR_KIND_OF_CODE[code].width for code in factors[:, gt.G_KIND].tolist()]
+        counts = factors[:, gt.G_COUNT].tolist()
+        self.reserve_factors(sum(counts), sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
 
     def reserve_variables(self, more: int, numbers: int) -> None:
         """Make room for `more` variables, whose values have so many numbers together."""
@@ -123,13 +127,6 @@ class Graph(Arenas):
         """Bytes in use of all arenas."""
         variables, factors, values, payload, columns, *_ = self.counts.tolist()
         return 8 * (variables * (at.V_WIDTH + 2) + factors * at.F_WIDTH + values + payload + columns + self.table.size)
-
-    def stamp_last(self, count: int, stamps: I64 | None) -> None:
-        """The last `count` variables, which are new, have these time stamps; None: none."""
-        variables = int(self.counts[at.VARIABLES])
-        self.stamps[variables - count : variables] = at.NO_STAMP if stamps is None else stamps
-        if stamps is not None:
-            self.counts[at.STAMPED] += np.count_nonzero(stamps != at.NO_STAMP)
 
     def stamps_of(self, rows: I64) -> I64 | None:
         """The time stamps of the variables at these indices, NO_STAMP of one without; None: none of them has one."""
@@ -177,7 +174,7 @@ class Graph(Arenas):
             spans = self._rows.follow(self.var, self.counts.item(at.VARIABLES))
             keys, values, stamps = self.keys, self.values, self.stamps if self.counts.item(at.STAMPED) else None
             return [span.group(keys, values, stamps) if span.together else self._scattered(span) for span in spans]
-        if (label := label_of(picked, self.places)) >= 0:
+        if (label := common_label(picked, self.array_table)) >= 0:
             return [self._gathered(label, picked)]
         var = self.var[picked]
         labels = 2 * var[:, at.V_KIND] + (var[:, at.V_COLUMN] < 0)
@@ -185,7 +182,7 @@ class Graph(Arenas):
 
     def _scattered(self, span: Span) -> Group:
         values, rows = np.empty((span.count, span.size)), span.rows()
-        gather(rows, self.places, _NO_KEYS, values)
+        gather_values(rows, self.array_table, _NO_KEYS, values)
         values.flags.writeable = not span.fixed  # as where they are together
         stamps = self.stamps_of(rows)
         if stamps is not None:
@@ -195,7 +192,7 @@ class Graph(Arenas):
     def _gathered(self, label: int, rows: I64) -> Group:
         kind = VARIABLE_KIND_OF_CODE[label // 2]
         keys, values = np.empty(rows.size, np.int64), np.empty((rows.size, kind.size))
-        gather(rows, self.places, keys, values)
+        gather_values(rows, self.array_table, keys, values)
         return Group(kind.name, keys, values, bool(label % 2), self.stamps_of(rows))
 
     def factors(self, most: int | None = None, apart: Sequence[Sequence[int]] = ()) -> list[FactorGroup]:
@@ -218,9 +215,9 @@ class Graph(Arenas):
         kind, code = FACTOR_KIND_OF_CODE[int(fac[rows[0], at.F_KIND])], int(fac[rows[0], at.F_FLAGS]) >> at.LOSS_SHIFT
         loss, picked = LOSS_OF_CODE.get(code, ""), fac[rows]
         ends = self.keys[picked[:, at.F_I : at.F_I + len(kind.connects)]]
-        width = kind.size + kind.triangle + (1 if loss else 0)
+        width = kind.width + (1 if loss else 0)
         numbers = self.payload[picked[:, at.F_AT, None] + np.arange(width)]
-        measured, information, scale = np.hsplit(numbers, [kind.size, kind.size + kind.triangle])
+        measured, information, scale = np.hsplit(numbers, [kind.size, kind.width])
         own = scale[:, 0].copy() if loss else None
         return FactorGroup(kind.name, ends, measured.copy(), information.copy(), loss, own, self.ids_of(rows))
 

@@ -31,6 +31,11 @@ class FactorKind:
         """Numbers in the upper triangle of the information matrix."""
         return self.dim * (self.dim + 1) // 2
 
+    @property
+    def width(self) -> int:
+        """Numbers of a measurement and its information."""
+        return self.size + self.triangle
+
     def __str__(self) -> str:
         return self.name
 

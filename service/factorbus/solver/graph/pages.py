@@ -57,7 +57,7 @@ def _pages_of(array: F64) -> mmap.mmap | None:
 
 
 def _seen(pages: mmap.mmap, size: int) -> F64:
-    """A step can write to a few small pages (`kernels/bayes_tree/allocator.py`); large arrays are faster in huge."""
+    """Small pages are found at their first use, one at a time; large arrays are faster in huge ones."""
     advice = _SMALL if len(pages) < _LARGE else _HUGE
     if advice is not None:
         with suppress(OSError):  # a system that has no huge ones

@@ -63,9 +63,9 @@ def _by_kind(graph: Graph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
 
 def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:
     """Of factors of one kind the Jacobian of each end (n, dim, d), Ω (n, dim, dim) and r (n, dim)."""
-    fac, n = np.ascontiguousarray(graph.fac[rows]), rows.size
+    n = rows.size
     r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, 6, 6)) for _ in range(3))
-    evaluate_factors(0, n, graph.var, fac, graph.values, graph.payload, r, A, B, W)
+    evaluate_factors(rows, graph.array_table, graph.values, r, A, B, W)
     d = kind.dim
     blocks = [J[:, :d, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]
     return blocks, W[:, :d, :d], r[:, :d]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorbus.solver.graph.arenas import Arenas
 from factorbus.solver.graph.factor_graph import Graph, grown
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.block_rows import (
@@ -20,9 +21,10 @@ from factorbus.solver.kernels.inc_l.block_rows import (
 from factorbus.solver.kernels.inc_l.dense_update import MOST_BLOCKS, dense_omega_update
 from factorbus.solver.kernels.inc_l.lambda_update import lambda_update
 from factorbus.solver.kernels.inc_l.omega_update import MOST_ROWS, omega_update
+from factorbus.solver.kernels.inc_l.records import BlockRows
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.symbolic import Symbolic
 
 _NEW_NUMBERS = 6 * 12  # doubles a new row takes at most
@@ -41,10 +43,11 @@ class Reach:
     span: int
 
 
-class BlockFactor:
+class BlockFactor(Arenas):
     """RᵀR = PΛPᵀ and d = R⁻ᵀPη."""
 
-    NOT_KEPT = ("_room",)
+    ARENAS = BlockRows._fields
+    NOT_KEPT = ("_room", "array_table")
 
     def __init__(self) -> None:
         self.rec: I64 = np.empty((16, br.RECORD), np.int64)
@@ -66,9 +69,8 @@ class BlockFactor:
         if self.index.size < symbolic.stored:
             self.index = np.empty(self.numbers.size, np.int64)
         take_fronts(
-            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.border, arena, self.rec,
-            self.index, self.numbers, self.place, self.counts,
-        )  # fmt: skip
+            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.border, arena, self.array_table
+        )
         self.d[: symbolic.size] = d
 
     def append(self, graph: Graph, v0: int) -> None:
@@ -78,17 +80,13 @@ class BlockFactor:
             return
         self._reserve(v1 - v0, int(graph.counts[at.SCALARS]))
         self._make_room((v1 - v0) * _NEW_INDEX, (v1 - v0) * _NEW_NUMBERS)
-        append_rows(
-            v0, v1, graph.var, graph.dims, self.rec, self.index, self.numbers, self.place, self.d, self.counts
-        )  # fmt: skip
+        append_rows(v0, v1, graph.array_table, self.array_table)
 
     def reach(self, graph: Graph, f0: int) -> Reach:
         """What the factors from id `f0` on reach; their variables have rows."""
         seen = np.zeros(1, np.int64)
-        count = reach_rows(
-            f0, int(graph.counts[at.FACTORS]), graph.var, graph.fac, self.place, self.rec, self.index, self._mark,
-            self._found, seen,
-        )  # fmt: skip
+        f1 = int(graph.counts[at.FACTORS])
+        count = reach_rows(f0, f1, graph.array_table, self.array_table, self._mark, self._found, seen)
         rows = self._found[:count]
         return Reach(rows, int(seen[0]), int(self.counts[br.POSITIONS] - rows[0]) if count else 0)
 
@@ -100,36 +98,25 @@ class BlockFactor:
         f1 = int(graph.counts[at.FACTORS])
         self._make_room_to_grow(reach)
         if reach.rows.size <= MOST_BLOCKS:
-            failed = dense_omega_update(
-                f0, f1, reach.rows, graph.var, graph.fac, graph.values, graph.payload, self.rec, self.index,
-                self.numbers, self.place, self.d, self.counts,
-            )  # fmt: skip
-            return failed < 0
+            return dense_omega_update(f0, f1, reach.rows, graph.array_table, self.array_table) < 0
         if self._room.size < MOST_ROWS * reach.scalars:
             self._room = np.empty(2 * MOST_ROWS * reach.scalars)
-        failed = omega_update(
-            f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.rec, self.index, self.numbers, self.place,
-            self.d, self.counts, reach.scalars, self._room,
-        )  # fmt: skip
-        return failed < 0
+        return omega_update(f0, f1, graph.array_table, self.array_table, reach.scalars, self._room) < 0
 
-    def lambda_update(self, blocks: Blocks, reach: Reach) -> bool:
+    def lambda_update(self, blocks: HessianBlocks, reach: Reach) -> bool:
         """R₂₂ := chol(Λ₂₂ − R₁₂ᵀR₁₂); d with it.  False: a pivot failed, and R is of no use any more."""
         self._make_room_to_grow(reach)
-        failed = lambda_update(
-            reach.rows, int(blocks.fill[0]), blocks.pattern, blocks.data, blocks.eta, self.rec, self.index,
-            self.numbers, self.place, self.d, self.counts,
-        )  # fmt: skip
-        return failed < 0
+        count = int(blocks.fill[0])
+        return lambda_update(reach.rows, count, blocks.pattern, blocks.data, blocks.eta, self.array_table) < 0
 
     def forward(self, eta: F64, d: F64) -> float:
         """d = R⁻ᵀPη in elimination order, from η in insertion order; gives dᵀd."""
-        return float(solve_block_rows_transposed(self.rec, self.index, self.numbers, self.counts, eta, d))
+        return float(solve_block_rows_transposed(self.array_table, eta, d))
 
     def back(self, d: F64) -> F64:
         """δ = PᵀR⁻¹d, in insertion order."""
         x, delta = np.empty(d.size), np.empty(d.size)
-        solve_block_rows(self.rec, self.index, self.numbers, self.counts, d, x, delta)
+        solve_block_rows(self.array_table, d, x, delta)
         return delta
 
     def memory_bytes(self) -> int:
@@ -165,5 +152,5 @@ class BlockFactor:
         live, listed = int((rec[:, br.DIM] * rec[:, br.LD]).sum()), int(rec[:, br.ROOM].sum())
         index = np.empty(max(self.index.size, 2 * (listed + positions)), np.int64)
         fresh = np.empty(max(self.numbers.size, 2 * (live + numbers)))
-        compact_rows(self.rec, self.index, self.numbers, self.counts, index, fresh)
+        compact_rows(self.array_table, index, fresh)
         self.index, self.numbers = index, fresh

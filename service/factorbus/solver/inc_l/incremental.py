@@ -16,7 +16,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import inner
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.elimination import Elimination
 
 
@@ -51,7 +51,7 @@ class Incremental:
         """Bytes of R, in fronts and in block rows."""
         return self.elimination.memory_bytes() + self.rows.memory_bytes()
 
-    def apply(self, graph: Graph, blocks: Blocks, since: Mark, watch: Stopwatch) -> Plan:
+    def apply(self, graph: Graph, blocks: HessianBlocks, since: Mark, watch: Stopwatch) -> Plan:
         """R and d follow what came after `since`, which Λ and η hold already; or R is given up."""
         if not self.have_r:
             return Plan("full", "the linearization point has moved, or nothing was factorized yet")
@@ -74,7 +74,7 @@ class Incremental:
             return Plan("full", f"a pivot failed in the {plan.strategy} update")
         return plan
 
-    def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
+    def factorize(self, graph: Graph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """R of Λ with its diagonal times 1 + damping, the one that is there if it is that; −1 or the failed column."""
         if damping == 0.0 and self.have_r:
             self._solves = self._have

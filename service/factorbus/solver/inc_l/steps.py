@@ -20,7 +20,7 @@ from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import mode_named
-from factorbus.solver.optimize.gauss_newton import Course, glide, minimize
+from factorbus.solver.optimize.gauss_newton import Minimization, glide, minimize
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
@@ -133,7 +133,7 @@ class IncrementalSteps:
             self._take_back()
             raise
         # 5. Remember where this leaves things, and account for it.
-        report = self._report(course, added, self._told(plan, because, batch), watch)
+        report = self._report(course, added, self._reported(plan, because, batch), watch)
         self._commit(course, added, bool(because), batch, finished)
         return report
 
@@ -142,12 +142,8 @@ class IncrementalSteps:
         mark, counts = self._done.graph, self._graph.counts.tolist()
         few = counts[at.VARIABLES] - mark[at.VARIABLES] <= _FEW and counts[at.FACTORS] - mark[at.FACTORS] <= 8 * _FEW
         if few and self._mode.updates:
-            epsilon = self._options.tuning.chi2_epsilon
-            graph = self._graph
-            settle_new(
-                mark[at.VARIABLES], counts[at.VARIABLES], mark[at.FACTORS], counts[at.FACTORS], epsilon,
-                graph.var, graph.fac, graph.values, graph.payload,
-            )  # fmt: skip
+            variables, factors = (mark[at.VARIABLES], counts[at.VARIABLES]), (mark[at.FACTORS], counts[at.FACTORS])
+            settle_new(*variables, *factors, self._options.tuning.chi2_epsilon, self._graph.array_table)
 
     def _suspects(self) -> I64:
         """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""
@@ -201,7 +197,9 @@ class IncrementalSteps:
             return Plan("full", "only the numbers of Λ can tell whether all new variables are held")
         return self._system.factor.apply(self._graph, self._system.blocks, self._done.graph, watch)
 
-    def _solve(self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch) -> tuple[Course, bool]:
+    def _solve(
+        self, added: float, settle: bool, batch: bool, suspects: I64, watch: Stopwatch
+    ) -> tuple[Minimization, bool]:
         """Gauss-Newton from the present values, or between forced batches one linear step; and whether that is the
         optimum to what χ² shows."""
         system, options, chi2 = self._system, self._options, self._done.chi2 + added
@@ -230,7 +228,7 @@ class IncrementalSteps:
             course.converged |= ordinary_rule(options, tolerance).is_negligible(course.left, course.chi2)
         return course, finished
 
-    def _keeps(self, had_factor: bool, course: Course) -> bool:
+    def _keeps(self, had_factor: bool, course: Minimization) -> bool:
         """Whether R is to stay in use at the new linearization point.
 
         It is where that has led to the new optimum often enough lately; else every `_TRY_AGAIN`-th of the steps that
@@ -246,16 +244,16 @@ class IncrementalSteps:
         dear = _LEAST_TRUST + _DEAR * int(self._graph.counts[at.FACTORS]) / int(self._graph.counts[at.VARIABLES])
         return self._trust > dear or self._moves % _TRY_AGAIN == 0
 
-    def _extend(self, added: float) -> tuple[Course, bool]:
+    def _extend(self, added: float) -> tuple[Minimization, bool]:
         """Nothing moves: what is new has the values it was given or composed to."""
         self._changed = np.arange(self._done.graph[at.VARIABLES], int(self._graph.counts[at.VARIABLES]))
-        return Course(self._done.chi2 + added, damping=0.0, converged=True), self._done.finished
+        return Minimization(self._done.chi2 + added, damping=0.0, converged=True), self._done.finished
 
     def _take_back(self) -> None:
         self._graph.forget(self._done.graph)
         self._system.take_back(self._done.fill)
 
-    def _commit(self, course: Course, added: float, solved: bool, batch: bool, finished: bool) -> None:
+    def _commit(self, course: Minimization, added: float, solved: bool, batch: bool, finished: bool) -> None:
         unsolved = self._done.unsolved + added
         if solved:
             unsolved = 0.0 if course.converged else np.inf
@@ -270,7 +268,7 @@ class IncrementalSteps:
             finished,
         )
 
-    def _told(self, plan: Plan, because: str, batch: bool) -> Plan:
+    def _reported(self, plan: Plan, because: str, batch: bool) -> Plan:
         """What the step is called in the report, and why it was done so."""
         if not because:
             return Plan("extend", "new factors agree with the estimate: the gradient is zero", plan.rows)
@@ -278,7 +276,7 @@ class IncrementalSteps:
             return Plan("full", f"{because}; a batch is due", plan.rows)
         return Plan(plan.strategy, f"{because}; {plan.because}", plan.rows)
 
-    def _report(self, course: Course, added: float, plan: Plan, watch: Stopwatch) -> StepReport:
+    def _report(self, course: Minimization, added: float, plan: Plan, watch: Stopwatch) -> StepReport:
         columns, factor = int(self._graph.counts[at.COLUMNS]), self._system.factor
         nonzeros, flops = factor.cost() if plan.strategy != "extend" else (0, 0.0)
         return StepReport(

@@ -19,7 +19,7 @@ _ROUNDING_FLOOR = 1e-12
 _EXACT, _EXACT_FLOOR = 1e-21, 1e-24
 
 
-class Problem(Protocol):
+class LeastSquares(Protocol):
     """A sum of squares at a linearization point."""
 
     def factorize(self, damping: float) -> int:
@@ -51,7 +51,7 @@ class Problem(Protocol):
         ...
 
 
-class LinearProblem(Problem, Protocol):
+class LinearizedLeastSquares(LeastSquares, Protocol):
     """A problem that can stay linearized where it was."""
 
     def accept_linear(self) -> None:
@@ -60,7 +60,7 @@ class LinearProblem(Problem, Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class StoppingRule:
     """When to stop: the next step would lower χ² by less than `batch_tolerance` χ² + `floor`; or after `limit` tries.
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
@@ -82,7 +82,7 @@ class Rule:
 
 
 @dataclass(slots=True)
-class Course:
+class Minimization:
     """How a minimization went.
 
     failed: the block column whose pivot failed in the last factorization, or −1.  left: what the next undamped step
@@ -98,7 +98,9 @@ class Course:
     left: float = math.inf
 
 
-def minimize(problem: Problem, chi2: float, damping: float, rule: Rule, have_factor: bool = False) -> Course:
+def minimize(
+    problem: LeastSquares, chi2: float, damping: float, rule: StoppingRule, have_factor: bool = False
+) -> Minimization:
     """Lower χ² from where `problem` stands until `rule` says stop.  At the end χ² is no higher than at the beginning.
 
     Each try: 1. factorize and solve for a step, unless the last factor gave one; 2. stop if it would gain nothing;
@@ -110,7 +112,7 @@ def minimize(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
     it begins without `damping`, which counts once they have been taken back.
     """
     hills = rule.nonmonotone
-    course = Course(chi2, 0.0 if hills else damping)
+    course = Minimization(chi2, 0.0 if hills else damping)
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
         if not solved:
@@ -163,9 +165,9 @@ def minimize(problem: Problem, chi2: float, damping: float, rule: Rule, have_fac
     return course
 
 
-def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
+def glide(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
     """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
-    course = Course(chi2, 0.0, factorizations=1, converged=True)
+    course = Minimization(chi2, 0.0, factorizations=1, converged=True)
     if problem.factorize(0.0) >= 0:
         return None
     if rule.is_negligible(problem.decrease(), chi2):
@@ -178,7 +180,7 @@ def glide(problem: LinearProblem, chi2: float, rule: Rule) -> Course | None:
     return course
 
 
-def _go_over_hill(problem: Problem, course: Course, reached: float, most: int) -> bool:
+def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, most: int) -> bool:
     """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
     first, which led to χ² `reached`.
 
@@ -201,7 +203,7 @@ def _go_over_hill(problem: Problem, course: Course, reached: float, most: int) -
     return False
 
 
-def _polish(problem: Problem, course: Course, most: int) -> None:
+def _polish(problem: LeastSquares, course: Minimization, most: int) -> None:
     """Steps by the old factor, which is nearly that of the optimum: δ is exact to more digits than χ² has."""
     last = math.inf
     for _ in range(most):
@@ -221,7 +223,7 @@ def _is_rounding(decrease: float, chi2: float) -> bool:
     return decrease <= _ROUNDING * chi2 + _ROUNDING_FLOOR
 
 
-def _damp_more(course: Course) -> bool:
+def _damp_more(course: Minimization) -> bool:
     """Ten times the damping; False: that has no use any more, and whoever tries again starts without any."""
     course.damping = max(10.0 * course.damping, _FIRST_DAMPING)
     if course.damping > _MOST_DAMPING:
@@ -230,7 +232,7 @@ def _damp_more(course: Course) -> bool:
     return True
 
 
-def _damp_less(course: Course, gained: float, expected: float) -> None:
+def _damp_less(course: Minimization, gained: float, expected: float) -> None:
     """After a good step: less damping where the model was right, more where it was poor."""
     if gained < 0.25 * expected:
         course.damping *= 2.0

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.model.retract import differing, move
 from factorbus.solver.optimize.factor import Factor
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.anchors import find_loose
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 R = TypeVar("R", bound=Factor)
 
@@ -22,13 +22,13 @@ _FREE_DIRECTION = (
 
 
 class System(Generic[R]):
-    """Λ, η and R of a graph at its present values.  A `gauss_newton.Problem` between `begin` and `end` of a step."""
+    """Λ, η and R of a graph at its present values.  A `LeastSquares` between `begin` and `end` of a step."""
 
     NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
 
     def __init__(self, graph: Graph, factor: R) -> None:
         self.graph = graph
-        self.blocks = Blocks()
+        self.blocks = HessianBlocks()
         self.factor = factor
         self._before: F64 = np.zeros(0)
         self._kept: F64 = np.zeros(0)

@@ -11,10 +11,10 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import Graph, Mark
 from factorbus.solver.kernels.graph.initialize import join, reach
-from factorbus.solver.kernels.graph.observability import hold
+from factorbus.solver.kernels.graph.observability import mark_held
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 
 # A variance this many times what the variable's own factors alone would leave is no longer a number.
 _LOOSE = 1e12
@@ -29,8 +29,8 @@ def find_unheld(graph: Graph, since: Mark) -> I64:
     held = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     arenas = graph.var, graph.fac, graph.values, graph.payload
-    while reach(False, first, *factors, *arenas, held) >= 0:
-        if not hold(first, *factors, *arenas, held):
+    while reach(False, first, *factors, graph.array_table, held) >= 0:
+        if not mark_held(first, *factors, *arenas, held):
             break
     else:
         return _NONE
@@ -48,7 +48,7 @@ def find_unanchored(graph: Graph, since: Mark) -> int:
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 
 
-def find_loose(graph: Graph, blocks: Blocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
+def find_loose(graph: Graph, blocks: HessianBlocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
     """The suspect that Λ leaves free to move, or −1.
 
     `solve` gives Λ⁻¹ b.  With D = diag Λ and signs s on the suspects, y = D½ Λ⁻¹ D½ s is of the size of the inverse of

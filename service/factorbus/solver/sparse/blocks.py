@@ -8,13 +8,13 @@ is not accepted costs nothing to undo.
 import numpy as np
 
 from factorbus.solver.graph.factor_graph import Graph, Mark, grown, table_size
-from factorbus.solver.kernels.graph.block_pattern import connect, enter_blocks, remove_blocks
+from factorbus.solver.kernels.graph.block_pattern import connect_blocks, enter_blocks, remove_blocks
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import linearize
 
 
-class Blocks:
+class HessianBlocks:
     """The normal equations Λ δ = η of a graph's free variables, linearized at given values."""
 
     NOT_KEPT = ("_spare_data", "_spare_eta")
@@ -49,7 +49,7 @@ class Blocks:
         f0, f1 = since[at.FACTORS], int(graph.counts[at.FACTORS])
         self._reserve(v1 - v0 + f1 - f0, int(graph.counts[at.SCALARS]))
         numbers = int(self.fill[1])
-        connect(v0, v1, f0, f1, graph.var, graph.fac, graph.dims, self.table, self.pattern, self.fill)
+        connect_blocks(v0, v1, f0, f1, graph.array_table, self.table, self.pattern, self.fill)
         if (need := int(self.fill[1])) > self.data.size:
             self.data = grown(self.data, need)
         self.data[numbers:need] = 0.0

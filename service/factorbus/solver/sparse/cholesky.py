@@ -11,8 +11,8 @@ from factorbus.solver.kernels.sparse.multifrontal import factorize
 from factorbus.solver.kernels.sparse.triangular_solve import (
     into_elimination_order,
     into_insertion_order,
-    solve_lower,
-    solve_upper,
+    solve_fronts,
+    solve_fronts_transposed,
 )
 from factorbus.solver.sparse.ordering import integers
 from factorbus.solver.sparse.symbolic import Symbolic
@@ -27,7 +27,7 @@ class Cholesky:
 
     def __init__(self) -> None:
         self._symbolic: Symbolic | None = None
-        self._arena, self._floors, self._x, self._room = (np.empty(0) for _ in range(4))
+        self._arena, self._room = np.empty(0), np.empty(0)
 
     @property
     def arena(self) -> F64:
@@ -46,9 +46,8 @@ class Cholesky:
         _check_blocks(symbolic, data, offsets)
         self._reserve(symbolic)
         failed = factorize(
-            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, self._floors,
-            TASK_QUEUE,
-        )  # fmt: skip
+            symbolic.fronts, symbolic.runs, symbolic.blocks, data, offsets, float(damping), self._arena, TASK_QUEUE
+        )
         if failed >= 0:
             return symbolic.variable_at(failed)
         self._symbolic = symbolic
@@ -70,13 +69,13 @@ class Cholesky:
         """d = R⁻ᵀPη, in elimination order."""
         symbolic, d = self._of(eta), np.empty(len(eta))
         into_elimination_order(symbolic.place, symbolic.starts, symbolic.dims, np.array(eta, float), d)
-        solve_lower(symbolic.fronts, symbolic.border, self._arena, d, self._room)
+        solve_fronts_transposed(symbolic.fronts, symbolic.border, self._arena, d, self._room)
         return d
 
     def back(self, d: F64) -> F64:
         """δ = PᵀR⁻¹d: from elimination order back to insertion order."""
         symbolic, x, delta = self._of(d), np.array(d, float), np.empty(len(d))
-        solve_upper(symbolic.fronts, symbolic.border, self._arena, x, self._room)
+        solve_fronts(symbolic.fronts, symbolic.border, self._arena, x, self._room)
         into_insertion_order(symbolic.place, symbolic.starts, symbolic.dims, x, delta)
         return delta
 
@@ -109,7 +108,6 @@ class Cholesky:
     def _reserve(self, symbolic: Symbolic) -> None:
         """Arenas at least as large as needed; they grow by doubling and never shrink."""
         self._arena = _grown(self._arena, symbolic.arena)
-        self._floors = _grown(self._floors, symbolic.size)
         self._room = _grown(self._room, symbolic.widest)
 
 

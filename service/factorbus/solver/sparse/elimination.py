@@ -8,7 +8,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import POSE, SEES_LANDMARK
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.blocks import Blocks
+from factorbus.solver.sparse.blocks import HessianBlocks
 from factorbus.solver.sparse.cholesky import Cholesky
 from factorbus.solver.sparse.cholmod import factorize_by_cholmod
 from factorbus.solver.sparse.ordering import order
@@ -29,7 +29,7 @@ class Elimination:
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
 
-    def factorize(self, graph: Graph, blocks: Blocks, damping: float, watch: Stopwatch) -> int:
+    def factorize(self, graph: Graph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """Factorize Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
         symbolic = self._analysis(graph, blocks, watch)
         if self._options.backend == "cholmod":
@@ -63,7 +63,7 @@ class Elimination:
             raise ValueError("there is no factor: the pattern has changed since")
         return symbolic, self._cholesky.arena
 
-    def _analysis(self, graph: Graph, blocks: Blocks, watch: Stopwatch) -> Symbolic:
+    def _analysis(self, graph: Graph, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]

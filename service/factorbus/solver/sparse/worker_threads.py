@@ -1,7 +1,7 @@
 """Where worker threads of this process work on the eliminations of this process.  MATH §9.5.
 
 The solver has no thread of its own: whoever has one to spare makes a `WorkerThread`, and calls its `run` on that
-thread. There is one board in a process, as there is one set of cores.
+thread. There is one queue in a process, as there is one set of cores.
 """
 
 import ctypes
@@ -18,7 +18,7 @@ TASK_QUEUE: I64 = lines(at.WORDS, np.int64)  # see `kernels/sparse/task_queue.py
 _NOTHING: I64 = np.empty(0, np.int64)
 
 # Words of workers that nobody has; none where threads cannot sleep in a kernel.
-_free = list(range(at.LENDERS, at.WORDS, 8)) if CAN_SLEEP else []
+_free = list(range(at.WORKERS, at.WORDS, 8)) if CAN_SLEEP else []
 
 
 def count_free() -> int:
@@ -41,11 +41,11 @@ class WorkerThread:
         if not _free:
             raise ValueError(f"{at.MOST} worker threads, which is all that can, or none can on this system")
         self._word = _free.pop()
-        self._semaphore = ctypes.c_void_p(TASK_QUEUE.ctypes.data + 8 * (self._word + at.ASLEEP))
+        self._semaphore = ctypes.c_void_p(TASK_QUEUE.ctypes.data + 8 * (self._word + at.SEMAPHORE_AT))
         self._libc = ctypes.CDLL(None)
         self._libc.sem_init(self._semaphore, 0, 0)
         self._line = TASK_QUEUE[self._word : self._word + 8]
-        self._line[at.MADE], self._line[0] = 0, at.LENDS
+        self._line[at.MADE], self._line[0] = 0, at.WORKING
 
     @property
     def made(self) -> int:
@@ -54,11 +54,11 @@ class WorkerThread:
     def run(self) -> None:
         """Returns after `leave`.  Once, on the thread whose core it is."""
         tree_step(_NOTHING, _NOTHING, TASK_QUEUE, self._word)
-        self._line[0] = at.AWAY
+        self._line[0] = at.ABSENT
         self._line = self._line.copy()
         _free.append(self._word)
 
     def leave(self) -> None:
         """Have `run` return, if need be after the chunk that it is at.  Once."""
-        self._line[0] = at.LEAVES
+        self._line[0] = at.STOPPING
         self._libc.sem_post(self._semaphore)

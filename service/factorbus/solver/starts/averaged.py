@@ -10,11 +10,20 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.carried import carry, tied
 from factorbus.solver.starts.components import components_of, docked
 from factorbus.solver.starts.losses import narrowing, weights_of
-from factorbus.solver.starts.relations import MAP, PLANE, SPACE, Directions, Relations, Space, poses_apart, relations_of
+from factorbus.solver.starts.relations import (
+    MAP,
+    PLANE,
+    SPACE,
+    Directions,
+    PoseSpace,
+    Relations,
+    poses_apart,
+    relations_of,
+)
 from factorbus.solver.starts.rotation_matrices import nearest_rotations, quaternions_of
 from factorbus.solver.starts.rotations import averaged_rotations
 from factorbus.solver.starts.together import rotations_with_places
-from factorbus.solver.starts.translations import distances, placed
+from factorbus.solver.starts.translations import distances, solve_positions
 
 # More components than these that nothing holds are not brought to each other: each takes a while.
 _MOST = 100
@@ -55,7 +64,7 @@ def averaged(graph: Graph) -> list[F64]:
 class _Averaging:
     """One space of a graph: what its factors say, and what it is before anything is averaged."""
 
-    def __init__(self, graph: Graph, space: Space) -> None:
+    def __init__(self, graph: Graph, space: PoseSpace) -> None:
         self._graph, self._space, self._nodes = graph, space, _nodes(graph, space)
         relations, self._directions = relations_of(graph, space)
         self.has_places = bool((self._nodes.point[relations.b] & (relations.a != MAP)).any())
@@ -101,7 +110,7 @@ class _Averaging:
         return R, _place(relations, nodes, R, np.ones(label.size, bool))
 
 
-def _nodes(graph: Graph, space: Space) -> Nodes:
+def _nodes(graph: Graph, space: PoseSpace) -> Nodes:
     count, d = int(graph.counts[at.VARIABLES]), space.dim
     var, size = graph.var[:count], 3 if d == 2 else 7
     R, t = np.tile(np.eye(d), (count + 1, 1, 1)), np.zeros((count + 1, d))
@@ -155,10 +164,10 @@ def _place(relations: Relations, nodes: Nodes, R: F64, inside: np.ndarray) -> F6
     label = components_of(used, nodes.fixed)
     known = nodes.fixed | ~inside
     known[_firsts(label)] = True
-    return placed(used, R, nodes.t, known)
+    return solve_positions(used, R, nodes.t, known)
 
 
-def _write(graph: Graph, space: Space, nodes: Nodes, R: F64, t: F64, values: F64) -> None:
+def _write(graph: Graph, space: PoseSpace, nodes: Nodes, R: F64, t: F64, values: F64) -> None:
     """The free poses and points as variables have them."""
     d, start = space.dim, graph.var[: graph.counts[at.VARIABLES], at.V_AT]
     for of in (nodes.pose & ~nodes.fixed, nodes.point & ~nodes.fixed):

@@ -1,6 +1,7 @@
 """A whole graph at once, from the best of several starts: what an incremental estimate is held against.  MATH §12."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +73,8 @@ def _is_beside(descent: Descent, lower: Descent) -> bool:
 
 def _composed(graph: Graph) -> F64:
     """Each variable from the first factor that reaches it; what none reaches stays where it is."""
-    fac, values = graph.fac[: graph.counts[at.FACTORS]], graph.values.copy()
+    composed = copy(graph)
+    composed.values = graph.values.copy()
     reached = (graph.var[: graph.counts[at.VARIABLES], at.V_COLUMN] < 0).astype(np.int64)
-    reach(True, 0, 0, len(fac), graph.var, np.ascontiguousarray(fac), values, graph.payload, reached)
-    return values
+    reach(True, 0, 0, int(graph.counts[at.FACTORS]), composed.array_table, reached)
+    return composed.values

@@ -7,14 +7,14 @@ import numpy as np
 from factorbus.solver.graph.factor_graph import Graph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.starts.relations import Relations, Space
+from factorbus.solver.starts.relations import PoseSpace, Relations
 from factorbus.solver.starts.rotation_matrices import turned_rays
 
 # What such a tie counts for beside rays to the same point.
 _WEAK = 1e-4
 
 
-def tied(graph: Graph, space: Space, relations: Relations, R: F64, t: F64) -> Relations:
+def tied(graph: Graph, space: PoseSpace, relations: Relations, R: F64, t: F64) -> Relations:
     """`relations`, and for each point whose place no factor measures: as the pose that saw it first sees it now.
 
     R (N, d, d), t (N, d): as they are.
@@ -42,7 +42,7 @@ def tied(graph: Graph, space: Space, relations: Relations, R: F64, t: F64) -> Re
     return relations.joined(ties)
 
 
-def carry(graph: Graph, space: Space, before: tuple[F64, F64], after: tuple[F64, F64], values: F64) -> None:
+def carry(graph: Graph, space: PoseSpace, before: tuple[F64, F64], after: tuple[F64, F64], values: F64) -> None:
     """Features of inverse depth go along with the pose that saw them first.
 
     before, after: rotations (N, d, d) and places (N, d) of all nodes as they are, and as they are in `values`.

@@ -7,7 +7,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import Directions, Relations
 from factorbus.solver.starts.rotation_matrices import nearest_rotations
-from factorbus.solver.starts.translations import placed
+from factorbus.solver.starts.translations import solve_positions
 
 # What the rotations that are there count for beside what is measured: where that leaves a direction open.
 _PRESENT = 1e-12
@@ -44,7 +44,7 @@ def docked(
     local[first] = 0.0
     stays = ~(members | points)
     stays[first] = True
-    local = placed(own, R, local, stays)
+    local = solve_positions(own, R, local, stays)
     there, here, weight = _pairs(inside, points & known, members, R, t, local)
     M = np.zeros(R.shape[1:])
     if weight.size > 1:

@@ -13,7 +13,7 @@ from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
-from factorbus.solver.optimize.gauss_newton import Rule, minimize
+from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
@@ -116,7 +116,7 @@ class Descents:
             return
         system.anew()
         tolerance, floor = self._rule
-        course = minimize(system, descent.chi2, descent.damping, Rule(tolerance, floor, _CHUNK, polish=_POLISH))
+        course = minimize(system, descent.chi2, descent.damping, StoppingRule(tolerance, floor, _CHUNK, polish=_POLISH))
         if course.failed >= 0 and course.iterations == 0:
             raise system.underconstrained(system.variable_of(course.failed))
         descent.rate = descent.chi2 / course.chi2 if course.chi2 > 0.0 else np.inf

@@ -18,7 +18,7 @@ MAP = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Space:
+class PoseSpace:
     """The plane or space: its dimension, and its kinds of variables and factors."""
 
     dim: int
@@ -34,11 +34,11 @@ class Space:
     linear: int
 
 
-PLANE = Space(
+PLANE = PoseSpace(
     2, at.SE2, at.POINT2, at.PRIOR_SE2, at.PRIOR_POINT2, at.BETWEEN_SE2, at.LANDMARK_SE2, at.POSITION_SE2,
     at.BEARING_SE2, at.LINEAR_PAIR_SE2, at.LINEAR_SE2,
 )  # fmt: skip
-SPACE = Space(
+SPACE = PoseSpace(
     3, at.SE3, at.POINT3, at.PRIOR_SE3, at.PRIOR_POINT3, at.BETWEEN_SE3, at.LANDMARK_SE3, at.POSITION_SE3,
     at.BEARING_SE3, at.LINEAR_PAIR_SE3, at.LINEAR_SE3,
 )  # fmt: skip
@@ -98,12 +98,12 @@ class Directions:
         return Directions(*(getattr(self, name)[chosen] for name in self.__slots__))
 
 
-def relations_of(graph: Graph, space: Space) -> tuple[Relations, Directions]:
+def relations_of(graph: Graph, space: PoseSpace) -> tuple[Relations, Directions]:
     """All that the factors of a graph say of poses and points in one space."""
     return Relations(*map(np.concatenate, zip(*_parts(graph, space), strict=True))), _directions(graph, space)
 
 
-def _parts(graph: Graph, space: Space) -> list[tuple[np.ndarray, ...]]:
+def _parts(graph: Graph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
     parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
     parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
     parts += [_positions(graph, space), _linear_pairs(graph, space), _linear(graph, space), _bearings(graph, space)]
@@ -154,7 +154,7 @@ def poses_apart(numbers: F64) -> tuple[F64, F64]:
     return matrices_of_quaternions(numbers[:, 3:]), numbers[:, :3]
 
 
-def _poses(graph: Graph, space: Space, kind: int) -> tuple[np.ndarray, ...]:
+def _poses(graph: Graph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, kind)
     (R, t), d = poses_apart(measured), space.dim
     b = fac[:, at.F_J] + 1 if kind == space.between else fac[:, at.F_I] + 1
@@ -173,7 +173,7 @@ def _turn(information: F64, d: int) -> F64:
     return np.maximum(mean, 1e-12 * np.trace(information[:, d:, d:], axis1=1, axis2=2)) * (1.0 if d == 2 else 0.25)
 
 
-def _points(graph: Graph, space: Space, kind: int) -> tuple[np.ndarray, ...]:
+def _points(graph: Graph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, kind)
     seen = kind == space.landmark
     a = fac[:, at.F_I] + 1 if seen else np.zeros(rows.size, np.int64)
@@ -191,7 +191,7 @@ def _bearing_ranges(graph: Graph) -> tuple[np.ndarray, ...]:
     return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, hold)
 
 
-def _bearings(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+def _bearings(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """Points on a line: at the distance that they have now, and free to move along it."""
     rows, fac, measured, information = _rows(graph, space.bearing)
     u = np.stack([np.cos(measured[:, 0]), np.sin(measured[:, 0])], axis=1) if space.dim == 2 else measured
@@ -210,7 +210,7 @@ def _value(graph: Graph, variables: I64, numbers: int) -> F64:
     return graph.values[graph.var[variables, at.V_AT, None] + np.arange(numbers)]
 
 
-def _positions(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+def _positions(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, space.position)
     d, a = space.dim, np.zeros(rows.size, np.int64)
     b, lever = fac[:, at.F_I] + 1, measured[:, d:]
@@ -226,7 +226,7 @@ def _headings(graph: Graph) -> tuple[np.ndarray, ...]:
     return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, hold, R=R, turn=turn)
 
 
-def _linear_pairs(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+def _linear_pairs(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """Two poses together: as they are to each other where the factor was linearized."""
     rows, fac, measured, information = _rows(graph, space.linear_pair)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
@@ -241,7 +241,7 @@ def _linear_pairs(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
     return _made(graph, space.linear_pair, rows, fac, a, b, t, hold, R=back @ Rb, turn=turn)
 
 
-def _linear(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
+def _linear(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """A pose by itself: where the factor was linearized, if it says something of all of the pose."""
     rows, fac, measured, information = _rows(graph, space.linear)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
@@ -255,7 +255,7 @@ def _linear(graph: Graph, space: Space) -> tuple[np.ndarray, ...]:
     return _made(graph, space.linear, rows, fac, a, b, t, hold, R=R, turn=weight[:, d:].mean(axis=1))
 
 
-def _directions(graph: Graph, space: Space) -> Directions:
+def _directions(graph: Graph, space: PoseSpace) -> Directions:
     if space.dim == 2:
         return Directions(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
     _, fac, measured, information = _rows(graph, at.ATTITUDE_SE3)

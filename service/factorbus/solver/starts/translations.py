@@ -12,7 +12,7 @@ _PULL = 1e-6
 _LEAST = 1e-300
 
 
-def placed(relations: Relations, R: F64, t: F64, known: np.ndarray) -> F64:
+def solve_positions(relations: Relations, R: F64, t: F64, known: np.ndarray) -> F64:
     """Places (N, d) of all nodes, of least χ² with these rotations (N, d, d).
 
     known (N,): those that stay where they are in t (N, d); so do those that no relation names.

@@ -11,7 +11,7 @@ import numpy as np
 
 from factorbus.solver.covariance.kernels.columns import forward_path
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel, part
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.covariance.kernels.squares import (
     gather_separator_block,
     height,
@@ -118,7 +118,7 @@ def put_column(
                 put(a, x.scratch + (m + p - 1 - i) * ldx + q, -load(a, result + i * ldx + q))
     for i in range(0, p, high):
         C = Tile(min(high, p - i), x.vectors, result + i * ldx, ldx)
-        negative_product(a, C, a, Strided(w + i * wide, wide, 1), Panel(x.scratch, ldx), depth)
+        negative_product(a, C, a, Strided(w + i * wide, wide, 1), VectorRows(x.scratch, ldx), depth)
     scatter_rows(frontals, layout, a, x, result)
     for s in range(frontals.size):
         block, d = out[frontals[s]], layout.dims[frontals[s]]

@@ -4,13 +4,14 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_bounded
+from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
@@ -79,11 +80,11 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
         account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
         if j >= 0:
             account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
-        stiff[f, tl.B_CHI2], _, _ = factor_chi2(graph, tree, f, link[f, tl.L_KIND], c, s)
+        stiff[f, tl.B_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
         account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
         finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
-        list_moved(MODEL, i, node, moved, state)
+        note_moved(MODEL, i, node, moved, state)
         link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
         node[i, tl.N_SEEN] = state[tl.S_STEP]
         if j >= 0:
@@ -113,7 +114,7 @@ def take_out(graph: Graph, tree: Tree, v0: int, f0: int) -> None:
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         if link[f, tl.L_KIND] >= tl.EXACT:
             state[tl.S_EXACT] -= 1
-            state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
+            state[tl.S_INACTIVE] -= link[f, tl.L_KIND] - tl.EXACT
         if j >= 0:
             node[j, tl.N_ADJ] = link[f, tl.L_J]
             _restore(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)

@@ -16,8 +16,6 @@ from factorbus.solver.kernels.jit.sorting import sort
 
 UNIT = 8  # doubles: a cache line
 FOLLOWING, SIZE = 0, 1  # entries of a free block
-PAGE = 512  # doubles in the smallest page that there is
-AHEAD = 64  # pages that a step writes to before they are needed, and one more for so many that are missing
 
 
 @inline_kernel
@@ -44,22 +42,6 @@ def size_below(size: int) -> int:
         units >>= 1
         shift += 1
     return 8 * shift + units
-
-
-@inline_kernel
-def write_ahead(numbers: F64, state: I64) -> None:
-    """Write to some pages that the longest steps will need, which have the old cliques and the new ones side by side.
-
-    For the first write to a page the system has to find and clear it, which it does here a few pages at a time.
-    """
-    end = state[tl.S_NUMBERS]
-    fresh = max(state[tl.S_FRESH], end)
-    missing = (min(2 * (end - state[tl.S_IDLE]), numbers.size) - fresh) // PAGE
-    if missing >= AHEAD:
-        for _ in range(min(missing, AHEAD + missing // AHEAD)):
-            numbers[fresh] = 0.0
-            fresh += PAGE
-    state[tl.S_FRESH] = fresh
 
 
 @part

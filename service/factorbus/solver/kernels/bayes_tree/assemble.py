@@ -9,7 +9,7 @@ from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_cla
 from factorbus.solver.kernels.bayes_tree.fronts import update_layout
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import TILE_ROWS, add_run, put, zero
+from factorbus.solver.kernels.jit.simd import TILE_ROWS, Block, Panel, add_run, put, zero
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
@@ -44,6 +44,19 @@ def variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
         s += 1
         scalar -= dim_of_variable(var, lists[s])
     return int(lists[s])
+
+
+@inline_kernel
+def front_of_clique(row: I64) -> fr.Front:
+    """The front that a clique is eliminated in: its border has the right-hand side as the last column."""
+    return fr.Front(
+        row[tl.C_ROWS],
+        row[tl.C_LD],
+        row[tl.C_PIVOTS],
+        row[tl.C_BORDER] + 1,
+        row[tl.C_UPDATE],
+        row[tl.C_WIDTH_UPDATE],
+    )
 
 
 @inline_kernel
@@ -111,7 +124,7 @@ def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: 
 
 
 @part
-def list_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
+def list_column_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
     """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
 
     A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.
@@ -234,10 +247,10 @@ def split_update(graph: Graph, tree: Tree, c: int, p: int, m: int, u: int, wide:
         if clique[child, tl.C_ABOVE] < kept:
             _add_child(graph, tree, child, m, u, wide)
         child = clique[child, tl.C_NEXT]
+    separators = Panel(row[tl.C_ROWS] + p, row[tl.C_LD], p)
     for i in range(0, m + 1, TILE_ROWS):
-        rows = min(TILE_ROWS, m + 1 - i)
-        line, stride = u + fr.update_row(i, wide), fr.update_stride(i, wide)
-        take_off(numbers, rows, line, stride, row[tl.C_ROWS] + p, row[tl.C_LD], i, i, m + 1, 0, p)
+        line = Block(u + fr.update_row(i, wide), fr.update_stride(i, wide))
+        take_off(numbers, min(TILE_ROWS, m + 1 - i), line, separators, i, i, m + 1, 0)
 
 
 @inline_kernel

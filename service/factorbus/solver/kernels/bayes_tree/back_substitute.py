@@ -10,7 +10,7 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import rigid_subtrees as rg
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved, move_variable
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, move_variable, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
@@ -214,4 +214,4 @@ def move_frontals(graph: Graph, tree: Tree, row: I64, delta: F64, lin: F64, befo
             solved += 1
         if differs:
             move_variable(graph, tree, v, delta, lin, before)
-            list_moved(MODEL, v, node, moved, state)
+            note_moved(MODEL, v, node, moved, state)

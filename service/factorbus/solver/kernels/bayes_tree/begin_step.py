@@ -7,6 +7,7 @@ from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.graph.initialize import follow, reach
 from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
 
@@ -15,7 +16,7 @@ HESSIAN = 6 * 6 * 3 + 13
 
 
 @part
-def begin(graph: Graph, tree: Tree) -> int:
+def begin_step(graph: Graph, tree: Tree) -> int:
     """Gives DONE: the step can begin; NO_ROOM: the arenas by variable and factor are short; UNSURE: see `step`."""
     var, fac, values, payload, counts = graph.var, graph.fac, graph.values, graph.payload, graph.counts
     settings, node, link, hessian, lin = tree.settings, tree.node, tree.link, tree.hessian, tree.lin
@@ -31,18 +32,18 @@ def begin(graph: Graph, tree: Tree) -> int:
     ):
         return tl.NO_ROOM
     if v1 - v0 <= settings[tl.P_INITIALIZE]:
-        settle_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], var, fac, values, payload)
+        settle_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], table_of(graph))
     if state[tl.S_CHECKED] == 0 and v1 > v0:
         held = np.empty(v1 - v0, np.int64)
         for v in range(v0, v1):
             held[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
         if (
             not are_held_in_turn(v0, f0, f1, var, fac, values, payload, held)
-            and reach(False, v0, f0, f1, var, fac, values, payload, held) >= 0
+            and reach(False, v0, f0, f1, table_of(graph), held) >= 0
         ):
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
-    state[tl.S_TOLD : tl.S_TOLD_TO] = 0
+    state[tl.S_DIFFERING : tl.S_REPORT_END] = 0
     state[tl.S_FAILED] = -1
     state[tl.S_STEP] += 1
     state[tl.S_BEGUN] = 1

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.model.sizes import size_of
 
 
 @kernel("int64(int64, int64[::1], int64[::1], int64[::1])")
-def list_moved(first: int, graph_table: I64, tree_table: I64, out: I64) -> int:
+def list_changed(first: int, graph_table: I64, tree_table: I64, out: I64) -> int:
     """List in `out`, ascending, the variables that have other bits than before the last step, and all from `first` on.
 
     graph_table, tree_table: of their arrays (`records`).  Gives how many.
@@ -46,7 +46,7 @@ def differs_in_tree(v: int, var: I64, lin: I64, values: I64) -> bool:
 
 @part
 def count_differing(first: int, count: int, changed: I64, var: I64, lin: F64, values: F64) -> int:
-    """How many `list_moved` would list."""
+    """How many `list_changed` would list."""
     n, before, now = count - first, lin.view(np.int64), values.view(np.int64)
     for k in range(changed.size):
         if changed[k] < first and differs_in_tree(changed[k], var, before, now):

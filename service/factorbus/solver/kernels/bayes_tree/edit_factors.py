@@ -14,13 +14,14 @@ import math
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
-from factorbus.solver.kernels.bayes_tree.factor_chi2 import factor_chi2, heading_of
-from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, make_scratch, weigh_factor
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
+from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_bounded
+from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph, graph_at
 
 # Columns of the log of links that were changed: which one, of what, and the factor or incidence that it was.
@@ -33,7 +34,7 @@ MOST_LINKS = 3  # that a factor is taken out of
 def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log: I64) -> int:
     """Take the factors `gone` out of the tree, and linearize those `renewed` as the graph has them now (rows).
 
-    graph, tree: tables of their arenas (`places`)   log (3 per factor gone, 3): links as they were, for `relink`
+    graph, tree: tables of their arenas (`array_table`)   log (3 per factor gone, 3): links as they were, for `relink`
     Gives how many rows of the log were written; −1 less that where any χ² is not a number.
     """
     graph, tree = graph_at(graph_table), tree_at(tree_table)
@@ -62,7 +63,7 @@ def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log
             if v >= 0:
                 sum_factors(graph, tree, v)
                 account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
-                list_moved(MODEL, v, node, moved, state)
+                note_moved(MODEL, v, node, moved, state)
     if gone.size + renewed.size > 0 and stiffest >= account[tl.A_STIFFEST]:
         account[tl.A_STIFFEST] = 0.0
         for v in range(state[tl.S_VARIABLES]):
@@ -83,7 +84,7 @@ def detach_factor(graph: Graph, tree: Tree, f: int, log: I64, count: int) -> int
     state[tl.S_HOLES] += size
     if link[f, tl.L_KIND] >= tl.EXACT:
         state[tl.S_EXACT] -= 1
-        state[tl.S_ASLEEP] -= link[f, tl.L_KIND] - tl.EXACT
+        state[tl.S_INACTIVE] -= link[f, tl.L_KIND] - tl.EXACT
     account[tl.A_CHI2] -= stiff[f, tl.B_CHI2]
     account[tl.A_ERROR] -= stiff[f, tl.B_ERROR]
     account[tl.A_COUNTED] -= stiff[f, tl.B_COUNTED]
@@ -105,12 +106,12 @@ def unlink_incidence(slot: int, v: int, node: I64, link: I64, log: I64, count: i
     """Take an incidence out of the list of variable v."""
     before, following = node[v, tl.N_ADJ], next_incidence(slot, link)
     if before == slot:
-        note(FIRST_INCIDENCE, v, slot, log, count)
+        log_link(FIRST_INCIDENCE, v, slot, log, count)
         node[v, tl.N_ADJ] = following
         return count + 1
     while next_incidence(before, link) != slot:
         before = next_incidence(before, link)
-    note(NEXT_INCIDENCE, before, slot, log, count)
+    log_link(NEXT_INCIDENCE, before, slot, log, count)
     link[before // 2, tl.L_I + before % 2] = following
     return count + 1
 
@@ -120,20 +121,20 @@ def unlink_own(f: int, v: int, node: I64, link: I64, log: I64, count: int) -> in
     """Take factor f out of those that variable v owns, if it is among them."""
     before, following = node[v, tl.N_OWN], link[f, tl.L_OWN]
     if before == f:
-        note(FIRST_OWN, v, f, log, count)
+        log_link(FIRST_OWN, v, f, log, count)
         node[v, tl.N_OWN] = following
         return count + 1
     while before >= 0 and link[before, tl.L_OWN] != f:
         before = link[before, tl.L_OWN]
     if before < 0:
         return count
-    note(NEXT_OWN, before, f, log, count)
+    log_link(NEXT_OWN, before, f, log, count)
     link[before, tl.L_OWN] = following
     return count + 1
 
 
 @inline_kernel
-def note(what: int, of: int, was: int, log: I64, count: int) -> None:
+def log_link(what: int, of: int, was: int, log: I64, count: int) -> None:
     """One more row of the log."""
     log[count, LOG_WHAT], log[count, LOG_OF], log[count, LOG_WAS] = what, of, was
 
@@ -175,7 +176,7 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
         linearize_factor(graph, tree, f, scratch)
         weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        stiff[f, tl.B_CHI2], _, _ = factor_chi2(graph, tree, f, link[f, tl.L_KIND], c, s)
+        stiff[f, tl.B_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
         account[tl.A_CHI2] += stiff[f, tl.B_CHI2] - was
         account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + was
         if not has_free(f, var, fac):

@@ -14,10 +14,17 @@ import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import separators_of
-from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
+from factorbus.solver.kernels.bayes_tree.assemble import (
+    add_hessian,
+    extend_add,
+    front_of_clique,
+    list_column_runs,
+    number_columns,
+    variable_at,
+)
 from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree, tree_at
-from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_relative
-from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, int_rows, ints, put_place
+from factorbus.solver.kernels.bayes_tree.rigid_subtrees import is_invariant
+from factorbus.solver.kernels.jit.array_table import WIDTH, address_of, int_rows, ints, put_entry
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.jit.records import table_of
 from factorbus.solver.kernels.model import layout as at
@@ -28,15 +35,15 @@ from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, f
 from factorbus.solver.kernels.sparse.task_queue import (
     AT,
     SUBTREES,
-    count_lenders,
+    claim,
+    count_workers,
+    finish_chunk,
     post,
-    say_done,
-    take_board,
     take_chunk,
-    wait_and_leave,
+    wait_and_release,
 )
 
-# Entries of a plan, a table as in `places`: what a thread has to know to eliminate fronts.
+# Entries of a plan, a table as in `array_table`: what a thread has to know to eliminate fronts.
 GRAPH, TREE = 0, 1  # tables
 IDS, RECORDS = 2, 3  # the clique and the record of each front
 FIRST_FACTOR, FACTORS = 4, 5  # those of front f are FACTORS[FIRST_FACTOR[f] : FIRST_FACTOR[f + 1]]
@@ -71,12 +78,12 @@ class SortedIn(NamedTuple):
 
 @part
 def eliminate_fronts(
-    graph: Graph, tree: Tree, ids: I64, fronts: Fronts, affected: Affected, lowest: I64, update: I64, board: I64
+    graph: Graph, tree: Tree, ids: I64, fronts: Fronts, affected: Affected, lowest: I64, update: I64, queue: I64
 ) -> int:
     """Fill the rows and update matrices of all fronts.  Gives the variable whose pivot failed, or −1.
 
     ids: the clique of each front   lowest: of each orphan the local number of its first separator to be eliminated
-    update (orphans, 3): where the update matrix of each orphan is, and its width   board: see `task_queue`
+    update (orphans, 3): where the update matrix of each orphan is, and its width   queue: see `task_queue`
     """
     # 1
     clique, state = tree.clique, tree.state
@@ -95,13 +102,13 @@ def eliminate_fronts(
         separators = max(separators, end - first)
     plan = np.empty(PLAN, np.int64)
     plan[N], plan[MOST_PIVOTS], plan[MOST_SEPARATORS] = fronts.order.size, pivots, separators
-    put_place(plan, GRAPH, address_of(table_of(graph)), table_of(graph).size, 1)
-    put_place(plan, TREE, address_of(table_of(tree)), table_of(tree).size, 1)
-    put_place(plan, ORPHANS, address_of(orphans), orphans.size, 1)
-    put_place(plan, UPDATE, address_of(update), len(update), update.shape[1])
-    # 2, 3.  What a plan tells of has to be there for as long: these are, while the next one runs.
+    put_entry(plan, GRAPH, address_of(table_of(graph)), table_of(graph).size, 1)
+    put_entry(plan, TREE, address_of(table_of(tree)), table_of(tree).size, 1)
+    put_entry(plan, ORPHANS, address_of(orphans), orphans.size, 1)
+    put_entry(plan, UPDATE, address_of(update), len(update), update.shape[1])
+    # 2, 3.  The arrays of a plan have to exist for as long: these do, while the next function runs.
     sorted_in = SortedIn(first_factor, factor_of, first_orphan, next_orphan)
-    failed, flops = _eliminate_sorted(plan, ids, records, sorted_in, orphans, update, board)
+    failed, flops = _eliminate_sorted(plan, ids, records, sorted_in, orphans, update, queue)
     if failed < 0:
         state[tl.S_FLOPS] += flops
     return failed
@@ -109,46 +116,46 @@ def eliminate_fronts(
 
 @part
 def _eliminate_sorted(
-    plan: I64, ids: I64, records: I64, sorted_in: SortedIn, _orphans: I64, _update: I64, board: I64
+    plan: I64, ids: I64, records: I64, sorted_in: SortedIn, _orphans: I64, _update: I64, queue: I64
 ) -> tuple[int, int]:
     """Complete the plan, and go by it; gives the variable whose pivot failed, or −1, and flops."""
-    put_place(plan, IDS, address_of(ids), ids.size, 1)
-    put_place(plan, RECORDS, address_of(records), len(records), fr.FRONT)
-    put_place(plan, FIRST_FACTOR, address_of(sorted_in.first_factor), sorted_in.first_factor.size, 1)
-    put_place(plan, FACTORS, address_of(sorted_in.factors), sorted_in.factors.size, 1)
-    put_place(plan, FIRST_ORPHAN, address_of(sorted_in.first_orphan), sorted_in.first_orphan.size, 1)
-    put_place(plan, NEXT_ORPHAN, address_of(sorted_in.next_orphan), sorted_in.next_orphan.size, 1)
-    lenders = count_lenders(board)
-    if lenders > 0:
-        return _eliminate_in_pieces(plan, records, lenders, board)
-    return eliminate_range(plan, 0, ids.size, 0, board)
+    put_entry(plan, IDS, address_of(ids), ids.size, 1)
+    put_entry(plan, RECORDS, address_of(records), len(records), fr.FRONT)
+    put_entry(plan, FIRST_FACTOR, address_of(sorted_in.first_factor), sorted_in.first_factor.size, 1)
+    put_entry(plan, FACTORS, address_of(sorted_in.factors), sorted_in.factors.size, 1)
+    put_entry(plan, FIRST_ORPHAN, address_of(sorted_in.first_orphan), sorted_in.first_orphan.size, 1)
+    put_entry(plan, NEXT_ORPHAN, address_of(sorted_in.next_orphan), sorted_in.next_orphan.size, 1)
+    workers = count_workers(queue)
+    if workers > 0:
+        return _eliminate_in_pieces(plan, records, workers, queue)
+    return eliminate_range(plan, 0, ids.size, 0, queue)
 
 
 @part
-def _eliminate_in_pieces(plan: I64, records: I64, lenders: int, board: I64) -> tuple[int, int]:
+def _eliminate_in_pieces(plan: I64, records: I64, workers: int, queue: I64) -> tuple[int, int]:
     """Subtrees on several cores, if it is worth it, and then what is above them; what fails first is what counts."""
-    cut = cut_subtrees(records, lenders)
+    cut = cut_subtrees(records, workers)
     pieces = len(cut)
-    if pieces > 0 and take_board(board):
-        put_place(plan, CUT, address_of(cut), pieces, SUBTREE)
-        _eliminate_together(plan, pieces, board)
+    if pieces > 0 and claim(queue):
+        put_entry(plan, CUT, address_of(cut), pieces, SUBTREE)
+        _eliminate_together(plan, pieces, queue)
     else:
         pieces = 0
     f, flops = 0, 0
     for k in range(pieces):
-        failed, spent = eliminate_range(plan, f, cut[k, FIRST], 0, board)
+        failed, spent = eliminate_range(plan, f, cut[k, FIRST], 0, queue)
         if failed < 0:
             failed = cut[k, FAILED]
         if failed >= 0:
             return failed, 0
         f = cut[k, END]
         flops += spent + cut[k, FLOPS]
-    failed, spent = eliminate_range(plan, f, len(records), 0, board)
+    failed, spent = eliminate_range(plan, f, len(records), 0, queue)
     return failed, flops + spent
 
 
 @part
-def cut_subtrees(records: I64, lenders: int) -> I64:
+def cut_subtrees(records: I64, workers: int) -> I64:
     """Subtrees of neighbours in postorder that take a small share of the whole; none where it is not worth it."""
     count = len(records)
     takes, first = np.zeros(count), np.arange(count)  # with all below
@@ -165,7 +172,7 @@ def cut_subtrees(records: I64, lenders: int) -> I64:
     if total < LONG:
         return np.empty((0, SUBTREE), np.int64)
     cut, size, pieces = np.empty((count, SUBTREE), np.int64), np.empty(count), 0
-    most = total / (PIECES * (1 + lenders))
+    most = total / (PIECES * (1 + workers))
     for f in range(count):
         above = records[f, fr.PARENT]
         if takes[f] > most or (above >= 0 and takes[above] <= most):
@@ -186,29 +193,29 @@ def cut_subtrees(records: I64, lenders: int) -> I64:
 
 
 @part
-def _eliminate_together(plan: I64, subtrees: int, board: I64) -> None:
-    """All subtrees; the board is this thread's."""
-    put_place(board, AT, address_of(plan), plan.size, 1)
-    post(board, SUBTREES, subtrees)
-    chunk = take_chunk(board)
+def _eliminate_together(plan: I64, subtrees: int, queue: I64) -> None:
+    """All subtrees; the queue is this thread's."""
+    put_entry(queue, AT, address_of(plan), plan.size, 1)
+    post(queue, SUBTREES, subtrees)
+    chunk = take_chunk(queue)
     while chunk >= 0:
-        make_subtree(board, chunk, 0)
-        say_done(board)
-        chunk = take_chunk(board)
-    wait_and_leave(board)
+        make_subtree(queue, chunk, 0)
+        finish_chunk(queue)
+        chunk = take_chunk(queue)
+    wait_and_release(queue)
 
 
 @part
-def make_subtree(board: I64, chunk: int, t: int) -> None:
-    """Eliminate a subtree of the plan that the board has, with the scratch at t."""
-    plan = ints(board, AT)
+def make_subtree(queue: I64, chunk: int, t: int) -> None:
+    """Eliminate a subtree of the plan that the queue has, with the scratch at t."""
+    plan = ints(queue, AT)
     subtrees = int_rows(plan, CUT)
     subtree = subtrees[subtrees[chunk, TURN]]
-    subtree[FAILED], subtree[FLOPS] = eliminate_range(plan, subtree[FIRST], subtree[END], t, board)
+    subtree[FAILED], subtree[FLOPS] = eliminate_range(plan, subtree[FIRST], subtree[END], t, queue)
 
 
 @part
-def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tuple[int, int]:
+def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tuple[int, int]:
     """Eliminate fronts begin .. end, whose children are; gives the variable whose pivot failed, or −1, and flops."""
     graph, tree = graph_at(ints(plan, GRAPH)), tree_at(ints(plan, TREE))
     var, fac = graph.var, graph.fac
@@ -224,18 +231,18 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
     flops = 0
     for f in range(begin, end):
         row = clique[ids[f]]
-        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+        p, m, front = row[tl.C_PIVOTS], row[tl.C_BORDER], front_of_clique(row)
         number_columns(row, noise, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
+        clear_front(numbers, front)
         anchored = 0
         for q in range(first_factor[f], first_factor[f + 1]):
-            anchored |= int(not is_relative(factor_of[q], var, fac))
+            anchored |= int(not is_invariant(factor_of[q], var, fac))
             add_hessian(graph, tree, factor_of[q], row, column)
         child = records[f, fr.CHILD]
         while child >= 0:
             other = clique[ids[child]]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            k = list_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
+            k = list_column_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, k, row)
             anchored |= other[tl.C_ANCHORED]
             child = records[child, fr.SIBLING]
@@ -243,15 +250,12 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, board: I64) -> tupl
         while e >= 0:
             start = clique[orphans[e], tl.C_LIST]
             low, high = separators_of(orphans[e], stamp, clique)
-            k = list_runs(graph, tree, start + low, start + high, column, p, m, runs)
+            k = list_column_runs(graph, tree, start + low, start + high, column, p, m, runs)
             extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
             anchored |= clique[orphans[e], tl.C_ANCHORED]
             e = next_orphan[e]
         row[tl.C_ANCHORED] = anchored
-        failed = factor_front(
-            numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], floors, 0, t,
-            board,
-        )  # fmt: skip
+        failed = factor_front(numbers, front, floors, t, queue)
         if failed >= 0:
             return variable_at(failed, row, var, lists), flops
         if failed == RAISED:

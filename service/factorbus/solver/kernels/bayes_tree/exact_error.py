@@ -1,5 +1,5 @@
-"""The linearization error of a factor, computed: of sights, of factors with a loss, and of kinds that no closed form
-bounds.  MATH (9.11), (9.31)
+"""The linearization error of a factor, computed: of observations, of factors with a loss, and of kinds that no closed
+form bounds.  MATH (9.11), (9.31)
 """
 
 import math
@@ -13,7 +13,8 @@ from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
 
-SWITCHED = 30.0  # of a sight that has lost its pixel or found it again: by which that counts in χ², see `sights`
+# The error of an observation that has lost its pixel or found it again: √INACTIVE_CHI2.
+SWITCHED = 30.0
 
 
 @part

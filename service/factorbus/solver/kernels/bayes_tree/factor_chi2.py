@@ -16,14 +16,14 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import quat_product, rotation
+from factorbus.solver.kernels.model.se3 import quat_product, rotation_matrix
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 SMALL_ANGLE = 0.1  # radians: below it the series of sine and cosine are exact to rounding
 
 
 @inline_kernel
-def factor_chi2(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: float) -> tuple[float, float, float]:
+def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: float) -> tuple[float, float, float]:
     """rᵀΩr, or ρ of it, of factor f at `values`; between poses the square of the translation in r; and between those in
     space the rotation's share of χ².  kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose.
     """
@@ -70,8 +70,8 @@ def landmark_se2_chi2(f: int, c: float, s: float, var: I64, fac: I64, values: F6
 def between_se3_chi2(f: int, var: I64, fac: I64, x: F64, p: F64) -> tuple[float, float, float]:
     """(3.6)"""
     i, j, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
-    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation(p, k + 3)
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     tx, ty, tz = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     ex = a0 * tx + a3 * ty + a6 * tz - p[k]
     ey = a1 * tx + a4 * ty + a7 * tz - p[k + 1]

@@ -84,15 +84,15 @@ def keep_root(n: int, affected: I64, var: I64) -> Fronts:
 @inline_kernel
 def row_layout(p: int, m: int) -> tuple:
     """(offset of the rows in their block, stride, offset of the used δ, size of the block)."""
-    ahead = fr.padded(p + m)
-    stride = fr.row_stride(fr.padded(p) + m + 1)
-    return ahead + fr.padded(p) - p, stride, 0, ahead + p * stride + fr.LANES
+    ahead = fr.padded_size(p + m)
+    stride = fr.row_stride(fr.padded_size(p) + m + 1)
+    return ahead + fr.padded_size(p) - p, stride, 0, ahead + p * stride + fr.LANES
 
 
 @inline_kernel
 def update_layout(m: int) -> tuple:
     """(width of the first rows, size) of an update matrix, the right-hand side with it."""
-    width = fr.padded(m + 1)
+    width = fr.padded_size(m + 1)
     return width, fr.update_size(m + 1, width)
 
 
@@ -103,7 +103,7 @@ def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
     records, order, border_at, border_of = fronts.records, fronts.order, fronts.border_at, fronts.border_of
     count = len(records)
     ids, n = np.empty(count, np.int64), order.size
-    if not has_room(records, border_at, n, clique, lists, numbers, state):
+    if not fronts_fit(records, border_at, n, clique, lists, numbers, state):
         return ids, False
     for f in range(count):
         c = take_clique(clique, state)
@@ -134,7 +134,7 @@ def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
 
 
 @part
-def has_room(records: I64, border_at: I64, n: int, clique: I64, lists: I64, numbers: F64, state: I64) -> bool:
+def fronts_fit(records: I64, border_at: I64, n: int, clique: I64, lists: I64, numbers: F64, state: I64) -> bool:
     """Whether the arenas have room behind what is in use for all fronts; else `state` says what is needed."""
     count, listed, doubles = len(records), 0, 0
     for f in range(count):

@@ -1,37 +1,20 @@
 """The Hessian of a factor at its variables' linearization points, kept until one of them moves.  MATH §9.2."""
 
 import math
-from typing import NamedTuple
-
-import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_round
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.jit.simd import Panel, put, six
 from factorbus.solver.kernels.jit.simd import at as load
-from factorbus.solver.kernels.jit.simd import put, six
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_camera
-from factorbus.solver.kernels.model.linearize import evaluate_apart, multiply
+from factorbus.solver.kernels.model.linearize import Scratch, evaluate_apart, multiply
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import dim_of, end_dims, information_at, residual_dim
 from factorbus.solver.lenses.layout import GOOD
-
-
-class Scratch(NamedTuple):
-    """Room to linearize a factor in: r (7,); H (4, 6, 6), its Jacobians A and B, Ω A and Ω B; W (6, 6), Ω."""
-
-    r: F64
-    H: F64
-    W: F64
-
-
-@inline_kernel
-def make_scratch() -> Scratch:
-    """Room to linearize factors in, one after the other."""
-    return Scratch(np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6)))
 
 
 @inline_kernel
@@ -76,9 +59,9 @@ def gradient_norm(count: int, g: int, hessian: F64) -> float:
 @inline_kernel
 def note_inactive(f: int, inactive: bool, link: I64, state: I64) -> None:
     """Count an observation that has no pixel any more, or has one again."""
-    if inactive != (link[f, tl.L_KIND] == tl.ASLEEP):
-        state[tl.S_ASLEEP] += 1 if inactive else -1
-        link[f, tl.L_KIND] = tl.ASLEEP if inactive else tl.EXACT
+    if inactive != (link[f, tl.L_KIND] == tl.INACTIVE):
+        state[tl.S_INACTIVE] += 1 if inactive else -1
+        link[f, tl.L_KIND] = tl.INACTIVE if inactive else tl.EXACT
 
 
 @part
@@ -109,20 +92,20 @@ def _write_between_se3(graph: Graph, tree: Tree, f: int, more: float, scratch: S
             e += load(M, 6 * a + b) * r[b]
         chi2 += r[a] * e
     for a in range(6):
-        six(M, 6 * a, 1, 6, J, 0, J, 72 + 6 * a)
-        six(M, 6 * a, 1, 6, J, 36, J, 108 + 6 * a)
+        six(M, Panel(6 * a, 1, 6), J, 0, J, 72 + 6 * a)
+        six(M, Panel(6 * a, 1, 6), J, 36, J, 108 + 6 * a)
     for a in range(3):
-        six(J, a, 6, 3, J, 72, out, h + 6 * a)
-        six(J, a, 6, 3, J, 108, out, h + 36 + 6 * a)
-        six(J, 36 + a, 6, 3, J, 108, out, h + 72 + 6 * a)
+        six(J, Panel(a, 6, 3), J, 72, out, h + 6 * a)
+        six(J, Panel(a, 6, 3), J, 108, out, h + 36 + 6 * a)
+        six(J, Panel(36 + a, 6, 3), J, 108, out, h + 72 + 6 * a)
     for a in range(3, 6):
-        six(J, a, 6, 6, J, 72, out, h + 6 * a)
-        six(J, a, 6, 6, J, 108, out, h + 36 + 6 * a)
-        six(J, 54 + a, 6, 3, J, 126, out, h + 72 + 6 * a)
+        six(J, Panel(a, 6, 6), J, 72, out, h + 6 * a)
+        six(J, Panel(a, 6, 6), J, 108, out, h + 36 + 6 * a)
+        six(J, Panel(54 + a, 6, 3), J, 126, out, h + 72 + 6 * a)
     for a in range(6):
         r[a] = -r[a]
-    six(r, 0, 1, 6, J, 72, out, h + 108)
-    six(r, 0, 1, 6, J, 108, out, h + 114)
+    six(r, Panel(0, 1, 6), J, 72, out, h + 108)
+    six(r, Panel(0, 1, 6), J, 108, out, h + 114)
     put(out, h + 120, chi2)
 
 

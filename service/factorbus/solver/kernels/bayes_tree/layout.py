@@ -42,12 +42,12 @@ L_I = 1  # next incidence of the first variable
 L_J = 2  # next incidence of the second one
 L_AT = 3  # where its Hessian starts
 L_STAMP = 4  # the last sweep that linearized it
-L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or ASLEEP
+L_KIND = 5  # as in the graph, so that one cache line has all; or EXACT or INACTIVE
 L_WIDTH = 8  # a cache line
 
 # In L_KIND: the linearization error of an observation, or of a factor with a loss, is computed (9.11); an inactive
 # observation.
-EXACT, ASLEEP = 1000, 1001
+EXACT, INACTIVE = 1000, 1001
 
 # Columns of `clique`, a cache line each: what back-substitution reads of a clique,
 C_LIST = 0
@@ -60,7 +60,7 @@ C_NEXT = 6  # next child of the same parent; next free record
 C_PARENT = 7  # -1: a root
 # what it reads of one that has moved,
 C_FIRST = 8  # the first place touched by the elimination C_MARK; -1: not solved yet
-C_ANCHORED = 9  # 1: a factor in it or below tells where in the world its variables are
+C_ANCHORED = 9  # 1: a factor in it or below says where in the world its variables are
 C_MOVES = 10  # 1: it has moved as a whole since it was solved
 C_BORDER = 11  # m
 C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
@@ -98,11 +98,11 @@ S_NEED_CLIQUES = 11  # what the last call lacked
 S_NEED_LISTS = 12
 S_NEED_NUMBERS = 13
 S_FAILED = 14  # variable whose pivot failed, or -1
-# The account of the last step, from S_TOLD_FROM to before S_TOLD_TO.
-S_TOLD_FROM = 15
+# The account of the last step, from S_REPORT_BEGIN to before S_REPORT_END.
+S_REPORT_BEGIN = 15
 S_NONZEROS = 15  # of R, doubles of rows on and above the diagonal
-S_ASLEEP = 16  # sights that had no pixel where they were linearized
-S_TOLD = 17  # variables whose estimate has other bits than before the step, new ones included
+S_INACTIVE = 16  # observations that had no pixel where they were linearized
+S_DIFFERING = 17  # variables whose estimate has other bits than before the step, new ones included
 S_ELIMINATED = 18  # variables eliminated,
 S_RELINEARIZED = 19  # linearization points moved,
 S_SOLVED = 20  # cliques solved again
@@ -110,7 +110,7 @@ S_CHANGED = 21  # variables whose estimate changed
 S_FLOPS = 22
 S_ROUNDS = 23  # eliminations
 S_CYCLES = 24  # of the phases, PHASES of them
-S_TOLD_TO = 31
+S_REPORT_END = 31
 S_TAKEN = 31  # factors that are in the tree: S_FACTORS but for those of a step under way
 S_SWEEP = 32  # counts relinearizations
 S_FIRST_NEW = 33  # variables that are in the tree: S_VARIABLES but for those of a step under way
@@ -132,15 +132,14 @@ S_IDLE = 48  # doubles of free blocks of `numbers`,
 S_GIVEN = 49  # of those given back since they were joined,
 S_LARGEST = 50  # and no class above this one has any
 S_RELINEARIZING = 51  # flops of the last elimination that relinearized
-S_FRESH = 52  # as far as pages of `numbers` were written to, seen in steps of few flops
-S_RISES = 53  # 1: the last round of the step raised χ²
-S_ONCE = 54  # 1: the step under way has one round
-S_RAISED = 55  # 1: a pivot was raised, so that R is not quite that of Λ
-S_AFTER = 56  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
-S_EDITED = 57  # variables in `moved` whose factors were edited since the last step; they come first
-S_EDITED_AT = 58  # the last step that such factors went before
-S_HOLES = 59  # doubles of `hessian` that no factor has any more
-S_FREE = 60  # heads of free lists: numbers, then lists
+S_RISES = 52  # 1: the last round of the step raised χ²
+S_ONCE = 53  # 1: the step under way has one round
+S_RAISED = 54  # 1: a pivot was raised, so that R is not quite that of Λ
+S_AFTER = 55  # why more than the step is to be done: sums of WORSE, ROSE, RAISED; 0: nothing
+S_EDITED = 56  # variables in `moved` whose factors were edited since the last step; they come first
+S_EDITED_AT = 57  # the last step that such factors went before
+S_HOLES = 58  # doubles of `hessian` that no factor has any more
+S_FREE = 59  # heads of free lists: numbers, then lists
 CLASSES = 256
 S_SIZE = S_FREE + 2 * CLASSES
 

@@ -21,7 +21,7 @@ from factorbus.solver.kernels.bayes_tree.error_terms import (
     turn_of,
 )
 from factorbus.solver.kernels.bayes_tree.exact_error import exact_error
-from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, factor_chi2, heading_of
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import any_chi2, chi2_of_factor, heading_of
 from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, STAYED
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.relinearize import WAITS
@@ -116,7 +116,7 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
 
 @inline_kernel
 def moved_ends(first: int, second: int, node: I64) -> int:
-    """How the variables of a factor moved: not at all, both as one body, or so that its linear model is asked."""
+    """How the variables of a factor moved: not at all, both as one body, or so that its linear model is evaluated."""
     if second < 0:
         return first
     also = node[second, tl.N_LISTED]
@@ -147,7 +147,7 @@ def evaluate_factor(
             if error > threshold:
                 await_ends(f, fac, var, node, pending, state)
     else:
-        chi2, gap, turned = factor_chi2(graph, tree, f, kind, c, s)
+        chi2, gap, turned = chi2_of_factor(graph, tree, f, kind, c, s)
         if second >= 0 and how == MODEL:
             error, full = error_of(graph, tree, f, v, threshold, gap, chi2, turned)
     was = stiff[f, tl.B_CHI2]

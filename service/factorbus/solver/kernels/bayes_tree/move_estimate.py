@@ -36,7 +36,7 @@ def move_variable(graph: Graph, tree: Tree, v: int, delta: F64, lin: F64, before
 
 
 @inline_kernel
-def list_moved(how: int, v: int, node: I64, moved: I64, state: I64) -> None:
+def note_moved(how: int, v: int, node: I64, moved: I64, state: I64) -> None:
     """The factors of variable v are to be evaluated: PLACE, their χ²; MODEL and more, how linear they are as well."""
     listed = node[v, tl.N_LISTED]
     if listed == STAYED:

@@ -13,7 +13,7 @@ from factorbus.solver.kernels.bayes_tree.reroot import MOST_RINGS
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.sparse.amd import ELEMENT, eliminate
+from factorbus.solver.kernels.sparse.amd import ELEMENT, order_nodes, quotient_graph
 
 NEWEST = MOST_RINGS + 3  # the last group: above those of all rings, and that of what is recent
 
@@ -34,7 +34,8 @@ def order_affected(
     for k in range(n):
         dims[k] = dim_of_variable(var, affected[k])
         group[k] = group_of(affected[k], recent, last, node, state)
-    length, elements, degree = np.zeros(n + m, np.int64), np.zeros(n + m, np.int64), np.zeros(n + m, np.int64)
+    quotient = quotient_graph(np.empty(n + m, np.int64), np.zeros(n + m, np.int64))
+    begin, length, elements, kind, degree, _, _ = quotient
     for e in range(m):
         start = clique[orphans[e], tl.C_LIST]
         first, end = separators_of(orphans[e], stamp, clique)
@@ -49,11 +50,11 @@ def order_affected(
         if j >= 0:
             length[i] += 1
             length[j] += 1
-    begin, total = np.empty(n + m, np.int64), 0
+    total = 0
     for k in range(n + m):
         begin[k] = total
         total += length[k]
-    near, kind = np.empty(total + total // 2 + 4 * n, np.int64), np.zeros(n + m, np.int64)
+    near = np.empty(total + total // 2 + 4 * n, np.int64)
     put, put_element = np.empty(n, np.int64), np.empty(n, np.int64)
     for k in range(n):
         put_element[k], put[k] = begin[k], begin[k] + elements[k]
@@ -73,7 +74,7 @@ def order_affected(
             near[put[i]], near[put[j]] = j, i
             put[i] += 1
             put[j] += 1
-    return eliminate(n, dims, begin, length, elements, kind, near, total, degree, group)
+    return order_nodes(dims, quotient, near, total, group)
 
 
 @inline_kernel

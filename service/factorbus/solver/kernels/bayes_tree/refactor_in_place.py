@@ -10,7 +10,14 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers, size_class, take_numbers
-from factorbus.solver.kernels.bayes_tree.assemble import add_hessian, extend_add, list_runs, number_columns, variable_at
+from factorbus.solver.kernels.bayes_tree.assemble import (
+    add_hessian,
+    extend_add,
+    front_of_clique,
+    list_column_runs,
+    number_columns,
+    variable_at,
+)
 from factorbus.solver.kernels.bayes_tree.fronts import row_layout, update_layout
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.reroot import flops_of
@@ -90,10 +97,10 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 
 
 @part
-def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, board: I64) -> int:
+def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, queue: I64) -> int:
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
-    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  board: see
+    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  queue: see
     `task_queue`.
     """
     var = graph.var
@@ -115,9 +122,9 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: 
     column, floors, runs = np.empty(total, np.int64), np.empty(widest), np.empty((most + 1, fr.RUN), np.int64)
     for k in range(renewed.size):
         row = clique[renewed[k]]
-        p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+        p, m, front = row[tl.C_PIVOTS], row[tl.C_BORDER], front_of_clique(row)
         number_columns(row, ROUNDING * stiffest, var, node, lists, scalars, column, floors)
-        clear_front(numbers, row[tl.C_ROWS], row[tl.C_LD], p, m + 1, row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE])
+        clear_front(numbers, front)
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
             while f >= 0:
@@ -127,22 +134,10 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: 
         while child >= 0:
             other = clique[child]
             start = other[tl.C_LIST] + other[tl.C_FRONTALS]
-            count = list_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
+            count = list_column_runs(graph, tree, start, start + other[tl.C_SEPARATORS], column, p, m, runs)
             extend_add(numbers, other[tl.C_UPDATE], other[tl.C_WIDTH_UPDATE], runs, count, row)
             child = other[tl.C_NEXT]
-        failed = factor_front(
-            numbers,
-            row[tl.C_ROWS],
-            row[tl.C_LD],
-            p,
-            m + 1,
-            row[tl.C_UPDATE],
-            row[tl.C_WIDTH_UPDATE],
-            floors,
-            0,
-            0,
-            board,
-        )
+        failed = factor_front(numbers, front, floors, 0, queue)
         if failed == RAISED:
             state[tl.S_RAISED] = 1
         if failed >= 0:

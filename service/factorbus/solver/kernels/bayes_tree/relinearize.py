@@ -3,11 +3,12 @@
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, note_turn
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
-from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor, make_scratch
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.bayes_tree.hessian import linearize_factor
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import I64, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.linearize import make_scratch
 from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
@@ -32,7 +33,7 @@ def relinearize(graph: Graph, tree: Tree, pending: I64) -> None:
             scalars[2, d + a], scalars[0, d + a] = scalars[0, d + a], 0.0
         note_turn(v, var, lin, turns)
         node[v, tl.N_FLAGS] = MOVES
-        list_moved(MODEL, v, node, moved, state)
+        note_moved(MODEL, v, node, moved, state)
         state[tl.S_RELINEARIZED] += 1
     linearize_around(graph, tree, pending)
 

@@ -1,7 +1,7 @@
 """Rows of factors that go: the rows behind them moved up, and back.  MATH §11.5.
 
 Factors are looked up by their rows in many places, in the order of which they came.  So none is left empty: what is
-behind a row that goes moves up by one, in the graph and in the tree, and what tells of a row is renumbered.
+behind a row that goes moves up by one, in the graph and in the tree, and what refers to a row is renumbered.
 """
 
 import numpy as np

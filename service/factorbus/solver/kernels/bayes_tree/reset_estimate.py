@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.linearization_error import measure
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, list_moved
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, note_moved
 from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.jit.compile import I64, kernel
 from factorbus.solver.kernels.jit.simd import put
@@ -30,7 +30,7 @@ def hold_at_linearization(graph_table: I64, tree_table: I64) -> None:
     state, account = tree.state, tree.account
     for v in range(state[tl.S_VARIABLES]):
         x, d, c = var[v, at.V_AT], var[v, at.V_SCALAR], node[v, tl.N_CLIQUE]
-        list_moved(MODEL, v, node, moved, state)
+        note_moved(MODEL, v, node, moved, state)
         if d < 0:
             continue
         for a in range(size_of(var[v, at.V_KIND])):

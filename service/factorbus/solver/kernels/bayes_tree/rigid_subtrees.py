@@ -16,7 +16,7 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable
 from factorbus.solver.kernels.bayes_tree.error_terms import turn_of
-from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, PLACE, list_moved, move_variable
+from factorbus.solver.kernels.bayes_tree.move_estimate import MODEL, PLACE, move_variable, note_moved
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
@@ -25,7 +25,7 @@ from factorbus.solver.kernels.jit.sorting import put_in_order
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_rigid
 from factorbus.solver.kernels.model.records import Graph
-from factorbus.solver.kernels.model.se3 import rotation
+from factorbus.solver.kernels.model.se3 import rotation_matrix
 
 MOTION = tl.MOTION
 BODIES = 64  # that move at once, at most
@@ -37,8 +37,8 @@ SINGULAR = 1e-12
 
 
 @inline_kernel
-def is_relative(f: int, var: I64, fac: I64) -> bool:
-    """Whether factor f tells nothing of where in the world its variables are."""
+def is_invariant(f: int, var: I64, fac: I64) -> bool:
+    """Whether factor f says nothing of where in the world its variables are."""
     kind, j = fac[f, at.F_KIND], fac[f, at.F_J]
     if j < 0 or var[j, at.V_COLUMN] < 0 or var[fac[f, at.F_I], at.V_COLUMN] < 0:
         return False
@@ -116,7 +116,7 @@ def moved_in_space(d: int, place: int, x: int, kind: int, numbers: F64, delta: F
     gz = load(delta, d + 2) - load(numbers, place + 2)
     if kind != at.SE3:
         return gx, gy, gz, 0.0, 0.0, 0.0
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(lin, x + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, x + 3)
     hx, hy = load(delta, d + 3) - load(numbers, place + 3), load(delta, d + 4) - load(numbers, place + 4)
     hz = load(delta, d + 5) - load(numbers, place + 5)
     return (
@@ -198,7 +198,7 @@ def displace(v: int, var: I64, lin: F64, turns: F64, given: F64, xi: int, motion
     gx, gy = load(given, xi) + oy * pz - oz * py, load(given, xi + 1) + oz * px - ox * pz
     gz = load(given, xi + 2) + ox * py - oy * px
     if kind == at.SE3:
-        a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(lin, x + 3)
+        a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(lin, x + 3)
         gx, gy, gz = a0 * gx + a3 * gy + a6 * gz, a1 * gx + a4 * gy + a7 * gz, a2 * gx + a5 * gy + a8 * gz
         motion[LOCAL + 3] = a0 * ox + a3 * oy + a6 * oz
         motion[LOCAL + 4] = a1 * ox + a4 * oy + a7 * oz
@@ -265,4 +265,4 @@ def move_bodies(graph: Graph, tree: Tree, listed: I64, quiet: float, delta: F64,
             put(delta, d + a, load(delta, d + a) + motion[LOCAL + a])
         move_variable(graph, tree, v, delta, lin, before)
         lever_error = 2.0 * turns[v, tl.U_LEVER] * turn_of(kind, delta, d) * load(motions, since + tl.M_TURN)
-        list_moved(MODEL if lever_error > quiet else PLACE, v, node, moved, state)
+        note_moved(MODEL if lever_error > quiet else PLACE, v, node, moved, state)

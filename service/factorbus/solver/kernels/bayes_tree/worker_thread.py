@@ -10,23 +10,23 @@ from factorbus.solver.kernels.sparse.task_queue import (
     MADE,
     PANEL,
     TASK,
+    finish_chunk,
     goes_on_working,
-    say_done,
     scratch_of,
     take_chunk,
 )
 
 
 @part
-def run_tasks(board: I64, worker: int) -> None:
-    """Make chunks of whatever the board has, until the word `worker` of it says that this thread is to leave."""
-    while goes_on_working(board, worker):
-        chunk = take_chunk(board)
+def run_tasks(queue: I64, worker: int) -> None:
+    """Make chunks of whatever the queue has, until the word `worker` of it says that this thread is to leave."""
+    while goes_on_working(queue, worker):
+        chunk = take_chunk(queue)
         while chunk >= 0:
-            if board[TASK] == PANEL:
-                make_panel_chunk(board, chunk)
+            if queue[TASK] == PANEL:
+                make_panel_chunk(queue, chunk)
             else:
-                make_subtree(board, chunk, scratch_of(worker))
-            board[worker + MADE] += 1
-            say_done(board)
-            chunk = take_chunk(board)
+                make_subtree(queue, chunk, scratch_of(worker))
+            queue[worker + MADE] += 1
+            finish_chunk(queue)
+            chunk = take_chunk(queue)

@@ -1,246 +1,195 @@
-"""Admission: rows of a batch are checked and written behind the rows in use; the caller moves the counts back when
-one is bad.  One call per group of a batch, because a step has little time.
+"""Admission: the rows of groups are checked and written behind those that the graph has, all in one call.
 
-Keys are found through an open-addressing hash table: `table` holds variable index + 1, 0 where free.  Variables are
-entered in the order of their indices and removed in the reverse order, so removing is clearing the slot.
+Variables come first, whatever the order of their groups, then factors.  A row that is not in order ends it: the rows
+before it are in the graph then, for whoever says what is wrong, and the caller goes back to its mark.
 """
-
-import math
 
 import numpy as np
 
+from factorbus.solver.kernels.graph import group_table as gt
+from factorbus.solver.kernels.graph.check_rows import check_factor, check_value
+from factorbus.solver.kernels.graph.initialize import reach
+from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
+from factorbus.solver.kernels.jit.memory import float_at, int_at
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.bounds import (
-    LEAST_INFORMATION,
-    LEAST_SCALE,
-    MOST_INFORMATION,
-    MOST_LINEAR,
-    MOST_NUMBER,
-    are_within,
-)
-from factorbus.solver.kernels.model.kinds import direction_at, is_checked, is_linear, positive_at, quaternion_at
-from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.sizes import dim_of, kinds_of_ends, residual_dim, values_of_ends
-
-# A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
-_QUATERNION_TOLERANCE = 1e-3
-# A pivot of Ω below this share of its diagonal entry is rounding: the matrix is singular.
-_PIVOT_TOLERANCE = 1e-14
+from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
+from factorbus.solver.kernels.model.kinds import is_camera, is_linear
+from factorbus.solver.kernels.model.records import Graph, graph_at
+from factorbus.solver.kernels.model.sizes import dim_of, information_at, kinds_of_ends, scale_at, size_of
 
 
-@inline_kernel
-def slot_of(key: int, table: I64, keys: I64) -> int:
-    """Where `key` is in the table, or the free slot where it would go."""
-    k = int(key)
-    h = k ^ (k >> 32)
-    h = (h * 0x45D9F3B) & 0xFFFFFFFF
-    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
-    h ^= h >> 16
-    mask = table.size - 1
-    slot = h & mask
-    while table[slot] != 0 and keys[table[slot] - 1] != key:
-        slot = (slot + 1) & mask
-    return slot
+@kernel("UniTuple(int64, 4)(int64[:,::1], boolean, int64[::1])")
+def admit_groups(groups: I64, whole: bool, graph_table: I64) -> tuple:
+    """Append the variables and factors of `groups`, and give values to the variables that come without.
 
+    groups (n + 1, G_WIDTH): see `group_table`.  whole: a linear factor of one variable may have a negative definite Ω.
+    graph_table: of the graph's arrays (`records`).
 
-@kernel("int64(int64, int64[::1], int64[::1])")
-def find_variable(key: int, table: I64, keys: I64) -> int:
-    """Index of the variable `key`, or −1."""
-    return int(table[slot_of(key, table, keys)]) - 1
-
-
-@kernel("void(int64, int64[::1], int64[::1])")
-def enter_keys(count: int, table: I64, keys: I64) -> None:
-    """Fill an empty table with the first `count` keys."""
-    for v in range(count):
-        table[slot_of(keys[v], table, keys)] = v + 1
-
-
-@kernel("void(int64, int64, int64[::1], int64[::1])")
-def remove_keys(first: int, last: int, table: I64, keys: I64) -> None:
-    """Remove the variables first .. last−1, which are the last that were entered."""
-    for v in range(last - 1, first - 1, -1):
-        table[slot_of(keys[v], table, keys)] = 0
-
-
-@kernel(
-    "UniTuple(int64, 2)(int64, boolean, int64[::1], float64[:,::1], int64[::1], int64[::1], int64[:,::1], float64[::1],"
-    " int64[::1], int64[::1])"
-)
-def admit_variables(
-    kind: int, fixed: bool, new: I64, given: F64, table: I64, keys: I64, var: I64, values: F64, dims: I64, counts: I64
-) -> tuple:
-    """Append variables of one kind; `given` (n, size) has their values, or (0, size) none.  Gives (row, fault)."""
-    size = given.shape[1]
-    for n in range(new.size):
-        slot = slot_of(new[n], table, keys)
-        if table[slot] != 0:
-            return n, at.DUPLICATE
-        x = counts[at.VALUES]
-        if given.shape[0] > 0:
-            for c in range(size):
-                values[x + c] = given[n, c]
-            wrong = check_value(kind, x, size, values)
-            if wrong != at.GOOD:
-                return n, wrong
-        append_variable(kind, fixed, new[n], slot, size, table, keys, var, dims, counts)
-    return -1, at.GOOD
-
-
-@kernel(
-    "UniTuple(int64, 2)(int64, int64, int64[:,::1], float64[:,::1], float64[:,::1], float64[::1], int64[::1],"
-    " int64[::1], int64[:,::1], int64[:,::1], float64[::1], int64[::1])"
-)
-def admit_factors(
-    kind: int, loss: int, ends: I64, z: F64, info: F64, scale: F64, table: I64, keys: I64, var: I64, fac: I64,
-    payload: F64, counts: I64,
-) -> tuple:  # fmt: skip
-    """Append factors of one kind: ends (m, arity) keys, z (m, size), info (m, triangle), and with a loss its scale
-    (m,), else (0,).  Gives (row, fault)."""
-    size, triangle = z.shape[1], info.shape[1]
+    Gives (fault, group, row, rest): GOOD and what is left to be done; or what is wrong, with which row of which group.
+    With NO_ROOM and NO_LIMITS nothing was done.
+    """
+    graph = graph_at(graph_table)
+    counts = graph.counts
+    fault = look_over(groups, graph)
+    if fault != gt.GOOD:
+        return fault, -1, -1, 0
+    v0, f0, rest = counts[at.VARIABLES], counts[at.FACTORS], 0
     scratch = np.empty((6, 6))
-    for m in range(ends.shape[0]):
-        i, j, wrong = find_ends(kind, ends[m, 0], ends[m, ends.shape[1] - 1], table, keys, var)
-        if wrong != at.GOOD:
-            return m, wrong
-        p = counts[at.PAYLOAD]
-        for c in range(size):
-            payload[p + c] = z[m, c]
-        for c in range(triangle):
-            payload[p + size + c] = info[m, c]
-        wrong = check_numbers(kind, p, size, triangle, payload, scratch)
-        if wrong != at.GOOD:
-            return m, wrong
-        numbers = size + triangle
+    for factors in range(2):
+        g = 0
+        while groups[g, gt.G_KIND] != gt.END:
+            if groups[g, gt.G_FACTORS] == factors:
+                if factors == 0:
+                    row, fault = append_variables(groups[g], graph)
+                else:
+                    row, fault, left = append_factors(groups[g], whole, graph, scratch)
+                    rest |= left
+                if fault != gt.GOOD:
+                    return fault, g, row, 0
+            g += 1
+    if count_missing(groups) > 0:
+        reached = list_given(groups, counts[at.VARIABLES] - v0)
+        if reach(True, v0, f0, counts[at.FACTORS], graph_table, reached) >= 0:
+            rest |= gt.UNREACHED
+        else:
+            outside = find_outside(v0, counts[at.VARIABLES], graph.var, graph.values)
+            if outside >= 0:
+                return gt.COMPOSED_OUT_OF_BOUNDS, -1, outside, 0
+    return gt.GOOD, -1, -1, rest
+
+
+@part
+def look_over(groups: I64, graph: Graph) -> int:
+    """GOOD; NO_ROOM: the groups do not fit behind what there is; NO_LIMITS: a lens has no limit yet."""
+    counts = graph.counts
+    variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
+    numbers, measured, g = counts[at.VALUES], counts[at.PAYLOAD], 0
+    while groups[g, gt.G_KIND] != gt.END:
+        kind, count = groups[g, gt.G_KIND], groups[g, gt.G_COUNT]
+        if groups[g, gt.G_FACTORS] == 0:
+            variables, numbers = variables + count, numbers + count * size_of(kind)
+        else:
+            factors += count
+            measured += count * (scale_at(kind) + (1 if groups[g, gt.G_LOSS] != at.NO_LOSS else 0))
+            if is_camera(kind) and groups[g, gt.G_LIMITED] == 0:
+                return gt.NO_LIMITS
+        g += 1
+    has_room = (
+        variables <= graph.keys.size
+        and 2 * variables <= graph.table.size
+        and numbers <= graph.values.size
+        and factors <= len(graph.fac)
+        and measured <= graph.payload.size
+    )
+    return gt.GOOD if has_room else gt.NO_ROOM
+
+
+@part
+def append_variables(group: I64, graph: Graph) -> tuple:
+    """Append the variables of a group.  Gives (row, fault) of the first that is not in order, or (−1, GOOD)."""
+    kind, stamps, values, counts = group[gt.G_KIND], graph.stamps, graph.values, graph.counts
+    size = size_of(kind)
+    for n in range(group[gt.G_COUNT]):
+        key, x = int_at(group[gt.G_KEYS] + 8 * n), counts[at.VALUES]
+        slot = slot_of(key, graph.table, graph.keys)
+        if graph.table[slot] != 0:
+            return n, gt.DUPLICATE
+        if group[gt.G_NUMBERS] != gt.NOWHERE:
+            copy_numbers(group[gt.G_NUMBERS] + 8 * n * size, size, values, x)
+            fault = check_value(kind, x, size, values)
+            if fault != gt.GOOD:
+                return n, fault
+        stamp = int_at(group[gt.G_STAMPS] + 8 * n) if group[gt.G_STAMPS] != gt.NOWHERE else at.NO_STAMP
+        stamps[counts[at.VARIABLES]] = stamp
+        counts[at.STAMPED] += 1 if stamp != at.NO_STAMP else 0
+        append_variable(kind, group[gt.G_FIXED] != 0, key, slot, graph)
+    return -1, gt.GOOD
+
+
+@part
+def append_factors(group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple:
+    """Append the factors of a group.  Gives (row, fault, what is left to be done for them): of the first that is not in
+    order, or (−1, GOOD, …).  scratch (6, 6)."""
+    kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
+    size, width = information_at(kind), scale_at(kind)
+    triangle, arity = width - size, 1 if kinds_of_ends(kind)[1] < 0 else 2
+    may_be_negative = whole and loss == at.NO_LOSS and arity == 1 and is_linear(kind)
+    rest = gt.OBSERVED if is_camera(kind) else 0
+    for n in range(group[gt.G_COUNT]):
+        p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
+        i, j, fault = find_ends(kind, int_at(first), int_at(first + 8 * (arity - 1)), graph)
+        if fault != gt.GOOD:
+            return n, fault, rest
+        copy_numbers(group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
+        copy_numbers(group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
+        is_negative = may_be_negative and payload[p + size] < 0.0
+        if is_negative:
+            negate(p + size, triangle, payload)
+            rest |= gt.NEGATIVE
+        fault = check_factor(kind, p, size, triangle, payload, scratch)
+        if fault != gt.GOOD:
+            return n, fault, rest
+        if is_negative:
+            negate(p + size, triangle, payload)
+        numbers = width
         if loss != at.NO_LOSS:
-            if not (scale[m] >= LEAST_SCALE and scale[m] <= MOST_NUMBER):
-                return m, at.BAD_SCALE
-            payload[p + numbers] = scale[m]
+            scale = float_at(group[gt.G_SCALE] + 8 * n)
+            if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):
+                return n, gt.BAD_SCALE, rest
+            payload[p + width] = scale
             numbers += 1
-        append_factor(kind, loss, i, j, numbers, var, fac, counts)
-    return -1, at.GOOD
+        append_factor(kind, loss, i, j, numbers, graph)
+    return -1, gt.GOOD, rest
 
 
 @inline_kernel
-def check_value(kind: int, x: int, size: int, values: F64) -> int:
-    """What is wrong with the new value that starts at x; it is brought into its normal form."""
-    if not are_within(MOST_NUMBER, x, size, values):
-        return at.OUT_OF_BOUNDS
-    if kind == at.SE2:
-        values[x + 2] = wrap(values[x + 2])
-    if kind == at.IDP:
-        values[x + 3] = wrap(values[x + 3])
-    if kind == at.SE3 and not make_unit(values, x + 3):
-        return at.BAD_QUATERNION
-    return at.GOOD
-
-
-@inline_kernel
-def append_variable(
-    kind: int, fixed: bool, key: int, slot: int, size: int, table: I64, keys: I64, var: I64, dims: I64, counts: I64
-) -> None:
+def append_variable(kind: int, fixed: bool, key: int, slot: int, graph: Graph) -> None:
     """One more variable, whose value is behind those in use already, if it has one; `slot` is where its key goes."""
-    v = counts[at.VARIABLES]
-    dim = dim_of(kind)
-    table[slot] = v + 1
-    keys[v] = key
+    var, counts = graph.var, graph.counts
+    v, dim = counts[at.VARIABLES], dim_of(kind)
+    graph.table[slot] = v + 1
+    graph.keys[v] = key
     var[v, at.V_KIND], var[v, at.V_AT] = kind, counts[at.VALUES]
     var[v, at.V_SCALAR], var[v, at.V_COLUMN], var[v, at.V_DIAGONAL] = -1, -1, -1
     if not fixed:
         var[v, at.V_SCALAR], var[v, at.V_COLUMN] = counts[at.SCALARS], counts[at.COLUMNS]
-        dims[counts[at.COLUMNS]] = dim
+        graph.dims[counts[at.COLUMNS]] = dim
         counts[at.SCALARS] += dim
         counts[at.COLUMNS] += 1
-    counts[at.VALUES] += size
+    counts[at.VALUES] += size_of(kind)
     counts[at.VARIABLES] += 1
 
 
 @inline_kernel
-def find_ends(kind: int, a: int, b: int, table: I64, keys: I64, var: I64) -> tuple:
+def find_ends(kind: int, a: int, b: int, graph: Graph) -> tuple:
     """(i, j, fault): the variables with these keys, for a factor of that kind; j is −1 where it has one end."""
     first, second = kinds_of_ends(kind)
+    table, keys, var = graph.table, graph.keys, graph.var
     i = table[slot_of(a, table, keys)] - 1
     if i < 0:
-        return i, -1, at.UNKNOWN_FIRST
+        return i, -1, gt.UNKNOWN_FIRST
     if var[i, at.V_KIND] != first:
-        return i, -1, at.WRONG_KIND_FIRST
+        return i, -1, gt.WRONG_KIND_FIRST
     if second < 0:
-        return i, -1, at.GOOD
+        return i, -1, gt.GOOD
     j = table[slot_of(b, table, keys)] - 1
     if j < 0:
-        return i, j, at.UNKNOWN_SECOND
+        return i, j, gt.UNKNOWN_SECOND
     if i == j:
-        return i, j, at.SELF_LOOP
+        return i, j, gt.SELF_LOOP
     has_become_a_point = kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3
     if var[j, at.V_KIND] != second and not has_become_a_point:
-        return i, j, at.WRONG_KIND_SECOND
-    return i, j, at.GOOD
+        return i, j, gt.WRONG_KIND_SECOND
+    return i, j, gt.GOOD
 
 
 @inline_kernel
-def check_numbers(kind: int, p: int, size: int, triangle: int, payload: F64, scratch: F64) -> int:
-    """What is wrong with the new measurement that starts at p, or with its information."""
-    if not (are_within_kind(kind, p, size, payload) and are_within(MOST_INFORMATION, p + size, triangle, payload)):
-        return at.OUT_OF_BOUNDS
-    if is_checked(kind):
-        wrong = check_measurement(kind, p, payload)
-        if wrong != at.GOOD:
-            return wrong
-    dim = residual_dim(kind)
-    if not is_positive_definite(dim, payload, p + size, scratch):
-        return at.NOT_POSITIVE_DEFINITE
-    c = p + size
-    for a in range(dim):
-        if payload[c] < LEAST_INFORMATION:
-            return at.OUT_OF_BOUNDS
-        c += dim - a
-    return at.GOOD
-
-
-@inline_kernel
-def are_within_kind(kind: int, p: int, size: int, payload: F64) -> bool:
-    """Whether the measurement that starts at p is within bounds; H and b of a linear factor are what R may hold."""
-    if not is_linear(kind):
-        return are_within(MOST_NUMBER, p, size, payload)
-    y = values_of_ends(kind)
-    return are_within(MOST_NUMBER, p, y, payload) and are_within(MOST_LINEAR, p + y, size - y, payload)
-
-
-@part
-def check_measurement(kind: int, p: int, payload: F64) -> int:
-    """What is wrong with a measurement whose numbers are within bounds; directions and quaternions become unit."""
-    n = positive_at(kind)
-    if n >= 0 and not payload[p + n] > 0.0:
-        return at.BAD_RANGE
-    for e in range(2):
-        n = direction_at(kind, e)
-        if n >= 0 and not make_direction(payload, p + n):
-            return at.BAD_DIRECTION
-        n = quaternion_at(kind, e)
-        if n >= 0 and not make_unit(payload, p + n):
-            return at.BAD_QUATERNION
-    return at.GOOD
-
-
-@inline_kernel
-def make_direction(v: F64, k: int) -> bool:
-    """Bring the vector at k to unit length, unless it is there to the last bit; False: it has none."""
-    n2 = v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2]
-    if not n2 > 1e-100:
-        return False
-    if abs(n2 - 1.0) > 4e-16:
-        scale = 1.0 / math.sqrt(n2)
-        for c in range(3):
-            v[k + c] *= scale
-    return True
-
-
-@inline_kernel
-def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, var: I64, fac: I64, counts: I64) -> None:
+def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, graph: Graph) -> None:
     """One more factor, whose numbers are behind those in use already; of a feature that is a point by now, of that."""
+    fac, counts = graph.fac, graph.counts
     f = counts[at.FACTORS]
-    if kind == at.IDP_SEEN and var[j, at.V_KIND] == at.POINT3:
+    if kind == at.IDP_SEEN and graph.var[j, at.V_KIND] == at.POINT3:
         kind = at.POINT_SEEN
     fac[f, at.F_KIND], fac[f, at.F_I], fac[f, at.F_J], fac[f, at.F_AT] = kind, i, j, counts[at.PAYLOAD]
     fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ], fac[f, at.F_FLAGS] = -1, -1, -1, loss << at.LOSS_SHIFT
@@ -249,36 +198,38 @@ def append_factor(kind: int, loss: int, i: int, j: int, numbers: int, var: I64, 
 
 
 @inline_kernel
-def make_unit(q: F64, k: int) -> bool:
-    """Bring the quaternion at k to unit length, unless it is there to the last bit; False: it is none."""
-    n2 = q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3]
-    if not abs(n2 - 1.0) <= 2.0 * _QUATERNION_TOLERANCE:
-        return False
-    if abs(n2 - 1.0) > 4e-16:
-        scale = 1.0 / math.sqrt(n2)
-        for c in range(4):
-            q[k + c] *= scale
-    return True
+def count_missing(groups: I64) -> int:
+    """New variables that come without values."""
+    g, missing = 0, 0
+    while groups[g, gt.G_KIND] != gt.END:
+        if groups[g, gt.G_FACTORS] == 0 and groups[g, gt.G_NUMBERS] == gt.NOWHERE:
+            missing += groups[g, gt.G_COUNT]
+        g += 1
+    return missing
+
+
+@part
+def list_given(groups: I64, count: int) -> I64:
+    """For each of `count` new variables whether it came with a value: 1 or 0."""
+    given, g, v = np.zeros(count, np.int64), 0, 0
+    while groups[g, gt.G_KIND] != gt.END:
+        if groups[g, gt.G_FACTORS] == 0:
+            if groups[g, gt.G_NUMBERS] != gt.NOWHERE:
+                given[v : v + groups[g, gt.G_COUNT]] = 1
+            v += groups[g, gt.G_COUNT]
+        g += 1
+    return given
 
 
 @inline_kernel
-def is_positive_definite(n: int, upper: F64, start: int, L: F64) -> bool:
-    """Whether the n × n symmetric matrix with this upper triangle (row by row from `start`) is positive definite: its
-    Cholesky factor, made in the (6, 6) scratch `L`, has pivots above rounding."""
-    k = start
-    for a in range(n):
-        for b in range(a, n):
-            L[b, a] = upper[k]
-            k += 1
-    for a in range(n):
-        diagonal = L[a, a]
-        for c in range(a):
-            L[a, a] -= L[a, c] * L[a, c]
-        if not (diagonal > 0.0 and L[a, a] > _PIVOT_TOLERANCE * diagonal):
-            return False
-        L[a, a] = math.sqrt(L[a, a])
-        for b in range(a + 1, n):
-            for c in range(a):
-                L[b, a] -= L[b, c] * L[a, c]
-            L[b, a] /= L[a, a]
-    return True
+def copy_numbers(address: int, count: int, out: F64, to: int) -> None:
+    """So many numbers from the address on to out[to:]."""
+    for c in range(count):
+        out[to + c] = float_at(address + 8 * c)
+
+
+@inline_kernel
+def negate(start: int, count: int, numbers: F64) -> None:
+    """Change the sign of so many numbers from `start` on."""
+    for c in range(start, start + count):
+        numbers[c] = -numbers[c]

@@ -6,8 +6,9 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.kinds import is_camera, lens_at
+from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.lenses.layout import GOOD, VERTICAL
 from factorbus.solver.lenses.models import ray
 
@@ -27,7 +28,7 @@ def find_lost(new: bool, f0: int, f1: int, var: I64, fac: I64, values: F64, payl
             x, y, p = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
             status = status_of_pixel(kind, payload, p) if new else GOOD
             if status == GOOD:
-                sight(kind, values, x, y, payload, p, r, A, B)
+                observation(kind, values, Ends(x, y), payload, p, r, A, B)
                 status = int(r[at.R_STATUS])
             if status == GOOD and new and kind == at.IDP_FIRST and abs(math.cos(values[y + 4])) < _VERTICAL:
                 status = VERTICAL

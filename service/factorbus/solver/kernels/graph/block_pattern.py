@@ -2,12 +2,13 @@
 
 `pattern` (3, capacity): rows, columns and starts of the blocks, a block being stored once with row ≤ column (block
 columns count free variables in insertion order).  `table` is a hash table of block index + 1 by (row, column), used as
-in `admit`.  `fill` (2,): blocks and numbers in use.  A factor remembers where its blocks start, so that adding it again
-after the linearization point moved needs no search.
+in `key_table`.  `fill` (2,): blocks and numbers in use.  A factor remembers where its blocks start, so that adding it
+again after the linearization point moved needs no search.
 """
 
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 
 
 @inline_kernel
@@ -39,13 +40,11 @@ def block_of(row: int, column: int, size: int, table: I64, pattern: I64, fill: I
     return int(pattern[2, table[slot] - 1])
 
 
-@kernel(
-    "void(int64, int64, int64, int64, int64[:,::1], int64[:,::1], int64[::1], int64[::1], int64[:,::1], int64[::1])"
-)
-def connect(
-    v0: int, v1: int, f0: int, f1: int, var: I64, fac: I64, dims: I64, table: I64, pattern: I64, fill: I64
-) -> None:
-    """Append the blocks of variables v0 .. v1−1 and of factors f0 .. f1−1."""
+@kernel("void(int64, int64, int64, int64, int64[::1], int64[::1], int64[:,::1], int64[::1])")
+def connect_blocks(v0: int, v1: int, f0: int, f1: int, graph_table: I64, table: I64, pattern: I64, fill: I64) -> None:
+    """Append the blocks of variables v0 .. v1−1 and of factors f0 .. f1−1; graph_table: of their arrays (`records`)."""
+    graph = graph_at(graph_table)
+    var, fac, dims = graph.var, graph.fac, graph.dims
     for v in range(v0, v1):
         c = var[v, at.V_COLUMN]
         if c >= 0:

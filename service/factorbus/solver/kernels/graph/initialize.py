@@ -10,6 +10,7 @@ from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import place_idp
 from factorbus.solver.kernels.model.kinds import initializes
+from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import (
     compose_inverse_se2,
     compose_se2,
@@ -23,18 +24,20 @@ _NOTHING = -1
 _WAITS = -2
 
 
-@kernel("int64(boolean, int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
-def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64) -> int:
+@kernel("int64(boolean, int64, int64, int64, int64[::1], int64[::1])")
+def reach(compose: bool, v0: int, f0: int, f1: int, graph_table: I64, reached: I64) -> int:
     """Mark in `reached` (one entry per variable from v0 on, 1: reached) what factors f0 .. f1−1 lead to.
 
     Variables before v0 are reached.  With `compose` the first factor that reaches a variable gives it its value.
-    Gives the first variable that is not reached, or −1.
+    Gives the first variable that is not reached, or −1.  graph_table: of the graph's arrays (`records`).
     """
+    graph = graph_at(graph_table)
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     f = f0
     while f < f1 and follow(compose, f, v0, var, fac, values, payload, reached) != _WAITS:
         f += 1
     if f < f1:
-        reach_on(compose, v0, f, f1, var, fac, values, payload, reached)
+        reach_on(compose, v0, f, f1, graph, reached)
     for v in range(reached.size):
         if reached[v] == 0:
             return v0 + v
@@ -42,10 +45,9 @@ def reach(compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: 
 
 
 @part
-def reach_on(
-    compose: bool, v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, reached: I64
-) -> None:
+def reach_on(compose: bool, v0: int, f0: int, f1: int, graph: Graph, reached: I64) -> None:
     """The same from the first factor that has to wait."""
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
     n = reached.size
     head, tail = np.full(n, -1), np.full(n, -1)  # per variable: the factors that wait for it
     after = np.full(2 * (f1 - f0), -1)  # 2 (f − f0) + end: the next in that list

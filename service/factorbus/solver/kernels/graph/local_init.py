@@ -4,6 +4,8 @@ A variable composed from the first factor that reached it has none of the others
 few factors cost, and what is left for the whole system to solve is much smaller.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
@@ -12,6 +14,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.camera import move_idp
 from factorbus.solver.kernels.model.linearize import evaluate_apart
 from factorbus.solver.kernels.model.points import move_point2, move_point3
+from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.se2 import move_se2
 from factorbus.solver.kernels.model.se3 import move_se3
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim, size_of
@@ -19,25 +22,36 @@ from factorbus.solver.kernels.model.sizes import dim_of, information_at, residua
 _ITERATIONS = 5
 
 
-@kernel("void(int64, int64, int64, int64, float64, int64[:,::1], int64[:,::1], float64[::1], float64[::1])")
-def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F64, payload: F64) -> None:
+class _Linear(NamedTuple):
+    """A factor linearized: its residual r (7,), the Jacobians H (2, 6, 6) of its ends, its information W (6, 6)."""
+
+    r: F64
+    H: F64
+    W: F64
+
+
+@kernel("void(int64, int64, int64, int64, float64, int64[::1])")
+def settle_new(v0: int, v1: int, f0: int, f1: int, least: float, graph_table: I64) -> None:
     """Gauss-Newton on one free variable of v0 .. v1−1 after the other, with those of factors f0 .. f1−1 that are on it.
 
-    Goes on while a step lowers the χ² of those factors, and by more than `least` and a thousandth of it.
+    Goes on while a step lowers the χ² of those factors, and by more than `least` and a thousandth of it.  graph_table:
+    of the graph's arrays (`records`).
     """
+    graph = graph_at(graph_table)
     for v in range(v0, v1):
-        if var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, fac):
-            settle(v, f0, f1, least, var, fac, values, payload)
+        if graph.var[v, at.V_COLUMN] >= 0 and is_seen_twice(v, f0, f1, graph.fac):
+            settle(v, f0, f1, least, graph)
 
 
 @part
-def settle(v: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F64, payload: F64) -> None:
+def settle(v: int, f0: int, f1: int, least: float, graph: Graph) -> None:
     """The same for one variable."""
+    var, values = graph.var, graph.values
     M, z, step, before = np.empty((6, 6)), np.empty(6), np.empty(6), np.empty(7)
-    r, H, W = np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6))
+    linear = _Linear(np.empty(at.R_SIZE), np.empty((2, 6, 6)), np.empty((6, 6)))
     x, kind = var[v, at.V_AT], var[v, at.V_KIND]
     dim, size = dim_of(kind), size_of(kind)
-    chi2 = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+    chi2 = gather_system(v, f0, f1, graph, linear, M, z)
     for _ in range(_ITERATIONS):
         if not chi2 > least or cholesky(dim, M, z) >= 0:
             break
@@ -49,7 +63,7 @@ def settle(v: int, f0: int, f1: int, least: float, var: I64, fac: I64, values: F
         for c in range(size):
             before[c] = values[x + c]
         move_one(kind, values, x, step)
-        reached = gather_system(v, f0, f1, var, fac, values, payload, r, H, W, M, z)
+        reached = gather_system(v, f0, f1, graph, linear, M, z)
         if not reached <= chi2:
             for c in range(size):
                 values[x + c] = before[c]
@@ -72,13 +86,13 @@ def is_seen_twice(v: int, f0: int, f1: int, fac: I64) -> bool:
 
 
 @part
-def gather_system(
-    v: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, H: F64, W: F64, M: F64, z: F64
-) -> float:
+def gather_system(v: int, f0: int, f1: int, graph: Graph, linear: _Linear, M: F64, z: F64) -> float:
     """M = Σ Hᵀ Ω H and z = −Σ Hᵀ Ω r over the factors of variable v among f0 .. f1−1; gives their χ².
 
-    scratch  r (7,), H (2, 6, 6), W (6, 6)
+    M (6, 6), z (6,); `linear` is scratch
     """
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    r, H, W = linear
     width, chi2 = dim_of(var[v, at.V_KIND]), 0.0
     M[:, :], z[:] = 0.0, 0.0
     for f in range(f0, f1):

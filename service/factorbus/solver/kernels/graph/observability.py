@@ -17,7 +17,7 @@ _ROOM = 1e-8
 
 
 @kernel("int64(int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
-def hold(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> int:
+def mark_held(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> int:
     """Mark in `held` (one entry per variable from v0 on, 1: held) what factors f0 .. f1−1 hold; gives how many."""
     r, H, z = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros(6)
     place, count = np.full(held.size, -1), 0

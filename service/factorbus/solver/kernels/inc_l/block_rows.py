@@ -2,24 +2,20 @@
 
 Position k is the k-th block column of the elimination order.  Block row k of R holds the blocks (k, j) for the
 positions j of its list, ascending, itself first; new positions are appended behind all others.
-
-    rec      (n, 10) int64    one record per position
-    index    int64            the lists of positions, each with room to grow
-    numbers  float64          the rows: `DIM` scalar rows of `LD` doubles, the first `WIDTH` in use, block after block;
-                              below the diagonal of the diagonal block they are zero
-    place    (columns,) int64 position of each block column of Λ
-    counts   (4,)    int64    how much of rec, scalars, index and numbers is in use
+The arrays are those of `records.BlockRows`.
 
 The first off-diagonal entry of a row is its parent in the elimination tree, and the rest of the row is in the parent's.
 """
 
 import numpy as np
 
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
 from factorbus.solver.kernels.jit.sorting import sort
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.sparse import fronts as fr
 
 COLUMN = 0  # block column of Λ
@@ -43,14 +39,15 @@ COUNTS = 4
 _NEW_ROOM = 4  # positions a new row has room for
 
 
-@kernel(
-    "void(int64, int64, int64[:,::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], "
-    "int64[::1])"
-)
-def append_rows(
-    v0: int, v1: int, var: I64, dims: I64, rec: I64, index: I64, numbers: F64, place: I64, d: F64, counts: I64
-) -> None:
-    """Append zero rows, without information, for the free variables v0 .. v1−1."""
+@kernel("void(int64, int64, int64[::1], int64[::1])")
+def append_rows(v0: int, v1: int, graph_table: I64, rows_table: I64) -> None:
+    """Append zero rows, without information, for the free variables v0 .. v1−1.
+
+    graph_table, rows_table: of the arrays of the graph and of R (`records`), here and below
+    """
+    graph, rows = graph_at(graph_table), rows_at(rows_table)
+    var, dims, rec, index, numbers = graph.var, graph.dims, rows.rec, rows.index, rows.numbers
+    place, d, counts = rows.place, rows.d, rows.counts
     for v in range(v0, v1):
         c = var[v, at.V_COLUMN]
         if c < 0:
@@ -69,18 +66,14 @@ def append_rows(
         counts[NUMBERS] += dim * row[LD]
 
 
-@kernel(
-    "void(int64[::1], int64[::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[:,::1], int64[::1], "
-    "float64[::1], int64[::1], int64[::1])"
-)
-def take_fronts(
-    order: I64, dims: I64, starts: I64, fronts: I64, border: I64, arena: F64, rec: I64, index: I64, numbers: F64,
-    place: I64, counts: I64,
-) -> None:  # fmt: skip
+@kernel("void(int64[::1], int64[::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1])")
+def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, border: I64, arena: F64, rows_table: I64) -> None:
     """Copy R from the fronts of a factorization, block by block.
 
     The zeros of joined fronts come along: the lists are those of the fronts.
     """
+    rows = rows_at(rows_table)
+    rec, index, numbers, place, counts = rows.rec, rows.index, rows.numbers, rows.place, rows.counts
     n = order.size
     position = np.empty(starts[n], np.int64)  # of each scalar in elimination order
     scalar = 0
@@ -120,19 +113,16 @@ def take_fronts(
     counts[POSITIONS], counts[SCALARS], counts[INDEX], counts[NUMBERS] = n, scalar, put_list, put_row
 
 
-@kernel(
-    "int64(int64, int64, int64[:,::1], int64[:,::1], int64[::1], int64[:,::1], int64[::1], int64[::1], int64[::1], "
-    "int64[::1])"
-)
-def reach_rows(
-    f0: int, f1: int, var: I64, fac: I64, place: I64, rec: I64, index: I64, mark: I64, out: I64, seen: I64
-) -> int:
+@kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1], int64[::1], int64[::1])")
+def reach_rows(f0: int, f1: int, graph_table: I64, rows_table: I64, mark: I64, out: I64, seen: I64) -> int:
     """The rows of R that factors f0 .. f1−1 change: their variables' and the ancestors of those.  MATH (8.5)
 
     in   mark: zero for every position; stays so
     out  out: the positions, ascending   seen (1,): their scalars
     Gives how many positions there are.
     """
+    graph, rows = graph_at(graph_table), rows_at(rows_table)
+    var, fac, rec, index, place = graph.var, graph.fac, rows.rec, rows.index, rows.place
     n = scalars = 0
     for f in range(f0, f1):
         for end in range(2):
@@ -151,9 +141,11 @@ def reach_rows(
     return n
 
 
-@kernel("void(int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], float64[::1], float64[::1])")
-def solve_block_rows(rec: I64, index: I64, numbers: F64, counts: I64, d: F64, x: F64, delta: F64) -> None:
+@kernel("void(int64[::1], float64[::1], float64[::1], float64[::1])")
+def solve_block_rows(rows_table: I64, d: F64, x: F64, delta: F64) -> None:
     """R x = d by blocks from the last row up; x in elimination order, δ = Pᵀ x in insertion order."""
+    rows = rows_at(rows_table)
+    rec, index, numbers, counts = rows.rec, rows.index, rows.numbers, rows.counts
     row_of_x = np.empty(counts[SCALARS])
     for k in range(counts[POSITIONS] - 1, -1, -1):
         row = rec[k]
@@ -181,9 +173,11 @@ def gather_row(row: I64, index: I64, rec: I64, x: F64, out: F64) -> None:
             j += 1
 
 
-@kernel("float64(int64[:,::1], int64[::1], float64[::1], int64[::1], float64[::1], float64[::1])")
-def solve_block_rows_transposed(rec: I64, index: I64, numbers: F64, counts: I64, eta: F64, d: F64) -> float:
+@kernel("float64(int64[::1], float64[::1], float64[::1])")
+def solve_block_rows_transposed(rows_table: I64, eta: F64, d: F64) -> float:
     """Rᵀ d = P η by blocks; η in insertion order, d in elimination order.  Gives dᵀ d."""
+    rows = rows_at(rows_table)
+    rec, index, numbers, counts = rows.rec, rows.index, rows.numbers, rows.counts
     taken = np.empty(counts[SCALARS])
     for k in range(counts[POSITIONS]):
         row = rec[k]
@@ -215,9 +209,11 @@ def solve_block_rows_transposed(rec: I64, index: I64, numbers: F64, counts: I64,
     return total
 
 
-@kernel("void(int64[:,::1], int64[::1], float64[::1], int64[::1], int64[::1], float64[::1])")
-def compact_rows(rec: I64, index: I64, numbers: F64, counts: I64, new_index: I64, new_numbers: F64) -> None:
+@kernel("void(int64[::1], int64[::1], float64[::1])")
+def compact_rows(rows_table: I64, new_index: I64, new_numbers: F64) -> None:
     """Copy the rows to other arenas without the gaps that moved rows left behind."""
+    rows = rows_at(rows_table)
+    rec, index, numbers, counts = rows.rec, rows.index, rows.numbers, rows.counts
     put_list, put_row = 0, 0
     for k in range(counts[POSITIONS]):
         row = rec[k]
@@ -233,47 +229,43 @@ def compact_rows(rec: I64, index: I64, numbers: F64, counts: I64, new_index: I64
 
 
 @part
-def widen_row(k: int, list_: I64, count: int, width: int, rec: I64, index: I64, numbers: F64, counts: I64) -> None:
-    """Give row k the positions list_[:count] of `width` scalars, which include those it has; new blocks are zero.
+def widen_row(k: int, wider: BlockList, rows: BlockRows) -> None:
+    """Give row k the blocks of the list, which include those it has; new ones are zero.
 
     The row stays where it is if there is room, else it moves to the end of the arenas and gets room to grow.
     """
-    row = rec[k]
+    index, counts = rows.index, rows.counts
+    row, count, width = rows.rec[k], wider.count, wider.width
     if row[COUNT] == count:
         return
-    old_list, old, old_ld, source = row[LIST], row[COUNT], row[LD], row[ROW]
+    old, old_ld, source = BlockList(index, row[LIST], row[COUNT], row[WIDTH]), row[LD], row[ROW]
     if row[LD] < width:
         row[LD] = width + width // 2 + 24
         row[ROW] = counts[NUMBERS]
         counts[NUMBERS] += row[DIM] * row[LD]
     for i in range(row[DIM]):
-        spread(
-            list_, count, width, index, old_list, old, row[WIDTH], rec, numbers, source + i * old_ld,
-            row[ROW] + i * row[LD],
-        )  # fmt: skip
+        move_blocks(wider, old, rows.rec, rows.numbers, source + i * old_ld, row[ROW] + i * row[LD])
     row[WIDTH] = width
     if row[ROOM] < count:
         row[LIST], row[ROOM] = counts[INDEX], count + count // 2 + 4
         counts[INDEX] += row[ROOM]
     for e in range(count):
-        index[row[LIST] + e] = list_[e]
+        index[row[LIST] + e] = wider.positions[wider.first + e]
     row[COUNT] = count
 
 
 @inline_kernel
-def spread(
-    list_: I64, count: int, width: int, held: I64, first: int, old: int, old_width: int, rec: I64, a: F64, source: int,
-    target: int,
-) -> None:  # fmt: skip
-    """Move a row with the blocks held[first : first+old] to the layout of list_[:count]; new blocks become zero.
+def move_blocks(new: BlockList, old: BlockList, rec: I64, a: F64, source: int, target: int) -> None:
+    """Move a scalar row with the blocks `old` at a[source] to the layout of `new` at a[target]; new blocks become zero.
 
     Goes from the end, so that source and target may be the same place.
     """
-    e, m, x, y = old - 1, count - 1, old_width, width
+    e, m, x, y = old.count - 1, new.count - 1, old.width, new.width
     while m >= 0 and (m > e or source != target):
-        dim = rec[list_[m], DIM]
+        position = new.positions[new.first + m]
+        dim = rec[position, DIM]
         y -= dim
-        if e >= 0 and held[first + e] == list_[m]:
+        if e >= 0 and old.positions[old.first + e] == position:
             x -= dim
             for c in range(dim - 1, -1, -1):
                 put(a, target + y + c, load(a, source + x + c))

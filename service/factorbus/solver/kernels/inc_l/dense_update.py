@@ -6,36 +6,34 @@ M = R₂₂ᵀ R₂₂ + Ω,  z = R₂₂ᵀ d₂ + ω;  then R̃₂₂ = chol(M
 import numpy as np
 
 from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put
 from factorbus.solver.kernels.jit.small_cholesky import cholesky
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, residual_dim
 
 MOST_BLOCKS = 5
 _MOST = 6 * MOST_BLOCKS
 
 
-@kernel(
-    "int64(int64, int64, int64[::1], int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[:,::1], int64[::1], "
-    "float64[::1], int64[::1], float64[::1], int64[::1])"
-)
-def dense_omega_update(
-    f0: int, f1: int, reached: I64, var: I64, fac: I64, values: F64, payload: F64, rec: I64, index: I64, numbers: F64,
-    place: I64, d: F64, counts: I64,
-) -> int:  # fmt: skip
-    """Fold factors f0 .. f1−1, linearized at `values`, into R and d by (18) and (19) as they stand.
+@kernel("int64(int64, int64, int64[::1], int64[::1], int64[::1])")
+def dense_omega_update(f0: int, f1: int, reached: I64, graph_table: I64, rows_table: I64) -> int:
+    """Fold factors f0 .. f1−1, linearized at the graph's values, into R and d by (18) and (19) as they stand.
 
     reached: the positions that the factors reach, at most MOST_BLOCKS.  Gives −1, or a position whose pivot failed.
     """
+    graph, rows = graph_at(graph_table), rows_at(rows_table)
+    rec = rows.rec
     start, size = np.empty(reached.size, np.int64), 0
     for t in range(reached.size):
         start[t] = size
         size += rec[reached[t], br.DIM]
     T, M, y, z = np.zeros((_MOST, _MOST)), np.empty((_MOST, _MOST)), np.empty(_MOST), np.empty(_MOST)
-    read_tail(reached, start, rec, index, numbers, d, T, y)
+    read_tail(reached, start, rows, T, y)
     for i in range(size):
         total = 0.0
         for k in range(i + 1):
@@ -46,20 +44,21 @@ def dense_omega_update(
             for k in range(i + 1):
                 total += T[k, i] * T[k, j]
             M[i, j] = total
-    add_omega(f0, f1, reached, start, var, fac, values, payload, place, M, z)
+    add_omega(f0, f1, reached, start, graph, rows.place, M, z)
     failed = cholesky(size, M, z)
     if failed >= 0:
         t = 0
         while t + 1 < reached.size and start[t + 1] <= failed:
             t += 1
         return reached[t]
-    write_tail(reached, start, size, M, z, rec, index, numbers, d, counts)
+    write_tail(reached, start, size, M, z, rows)
     return -1
 
 
 @part
-def read_tail(reached: I64, start: I64, rec: I64, index: I64, numbers: F64, d: F64, T: F64, y: F64) -> None:
+def read_tail(reached: I64, start: I64, rows: BlockRows, T: F64, y: F64) -> None:
     """The reached rows as one dense matrix, and their part of d."""
+    rec, index, numbers, d = rows.rec, rows.index, rows.numbers, rows.d
     for t in range(reached.size):
         row = rec[reached[t]]
         x, u = 0, t
@@ -75,18 +74,11 @@ def read_tail(reached: I64, start: I64, rec: I64, index: I64, numbers: F64, d: F
 
 
 @part
-def add_omega(
-    f0: int, f1: int, reached: I64, start: I64, var: I64, fac: I64, values: F64, payload: F64, place: I64, M: F64,
-    z: F64,
-) -> None:  # fmt: skip
+def add_omega(f0: int, f1: int, reached: I64, start: I64, graph: Graph, place: I64, M: F64, z: F64) -> None:
     """M += Ω = Σ Hᵀ Ω_k H, z += ω = −Σ Hᵀ Ω_k r; on and above the diagonal."""
-    r, H, W, WH, first = (
-        np.zeros(at.R_SIZE),
-        np.zeros((2, 6, 6)),
-        np.zeros((6, 6)),
-        np.zeros((6, 6)),
-        np.empty(2, np.int64),
-    )
+    var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
+    r, H, first = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.empty(2, np.int64)
+    W, WH = np.zeros((6, 6)), np.zeros((6, 6))
     for f in range(f0, f1):
         evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
         kind = fac[f, at.F_KIND]
@@ -130,13 +122,12 @@ def add_omega(
 
 
 @part
-def write_tail(
-    reached: I64, start: I64, size: int, M: F64, z: F64, rec: I64, index: I64, numbers: F64, d: F64, counts: I64
-) -> None:
+def write_tail(reached: I64, start: I64, size: int, M: F64, z: F64, rows: BlockRows) -> None:
     """The rows get all reached positions from their own on, and the numbers of M and z."""
+    rec, numbers, d = rows.rec, rows.numbers, rows.d
     for t in range(reached.size):
         k, width = reached[t], size - start[t]
-        br.widen_row(k, reached[t:], reached.size - t, width, rec, index, numbers, counts)
+        br.widen_row(k, BlockList(reached, t, reached.size - t, width), rows)
         row = rec[k]
         for i in range(row[br.DIM]):
             for c in range(width):

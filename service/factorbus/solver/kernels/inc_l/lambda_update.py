@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from factorbus.solver.kernels.inc_l import block_rows as br
+from factorbus.solver.kernels.inc_l.records import BlockList, BlockRows, rows_at
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.jit.simd import at as load
 from factorbus.solver.kernels.jit.simd import put, zero
@@ -19,43 +20,40 @@ from factorbus.solver.kernels.sparse.partial_cholesky import PIVOT_TOLERANCE
 NONE = -1
 
 
-@kernel(
-    "int64(int64[::1], int64, int64[:,::1], float64[::1], float64[::1], int64[:,::1], int64[::1], float64[::1], "
-    "int64[::1], float64[::1], int64[::1])"
-)
-def lambda_update(
-    reached: I64, blocks: int, pattern: I64, data: F64, eta: F64, rec: I64, index: I64, numbers: F64, place: I64,
-    d: F64, counts: I64,
-) -> int:  # fmt: skip
+@kernel("int64(int64[::1], int64, int64[:,::1], float64[::1], float64[::1], int64[::1])")
+def lambda_update(reached: I64, blocks: int, pattern: I64, data: F64, eta: F64, rows_table: I64) -> int:
     """Make the rows at the positions `reached` (ascending) anew from η and the `blocks` blocks of Λ in `pattern`.
 
     Gives −1, or a position whose pivot failed.
     """
-    n = counts[br.POSITIONS]
+    rows = rows_at(rows_table)
+    n = rows.counts[br.POSITIONS]
     is_reached = np.zeros(n, np.int64)
     for j in reached:
         is_reached[j] = 1
-    begin, block_of = blocks_by_row(reached, is_reached, blocks, pattern, place)
-    renew_structure(reached, begin, block_of, pattern, place, rec, index, numbers, counts)
+    begin, block_of = blocks_by_row(reached, is_reached, blocks, pattern, rows.place)
+    renew_structure(reached, begin, block_of, pattern, rows)
     # the entry of each row that is next to be used, and its first scalar in the row
     entry, offset, head, after = np.empty(n, np.int64), np.empty(n, np.int64), np.full(n, NONE), np.empty(n, np.int64)
     for k in range(n):
         if is_reached[k] == 0:
-            queue_row(k, is_reached, rec, index, entry, offset, head, after)
+            queue_row(k, is_reached, rows, entry, offset, head, after)
     where = np.empty(n, np.int64)  # of each position in the row that is being made
     for t in range(reached.size):
         j = reached[t]
-        fill_row(j, begin[t], begin[t + 1], block_of, pattern, data, eta, rec, index, numbers, place, d, where)
+        own = block_of[begin[t] : begin[t + 1]]
+        fill_row(j, own, pattern, data, eta, rows, where)
         k = head[j]
         while k != NONE:
             following = after[k]
-            take_product(j, k, entry[k], offset[k], rec, index, numbers, d, where)
-            advance(k, entry, offset, head, after, rec, index)
+            take_product(j, k, entry[k], offset[k], rows, where)
+            advance(k, rows, entry, offset, head, after)
             k = following
-        if not factor_row(rec[j], load_floor(j, begin[t], block_of, pattern, data, rec), numbers, d):
+        row = rows.rec[j]
+        if not factor_row(row, load_floor(row[br.DIM], pattern[2, own[0]], data), rows.numbers, rows.d):
             return j
         entry[j], offset[j] = 0, 0
-        advance(j, entry, offset, head, after, rec, index)
+        advance(j, rows, entry, offset, head, after)
     return -1
 
 
@@ -85,11 +83,9 @@ def blocks_by_row(reached: I64, is_reached: I64, blocks: int, pattern: I64, plac
 
 
 @part
-def renew_structure(
-    reached: I64, begin: I64, block_of: I64, pattern: I64, place: I64, rec: I64, index: I64, numbers: F64, counts: I64
-) -> None:
+def renew_structure(reached: I64, begin: I64, block_of: I64, pattern: I64, rows: BlockRows) -> None:
     """Rows get the positions of the new blocks of Λ and of their children in the tree."""
-    n = counts[br.POSITIONS]
+    rec, index, place, n = rows.rec, rows.index, rows.place, rows.counts[br.POSITIONS]
     seen, head, after = np.full(n, NONE), np.full(n, NONE), np.full(n, NONE)
     list_ = np.empty(n, np.int64)
     for t in range(reached.size):
@@ -119,15 +115,16 @@ def renew_structure(
             width = 0
             for e in range(count):
                 width += rec[list_[e], br.DIM]
-            br.widen_row(j, list_, count, width, rec, index, numbers, counts)
+            br.widen_row(j, BlockList(list_, 0, count, width), rows)
         if count > 1:
             parent = index[rec[j, br.LIST] + 1]
             after[j], head[parent] = head[parent], j
 
 
 @inline_kernel
-def queue_row(k: int, is_reached: I64, rec: I64, index: I64, entry: I64, offset: I64, head: I64, after: I64) -> None:
+def queue_row(k: int, is_reached: I64, rows: BlockRows, entry: I64, offset: I64, head: I64, after: I64) -> None:
     """A row that stays waits for the first reached position in its list, if there is one."""
+    rec, index = rows.rec, rows.index
     first, e, x = rec[k, br.LIST], rec[k, br.COUNT], rec[k, br.WIDTH]
     while e > 1 and is_reached[index[first + e - 1]]:
         e -= 1
@@ -139,8 +136,9 @@ def queue_row(k: int, is_reached: I64, rec: I64, index: I64, entry: I64, offset:
 
 
 @inline_kernel
-def advance(k: int, entry: I64, offset: I64, head: I64, after: I64, rec: I64, index: I64) -> None:
+def advance(k: int, rows: BlockRows, entry: I64, offset: I64, head: I64, after: I64) -> None:
     """Row k waits for the next position in its list."""
+    rec, index = rows.rec, rows.index
     first = rec[k, br.LIST]
     offset[k] += rec[index[first + entry[k]], br.DIM]
     entry[k] += 1
@@ -150,11 +148,9 @@ def advance(k: int, entry: I64, offset: I64, head: I64, after: I64, rec: I64, in
 
 
 @part
-def fill_row(
-    j: int, begin: int, end: int, block_of: I64, pattern: I64, data: F64, eta: F64, rec: I64, index: I64, numbers: F64,
-    place: I64, d: F64, where: I64,
-) -> None:  # fmt: skip
-    """Row j of Λ and η; `where` says where its positions are in it."""
+def fill_row(j: int, own: I64, pattern: I64, data: F64, eta: F64, rows: BlockRows, where: I64) -> None:
+    """Row j := row j of Λ and η, whose blocks are `own`; where: gets where its positions are in it."""
+    rec, index, numbers, place, d = rows.rec, rows.index, rows.numbers, rows.place, rows.d
     row = rec[j]
     x = 0
     for e in range(row[br.LIST], row[br.LIST] + row[br.COUNT]):
@@ -163,8 +159,8 @@ def fill_row(
     for i in range(row[br.DIM]):
         zero(numbers, row[br.ROW] + i * row[br.LD], row[br.WIDTH])
         put(d, row[br.SCALAR] + i, load(eta, row[br.START] + i))
-    for e in range(begin, end):
-        b = block_of[e]
+    for e in range(own.size):
+        b = own[e]
         a, c, source = place[pattern[0, b]], place[pattern[1, b]], pattern[2, b]
         other = c if a == j else a
         height, width, target = row[br.DIM], rec[other, br.DIM], row[br.ROW] + where[other]
@@ -176,10 +172,9 @@ def fill_row(
 
 
 @part
-def take_product(
-    j: int, k: int, entry: int, offset: int, rec: I64, index: I64, numbers: F64, d: F64, where: I64
-) -> None:
+def take_product(j: int, k: int, entry: int, offset: int, rows: BlockRows, where: I64) -> None:
     """Row j −= R_kjᵀ (row k from j on), d_j −= R_kjᵀ d_k.  Neighbours that stay neighbours go together."""
+    rec, index, numbers, d = rows.rec, rows.index, rows.numbers, rows.d
     row, other = rec[j], rec[k]
     height, base, ld = row[br.DIM], other[br.ROW], other[br.LD]
     for q in range(other[br.DIM]):
@@ -206,9 +201,9 @@ def take_product(
 
 
 @inline_kernel
-def load_floor(j: int, begin: int, block_of: I64, pattern: I64, data: F64, rec: I64) -> float:
-    """The least pivot allowed in row j."""
-    dim, source, least = rec[j, br.DIM], pattern[2, block_of[begin]], math.inf
+def load_floor(dim: int, source: int, data: F64) -> float:
+    """The least pivot allowed in a row of `dim` scalars whose diagonal block of Λ is at data[source]."""
+    least = math.inf
     for i in range(dim):
         least = min(least, load(data, source + i * dim + i))
     return PIVOT_TOLERANCE * least

@@ -1,7 +1,7 @@
 """Words that several threads change, and how one waits for another.
 
 `exchange` and `fetch_add` are in order with all that is read and written before and behind them, on every thread.  To
-sleep and to wake is for Linux alone: elsewhere nobody lends a core.
+sleep and to wake is for Linux alone: elsewhere there are no worker threads.
 """
 
 import sys

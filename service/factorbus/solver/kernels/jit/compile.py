@@ -70,7 +70,8 @@ __all__ = [
     "KernelFolder",
     "cache_folder",
     "cgutils",
-    "compiled_seconds",
+    "code_environment",
+    "compile_seconds",
     "extending",
     "inline_kernel",
     "intrinsic",
@@ -78,7 +79,6 @@ __all__ = [
     "is_on_disk",
     "iter_compile",
     "kernel",
-    "machine",
     "part",
     "sources_hash",
     "types",
@@ -194,7 +194,7 @@ class KernelFolder:
         return path
 
 
-def compiled_seconds() -> float:
+def compile_seconds() -> float:
     """Seconds spent compiling kernels in this process; 0.0 when all came from disk."""
     return _COMPILATIONS.duration if _COMPILATIONS.done else 0.0
 
@@ -234,11 +234,11 @@ def sources_hash(folder: Path, *also: Path) -> str:
     for path in sorted({*folder.rglob("*.py"), *makers, *also}, key=lambda path: (path.parent.name, path.name)):
         text = path.read_bytes()
         digest.update(f"{path.name} {len(text)}\n".encode() + text)
-    digest.update(repr((sys.version, sorted(machine().items()), sorted(_FASTMATH), STOCK)).encode())
+    digest.update(repr((sys.version, sorted(code_environment().items()), sorted(_FASTMATH), STOCK)).encode())
     return digest.hexdigest()[:20]
 
 
-def machine() -> dict[str, str]:
+def code_environment() -> dict[str, str]:
     """What compiled code depends on besides its sources: the processor with a hash of its features, versions, flags."""
     features = sorted(name for name, has in llvmlite.binding.get_host_cpu_features().items() if has)
     can = hashlib.sha256(" ".join(features).encode()).hexdigest()[:8]

@@ -96,10 +96,10 @@ def _known_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
     """What a built-in function comes to with such arguments.  Numba finds that out anew at every call, and in every
     round of its inference: a quarter of all the time that it takes to compile."""
     _, known = _call_types.setdefault(id(self), (self, {}))
-    asked = context, tuple(args), tuple(kws.items())
-    if asked not in known:
-        known[asked] = _find_call_type(self, context, args, kws)
-    return known[asked]
+    call = context, tuple(args), tuple(kws.items())
+    if call not in known:
+        known[call] = _find_call_type(self, context, args, kws)
+    return known[call]
 
 
 # The first two look at the module that they are called for, the third changes no code: Numba's own functions, which are

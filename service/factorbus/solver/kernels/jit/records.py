@@ -55,7 +55,7 @@ def _open_in_python(record: type) -> Any:
     with_table: Any = type(record.__name__, (record,), {})
 
     def record_at(table: I64) -> Any:
-        """The record that this table tells of."""
+        """The record of this table."""
         made = with_table(*(array_in_python(table, entry, *kind) for entry, kind in enumerate(kinds)))
         made.table_ = table
         return made
@@ -138,7 +138,7 @@ else:
 
         @intrinsic
         def address(_typing: Any, table: Any) -> Any:
-            """The record that this table tells of."""
+            """The record of this table."""
 
             def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
                 return context.make_array(signature.args[0])(context, builder, args[0]).data

@@ -17,11 +17,13 @@ _VARIABLE = "FACTORBUS_STOCK_NUMBA"
 
 def why_stock() -> str:
     """Why Numba is used as it is; empty where it is changed.  Raises ValueError: the variable is neither 0 nor 1."""
-    told = os.environ.get(_VARIABLE, "")
-    if told not in ("", "0", "1"):
-        raise ValueError(f"{_VARIABLE} is {told!r}; wanted 1, for Numba as it is, or 0, for Numba changed: or unset it")
-    if told == "1":
+    value = os.environ.get(_VARIABLE, "")
+    if value not in ("", "0", "1"):
+        raise ValueError(
+            f"{_VARIABLE} is {value!r}; wanted 1, for Numba as it is, or 0, for Numba changed: or unset it"
+        )
+    if value == "1":
         return f"{_VARIABLE} is 1"
-    if not told and (installed := version("numba")) not in TESTED:
+    if not value and (installed := version("numba")) not in TESTED:
         return f"numba {installed} is not one of those tested ({', '.join(TESTED)})"
     return ""

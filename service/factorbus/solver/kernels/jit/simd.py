@@ -8,15 +8,29 @@ behind range checks, NUMBA_BOUNDSCHECK=1) and `simd_plain` (NumPy, NUMBA_DISABLE
 """
 
 from factorbus.solver.kernels.jit.compile import BOUNDSCHECK, DISABLED, vector_lanes
+from factorbus.solver.kernels.jit.simd_plain import Block, Panel
 
 if DISABLED:
-    from factorbus.solver.kernels.jit.simd_plain import add_run, at, put, six, solve_rows, tile, zero
+    from factorbus.solver.kernels.jit.simd_plain import add_run, at, put, six, solve_tile, tile, zero
 elif BOUNDSCHECK:
-    from factorbus.solver.kernels.jit.simd_checked import add_run, at, put, six, solve_rows, tile, zero
+    from factorbus.solver.kernels.jit.simd_checked import add_run, at, put, six, solve_tile, tile, zero
 else:
-    from factorbus.solver.kernels.jit.simd_llvm import add_run, at, put, six, solve_rows, tile, zero
+    from factorbus.solver.kernels.jit.simd_llvm import add_run, at, put, six, solve_tile, tile, zero
 
-__all__ = ["LANES", "TILE_ROWS", "TILE_VECTORS", "add_run", "at", "put", "six", "solve_rows", "tile", "zero"]
+__all__ = [
+    "LANES",
+    "TILE_ROWS",
+    "TILE_VECTORS",
+    "Block",
+    "Panel",
+    "add_run",
+    "at",
+    "put",
+    "six",
+    "solve_tile",
+    "tile",
+    "zero",
+]
 
 LANES = vector_lanes()
 TILE_ROWS = 4

@@ -4,10 +4,11 @@ from typing import Any
 
 from factorbus.solver.kernels.jit import simd_llvm
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, vector_lanes
+from factorbus.solver.kernels.jit.simd_plain import Block, Panel
 
 _LANES = vector_lanes()
 _at, _put, _zero, _add_run = simd_llvm.at, simd_llvm.put, simd_llvm.zero, simd_llvm.add_run
-_tile, _solve_rows, _six = simd_llvm.tile, simd_llvm.solve_rows, simd_llvm.six
+_tile, _solve_tile, _six = simd_llvm.tile, simd_llvm.solve_tile, simd_llvm.six
 
 
 @inline_kernel
@@ -37,26 +38,26 @@ def add_run(a: F64, i: int, j: int, count: int) -> None:
 
 
 @inline_kernel
-def tile(a: F64, rows: int, vectors: int, c: int, ldc: int, x: int, y: int, ld: int, depth: int) -> None:
-    _within(a, c, (rows - 1) * ldc + vectors * _LANES)
-    _within(a, x, (depth - 1) * ld + rows)
-    _within(a, y, (depth - 1) * ld + vectors * _LANES)
-    _tile(a, rows, vectors, c, ldc, x, y, ld, depth)
+def tile(a: F64, rows: int, vectors: int, C: Block, X: Panel, y: int) -> None:
+    _within(a, C.start, (rows - 1) * C.ld + vectors * _LANES)
+    _within(a, X.start, (X.depth - 1) * X.ld + rows)
+    _within(a, y, (X.depth - 1) * X.ld + vectors * _LANES)
+    _tile(a, rows, vectors, C, X, y)
 
 
 @inline_kernel
-def solve_rows(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None:
+def solve_tile(a: F64, rows: int, vectors: int, c: int, ld: int, t: int) -> None:
     _within(a, c, (rows - 1) * ld + vectors * _LANES)
     _within(a, t, 10)
-    _solve_rows(a, rows, vectors, c, ld, t)
+    _solve_tile(a, rows, vectors, c, ld, t)
 
 
 @inline_kernel
-def six(x: F64, i: int, stride: int, depth: int, y: F64, j: int, out: F64, to: int) -> None:
-    _within(x, i, (depth - 1) * stride + 1)
-    _within(y, j, 6 * depth)
+def six(x: F64, X: Panel, y: F64, j: int, out: F64, to: int) -> None:
+    _within(x, X.start, (X.depth - 1) * X.ld + 1)
+    _within(y, j, 6 * X.depth)
     _within(out, to, 6)
-    _six(x, i, stride, depth, y, j, out, to)
+    _six(x, X, y, j, out, to)
 
 
 @inline_kernel

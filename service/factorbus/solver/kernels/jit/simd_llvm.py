@@ -61,25 +61,25 @@ def add_run(_typing: Any, a: Any, _i: Any, _j: Any, _count: Any) -> Any:
 
 
 @intrinsic
-def tile(
-    _typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ldc: Any, _x: Any, _y: Any, _ld: Any, _depth: Any
-) -> Any:
+def tile(_typing: Any, a: Any, _rows: Any, _vectors: Any, C: Any, X: Any, _y: Any) -> Any:
     """C −= XᵀY in registers: see `simd_plain.tile`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        array, rows, vectors, c, ldc, x, y, ld, depth = args
+        array, rows, vectors, block, panel, y = args
+        c, ldc = cgutils.unpack_tuple(builder, block)
+        x, ld, depth = cgutils.unpack_tuple(builder, panel)
         c, x, y = (_address(context, builder, signature, array, where) for where in (c, x, y))
         shapes = {m * 4 + v: (m, v) for m in (1, 2, 3, 4) for v in (1, 2, 3)}
         case = builder.add(builder.mul(rows, _I64(4)), vectors)
         _switch(builder, case, "factorbus_tile", shapes, [c, ldc, x, y, ld, depth], _build_tile)
         return context.get_dummy_value()
 
-    return types.void(a, *[_INT] * 8), emit
+    return types.void(a, _INT, _INT, C, X, _INT), emit
 
 
 @intrinsic
-def solve_rows(_typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ld: Any, _t: Any) -> Any:
-    """C = T⁻ᵀ C: see `simd_plain.solve_rows`"""
+def solve_tile(_typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ld: Any, _t: Any) -> Any:
+    """C = T⁻ᵀ C: see `simd_plain.solve_tile`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array, rows, vectors, c, ld, t = args
@@ -92,14 +92,15 @@ def solve_rows(_typing: Any, a: Any, _rows: Any, _vectors: Any, _c: Any, _ld: An
 
 
 @intrinsic
-def six(_typing: Any, x: Any, _i: Any, _stride: Any, _depth: Any, y: Any, _j: Any, out: Any, _to: Any) -> Any:
+def six(_typing: Any, x: Any, X: Any, y: Any, _j: Any, out: Any, _to: Any) -> Any:
     """A row of six sums: see `simd_plain.six`"""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        x, i, stride, depth, y, j, out, to = args
+        x, panel, y, j, out, to = args
+        i, stride, depth = cgutils.unpack_tuple(builder, panel)
         x = _address(context, builder, signature, x, i)
-        y = _address(context, builder, signature, y, j, 4)
-        out = _address(context, builder, signature, out, to, 6)
+        y = _address(context, builder, signature, y, j, 2)
+        out = _address(context, builder, signature, out, to, 4)
         with _loop(builder, _I64(0), depth, 1, [ir.Constant(_SIX, [0.0] * 6)]) as (k, carried):
             factor = _spread(builder, builder.load(builder.gep(x, [builder.mul(k, stride)])), _SIX)
             row = _load(builder, builder.gep(y, [builder.mul(k, _I64(6))]), _SIX)
@@ -107,7 +108,7 @@ def six(_typing: Any, x: Any, _i: Any, _stride: Any, _depth: Any, y: Any, _j: An
         _store(builder, carried.final[0], out)
         return context.get_dummy_value()
 
-    return types.void(x, _INT, _INT, _INT, y, _INT, out, _INT), emit
+    return types.void(x, X, y, _INT, out, _INT), emit
 
 
 def _build_add_run(builder: Any, target: Any, source: Any, count: Any) -> None:

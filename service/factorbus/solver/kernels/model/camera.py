@@ -1,28 +1,29 @@
-"""What cameras see in a map: residuals and Jacobians of sights, ⊞ and first values of features.  MATH §3.1.
+"""What cameras see in a map: residuals and Jacobians of observations, ⊞ and first values of features.  MATH §3.1.
 
 A camera is an se3 pose, camera to map.  A feature y = (x, y, z, θ, φ, ρ) is where the camera stood that saw it first,
 azimuth, elevation and inverse distance; it stands for the point (x, y, z) + m(θ, φ)/ρ, m = (cos φ sin θ, −sin φ,
-cos φ cos θ).  A measurement is a pixel (u, v), for a first sight also ρ₀, and then the lens: its code and `LENS_SIZE`
-numbers (`factorbus.solver.lenses.layout`).
+cos φ cos θ).  A measurement is a pixel (u, v), for a first observation also ρ₀, and then the lens: its code and
+`LENS_SIZE` numbers (`factorbus.solver.lenses.layout`).
 """
 
 import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import rotation
+from factorbus.solver.kernels.model.se3 import rotation_matrix
 from factorbus.solver.lenses.layout import BEHIND, GOOD, OUTSIDE_LENS, VERTICAL
 from factorbus.solver.lenses.models import project, ray
 
-# What a sight counts while there is no pixel to compare with: as one that is 30 σ off, which no step is to gain by.
-ASLEEP = 900.0
+# What an inactive observation adds to χ²: as much as one that is 30 σ off, so that no step gains by it.
+INACTIVE_CHI2 = 900.0
 _VERTICAL = 1e-6
 
 
 @part
-def sight(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
-    """Residual and Jacobians of a sight of any kind; arguments as in `se2`.  MATH (3.14) to (3.17)
+def observation(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
+    """Residual and Jacobians of an observation of any kind; other arguments as in `se2`.  MATH (3.14) to (3.17)
 
     idp_first    r = ( (x, y, z) − t;  pixel − (u, v);  ρ − ρ₀ )
     idp_seen     r = pixel of Rᵀ a − (u, v),   a = ((x, y, z) − t) ρ + m
@@ -32,9 +33,10 @@ def sight(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: 
     seen E Rᵀ [ ρ I | m_θ | m_φ | (x, y, z) − t ], or E Rᵀ.
 
     r[R_STATUS] gets what became of the pixel.  Where it is not GOOD its rows are 0, so that it counts for nothing, and
-    what it adds to χ² is given: ASLEEP; else 0.
+    INACTIVE_CHI2 is returned, which it adds to χ²; else 0.
     """
-    q = rotation(x, i + 3)
+    i, j = ends
+    q = rotation_matrix(x, i + 3)
     d0, d1, d2 = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     n, rho, a0, a1, a2 = k + 2, 1.0, d0, d1, d2
     st, ct, sp, cp = 0.0, 0.0, 0.0, 0.0
@@ -58,7 +60,7 @@ def sight(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: 
         r[row], r[row + 1] = 0.0, 0.0
         A[row : row + 2, :6] = 0.0
         B[row : row + 2, :6] = 0.0
-        return ASLEEP
+        return INACTIVE_CHI2
     r[at.R_STATUS] = GOOD
     r[row], r[row + 1] = u - p[k], v - p[k + 1]
     g0, g1, g2 = e0, e1, e2
@@ -78,9 +80,9 @@ def sight(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: 
 
 @part
 def place_idp(x: F64, i: int, p: F64, k: int, j: int) -> int:
-    """The y that makes the residual of its first sight zero, into x from j on; gives GOOD or why not.  MATH (3.18)"""
+    """The y with which its first observation has no residual, into x from j on; gives GOOD or why not.  MATH (3.18)"""
     status, a, b, c, _, _, _, _, _, _ = ray(int(p[k + 3]), p[k + 4 :], p[k], p[k + 1])
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     hx, hy, hz = q[0] * a + q[1] * b + q[2] * c, q[3] * a + q[4] * b + q[5] * c, q[6] * a + q[7] * b + q[8] * c
     s2 = hx * hx + hz * hz
     x[j], x[j + 1], x[j + 2] = x[i], x[i + 1], x[i + 2]

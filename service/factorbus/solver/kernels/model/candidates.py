@@ -3,22 +3,23 @@
 from factorbus.solver.kernels.jit.compile import F64, I64, kernel
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.linearize import evaluate_apart
+from factorbus.solver.kernels.model.records import graph_at
 from factorbus.solver.kernels.model.sizes import information_at, residual_dim
 
 
 @kernel(
-    "void(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[:,::1], float64[:,:,::1],"
-    " float64[:,:,::1], float64[:,:,::1])"
+    "void(int64[::1], int64[::1], float64[::1], float64[:,::1], float64[:,:,::1], float64[:,:,::1], float64[:,:,::1])"
 )
-def evaluate_factors(
-    first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, r: F64, A: F64, B: F64, W: F64
-) -> None:
-    """The factors first .. last−1 at `values`.
+def evaluate_factors(picked: I64, graph_table: I64, values: F64, r: F64, A: F64, B: F64, W: F64) -> None:
+    """The factors with the ids `picked` (n,) at `values`, which are laid out as the graph's.
 
-    out  r (n, 6), A, B, W (n, 6, 6): upper left corners
+    graph_table: of the graph's arrays (`records`)
+    out  r (n, R_SIZE), A, B, W (n, 6, 6): upper left corners
     """
-    for f in range(first, last):
-        k = f - first
+    graph = graph_at(graph_table)
+    var, fac, payload = graph.var, graph.fac, graph.payload
+    for k in range(picked.size):
+        f = picked[k]
         evaluate_apart(f, var, fac, values, payload, r[k], A[k], B[k])
         dim = residual_dim(fac[f, at.F_KIND])
         p = fac[f, at.F_AT] + information_at(fac[f, at.F_KIND])

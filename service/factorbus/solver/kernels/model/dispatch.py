@@ -5,7 +5,8 @@ from typing import Any, Protocol
 
 from factorbus.solver.kernels.model import layout as at
 
-_ARGUMENTS = "x, i, j, p, k, r, A, B"
+_ARGUMENTS = "x, ends, p, k, r, A, B"
+_OF_ONE_KIND = "x, ends.i, ends.j, p, k, r, A, B"
 
 
 class Model(Protocol):
@@ -20,8 +21,8 @@ class Model(Protocol):
 
 
 def dispatcher(name: str, models: Mapping[str, Model], others: Callable[..., Any] | None = None) -> Callable[..., Any]:
-    """A function `name`(kind, x, i, j, p, k, r, A, B) that calls the residual function of the kind, one of `models`, or
-    `others` with the same arguments; it returns what χ² has beside rᵀ Ω r.
+    """A function `name`(kind, x, ends, p, k, r, A, B) that calls the residual function of the kind, one of `models`, or
+    `others` with the same arguments; it returns what χ² has beside rᵀ Ω r.  ends: `records.Ends`.
 
     Kinds of one function are tested together, where the first of them is.
     """
@@ -35,7 +36,7 @@ def dispatcher(name: str, models: Mapping[str, Model], others: Callable[..., Any
     word = "if"
     for n, (function, kinds) in enumerate(codes.items()):
         names[f"residual_{n}"] = function
-        call = f"residual_{n}({'kind, ' if of[function].of_kinds else ''}{_ARGUMENTS})"
+        call = f"residual_{n}({f'kind, {_ARGUMENTS}' if of[function].of_kinds else _OF_ONE_KIND})"
         lines += [
             f"    {word} {' or '.join(f'kind == {code}' for code in kinds)}:",
             f"        {'more = ' if of[function].lens_at >= 0 else ''}{call}",

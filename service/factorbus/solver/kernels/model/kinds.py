@@ -1,7 +1,8 @@
 """The kinds of factors: the residual of each, and what kernels have to know of it.  MATH §3.
 
 Names, ends and sizes are the wire's, `factorbus.proto.kinds`.  Here each kind has its residual function, called as
-residual(x, i, j, p, k, r, A, B): see `se2`.  From these declarations follow `residual_of`, which calls the function of
+residual(x, i, j, p, k, r, A, B): see `se2`.  One of several kinds is called as residual(kind, x, ends, p, k, r, A, B),
+with `records.Ends` in place of i and j.  From these declarations follow `residual_of`, which calls the function of
 a kind, and the predicates.  The order of codes means nothing.  A kind that is in one list and not in the other is an
 error when this file is imported.
 """
@@ -15,12 +16,13 @@ import numpy as np
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.model import layout as at
-from factorbus.solver.kernels.model.camera import sight
+from factorbus.solver.kernels.model.camera import observation
 from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
 from factorbus.solver.kernels.model.linear import linear, linear_se2
 from factorbus.solver.kernels.model.points import prior_point2, prior_point3
 from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
 from factorbus.solver.kernels.model.range_bearing import bearing_se2, bearing_se3, range_se2, range_se3
+from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
 from factorbus.solver.lenses.layout import GOOD
@@ -60,12 +62,6 @@ class FactorModel:
     directions: tuple[int, ...] = ()
 
 
-@inline_kernel
-def linear_plane(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
-    """Linear factors of one pose in the plane, or two."""
-    linear_se2(x, i, j, 1 if kind == at.LINEAR_SE2 else 2, p, k, r, A, B)
-
-
 def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **more: Any) -> FactorModel:
     """A kind that places new variables, and that most graphs are of."""
     return FactorModel(residual, equation, common=True, initializes=True, bounded=True, rigid=rigid, **more)
@@ -73,7 +69,7 @@ def _usual(residual: Callable[..., Any], equation: str, rigid: bool = False, **m
 
 def _seen(equation: str, lens_at: int, **more: Any) -> FactorModel:
     """What a camera sees."""
-    return FactorModel(sight, equation, of_kinds=True, common=True, lens_at=lens_at, **more)
+    return FactorModel(observation, equation, of_kinds=True, common=True, lens_at=lens_at, **more)
 
 
 def _linear_model(name: str) -> FactorModel:
@@ -83,7 +79,7 @@ def _linear_model(name: str) -> FactorModel:
         if end == "se3":
             quaternions.append(start + 3)
         start += VARIABLE_KINDS[end].size
-    function = linear_plane if set(ends) == {"se2"} else linear
+    function = linear_se2 if set(ends) == {"se2"} else linear
     return FactorModel(function, "MATH (3.26)", of_kinds=True, linear=True, quaternions=tuple(quaternions))
 
 
@@ -229,11 +225,11 @@ _other_residual_of = inline_kernel(dispatcher("other_residual_of", _others))
 
 
 @part
-def _other_residual(kind: int, x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
+def _other_residual(kind: int, x: F64, ends: Ends, p: F64, k: int, r: F64, A: F64, B: F64) -> float:
     """Of the kinds that are not common."""
     r[at.R_STATUS] = GOOD
-    return _other_residual_of(kind, x, i, j, p, k, r, A, B)
+    return _other_residual_of(kind, x, ends, p, k, r, A, B)
 
 
-# The residual function of a kind: residual_of(kind, x, i, j, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
+# The residual function of a kind: residual_of(kind, x, ends, p, k, r, A, B); gives what χ² has beside rᵀ Ω r.
 residual_of = inline_kernel(dispatcher("residual_of", _common, _other_residual))

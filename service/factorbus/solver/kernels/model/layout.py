@@ -77,41 +77,6 @@ LINEAR_PAIR_SE3 = FACTOR_CODES["linear_pair_se3"]
 NO_LOSS = 0
 LOSS_CODES = {name: 1 + code for code, name in enumerate(LOSSES)}
 
-# Scratch for a residual: six numbers at most, then what became of a sight (`factorbus.solver.lenses.layout`).
+# Scratch for a residual: six numbers at most, then what became of an observation's pixel (`lenses.layout`).
 R_STATUS = 6
 R_SIZE = 7
-
-# What an admission kernel found wrong with a row.
-GOOD = 0
-DUPLICATE = 1
-OUT_OF_BOUNDS = 2  # NaN, infinite, or not within its bounds (`bounds`)
-BAD_QUATERNION = 3
-UNKNOWN_FIRST = 4
-UNKNOWN_SECOND = 5
-WRONG_KIND_FIRST = 6
-WRONG_KIND_SECOND = 7
-SELF_LOOP = 8
-BAD_RANGE = 9
-NOT_POSITIVE_DEFINITE = 10
-BAD_SCALE = 11
-BAD_DIRECTION = 12
-
-# Columns of `groups`: groups of variables and factors whose numbers lie in the bytes of a message, little-endian, one
-# row each in any order, and after the last one a row of kind END.  An offset is that of the first byte.
-G_KIND = 0
-G_FACTORS = 1  # 0: variables, 1: factors
-G_COUNT = 2
-G_FIXED = 3  # 1: variables that are held where they are
-G_ARITY = 4  # keys of a factor; 1 for variables
-G_SIZE = 5  # numbers of a value or a measurement
-G_TRIANGLE = 6  # numbers of an information matrix; 0 for variables
-G_KEYS = 7  # offset of the keys
-G_NUMBERS = 8  # offset of the values, -1: they come without; or of the measurements
-G_INFORMATION = 9  # offset of the information matrices; -1 for variables
-G_STAMPS = 10  # offset of the time stamps; -1: they have none, and factors have none
-G_WIDTH = 11
-
-# What `admit_bytes` gives beside the number of the first factor.
-NOT_IN_ORDER = -1
-NO_ROOM = -2
-END = -1

@@ -8,37 +8,61 @@ Factors are taken in the order of their ids, whatever their kinds.  So the sums 
 whether they were made at once or as the factors arrived; taking back a refused insert rests on that.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import residual_of
 from factorbus.solver.kernels.model.losses import soften
+from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.sizes import end_dims, information_at, residual_dim
+
+
+class Scratch(NamedTuple):
+    """Room to linearize a factor in: r (7,); H (4, 6, 6), its Jacobians A and B, Ω A and Ω B; W (6, 6), Ω."""
+
+    r: F64
+    H: F64
+    W: F64
+
+
+@inline_kernel
+def make_scratch() -> Scratch:
+    """Room to linearize factors in, one after the other."""
+    return Scratch(np.zeros(at.R_SIZE), np.zeros((4, 6, 6)), np.zeros((6, 6)))
+
+
+class NormalEquations(NamedTuple):
+    """Λ δ = η: the blocks of Λ, row by row, in `data`, and `eta` (scalars,)."""
+
+    data: F64
+    eta: F64
 
 
 @kernel("float64(int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], float64[::1], float64[::1])")
 def linearize(first: int, last: int, var: I64, fac: I64, values: F64, payload: F64, data: F64, eta: F64) -> float:
     """Add the factors first .. last−1, linearized at `values`, to Λ's blocks in `data` and to `eta`; gives their χ²."""
-    r = np.zeros(at.R_SIZE)
-    H = np.zeros((4, 6, 6))
-    W = np.zeros((6, 6))
+    scratch, system = make_scratch(), NormalEquations(data, eta)
+    r, H = scratch.r, scratch.H
     chi2 = 0.0
     for f in range(first, last):
-        kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
+        row = fac[f]
+        kind, p = row[at.F_KIND], row[at.F_AT]
         chi2 += evaluate(f, var, fac, values, payload, r, H[0], H[1])
         # Sizes as constants, so that each call becomes straight code.
         if kind == at.BETWEEN_SE2 or kind == at.PRIOR_SE2:
-            chi2 += add_factor(3, 3, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
+            chi2 += add_factor(3, 3, 3, row, var, payload[p + 3 :], scratch, system)
         elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
-            chi2 += add_factor(2, 3, 2, f, var, fac, payload[p + 2 :], r, H, W, data, eta)
+            chi2 += add_factor(2, 3, 2, row, var, payload[p + 2 :], scratch, system)
         elif kind == at.BETWEEN_SE3 or kind == at.PRIOR_SE3:
-            chi2 += add_factor(6, 6, 6, f, var, fac, payload[p + 7 :], r, H, W, data, eta)
+            chi2 += add_factor(6, 6, 6, row, var, payload[p + 7 :], scratch, system)
         elif kind == at.LANDMARK_SE3 or kind == at.PRIOR_POINT3:
             first_size = 6 if kind == at.LANDMARK_SE3 else 3
-            chi2 += add_factor(3, first_size, 3, f, var, fac, payload[p + 3 :], r, H, W, data, eta)
+            chi2 += add_factor(3, first_size, 3, row, var, payload[p + 3 :], scratch, system)
         else:
-            chi2 += add_other(kind, f, var, fac, payload[p + information_at(kind) :], r, H, W, data, eta)
+            chi2 += add_other(kind, row, var, payload[p + information_at(kind) :], scratch, system)
     return chi2
 
 
@@ -54,7 +78,7 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
     kind, p = fac[f, at.F_KIND], fac[f, at.F_AT]
     i = var[fac[f, at.F_I], at.V_AT]
     j = var[max(fac[f, at.F_J], 0), at.V_AT]
-    more = residual_of(kind, x, i, j, payload, p, r, A, B)
+    more = residual_of(kind, x, Ends(i, j), payload, p, r, A, B)
     loss = fac[f, at.F_FLAGS] >> at.LOSS_SHIFT
     if loss != at.NO_LOSS:
         more = soften(kind, loss, p, payload, more, r, A, B)
@@ -62,20 +86,22 @@ def evaluate(f: int, var: I64, fac: I64, x: F64, payload: F64, r: F64, A: F64, B
 
 
 @part
-def add_other(kind: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64) -> float:
+def add_other(kind: int, row: I64, var: I64, info: F64, scratch: Scratch, system: NormalEquations) -> float:
     """`add_factor` of the kinds that are not worth straight code."""
     di, dj = end_dims(kind)
-    return add_factor(residual_dim(kind), di, dj, f, var, fac, info, r, H, W, data, eta)
+    return add_factor(residual_dim(kind), di, dj, row, var, info, scratch, system)
 
 
 @inline_kernel
 def add_factor(
-    dr: int, di: int, dj: int, f: int, var: I64, fac: I64, info: F64, r: F64, H: F64, W: F64, data: F64, eta: F64
+    dr: int, di: int, dj: int, row: I64, var: I64, info: F64, scratch: Scratch, system: NormalEquations
 ) -> float:
-    """Add Hᵀ Ω H and −Hᵀ Ω r of one factor where they belong; gives rᵀ Ω r.
+    """Add Hᵀ Ω H and −Hᵀ Ω r of the factor with this row where they belong; gives rᵀ Ω r.
 
-    H holds A, B and gets Ω A, Ω B; `info` starts with the upper triangle of Ω.  Ends without a block are fixed.
+    scratch: has r, A and B, and gets Ω, Ω A and Ω B   info: starts with the upper triangle of Ω
+    Ends without a block are fixed.
     """
+    r, H, W, data, eta = scratch.r, scratch.H, scratch.W, system.data, system.eta
     A, B, WA, WB = H[0], H[1], H[2], H[3]
     k = 0
     for a in range(dr):
@@ -89,15 +115,15 @@ def add_factor(
         for b in range(dr):
             e += W[a, b] * r[b]
         chi2 += r[a] * e
-    ii, jj, ij = fac[f, at.F_II], fac[f, at.F_JJ], fac[f, at.F_IJ]
+    ii, jj, ij = row[at.F_II], row[at.F_JJ], row[at.F_IJ]
     if ii >= 0:
         multiply(dr, di, W, A, WA)
-        add_end(dr, di, A, WA, r, data[ii:], eta[var[fac[f, at.F_I], at.V_SCALAR] :])
+        add_diagonal_block(dr, di, A, WA, r, data[ii:], eta[var[row[at.F_I], at.V_SCALAR] :])
     if jj >= 0:
         multiply(dr, dj, W, B, WB)
-        add_end(dr, dj, B, WB, r, data[jj:], eta[var[fac[f, at.F_J], at.V_SCALAR] :])
+        add_diagonal_block(dr, dj, B, WB, r, data[jj:], eta[var[row[at.F_J], at.V_SCALAR] :])
     if ij >= 0:
-        if fac[f, at.F_FLAGS] & at.SWAPPED:
+        if row[at.F_FLAGS] & at.SWAPPED:
             add_pair(dr, dj, di, B, WA, data[ij:])
         else:
             add_pair(dr, di, dj, A, WB, data[ij:])
@@ -116,7 +142,7 @@ def multiply(dr: int, d: int, W: F64, A: F64, out: F64) -> None:
 
 
 @inline_kernel
-def add_end(dr: int, d: int, A: F64, WA: F64, r: F64, block: F64, eta: F64) -> None:
+def add_diagonal_block(dr: int, d: int, A: F64, WA: F64, r: F64, block: F64, eta: F64) -> None:
     """block += Aᵀ Ω A, symmetric to the bit; eta −= (Ω A)ᵀ r."""
     for a in range(d):
         total = 0.0

@@ -7,7 +7,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import rotation
+from factorbus.solver.kernels.model.se3 import rotation_matrix
 
 
 @inline_kernel
@@ -26,7 +26,7 @@ def position_se2(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F6
 @inline_kernel
 def position_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """r = t + R l − z,  A = [ R | −R ⌊l⌋ ].  (3.20)"""
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     l0, l1, l2 = p[k + 3], p[k + 4], p[k + 5]
     for a in range(3):
         q0, q1, q2 = q[3 * a], q[3 * a + 1], q[3 * a + 2]
@@ -45,7 +45,7 @@ def heading_se2(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64
 @inline_kernel
 def attitude_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) -> None:
     """A direction g of the map as the robot sees it: r = b − z, b = Rᵀ g;  A = [ 0 | ⌊b⌋ ].  (3.22)"""
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     g0, g1, g2 = p[k + 3], p[k + 4], p[k + 5]
     b0, b1, b2 = q[0] * g0 + q[3] * g1 + q[6] * g2, q[1] * g0 + q[4] * g1 + q[7] * g2, q[2] * g0 + q[5] * g1 + q[8] * g2
     r[0], r[1], r[2] = b0 - p[k], b1 - p[k + 1], b2 - p[k + 2]

@@ -7,7 +7,7 @@ import math
 
 from factorbus.solver.kernels.jit.compile import F64, inline_kernel
 from factorbus.solver.kernels.model.se2 import wrap
-from factorbus.solver.kernels.model.se3 import rotation
+from factorbus.solver.kernels.model.se3 import rotation_matrix
 
 # Closer than this there is no direction: Jacobians are zero, so that a point may lie on a pose.
 _NEAR = 1e-150
@@ -29,7 +29,7 @@ def range_se2(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) ->
 @inline_kernel
 def range_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
     """As `range_se2`."""
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     t0, t1, t2 = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     distance = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
     inverse = 1.0 / distance if distance > _NEAR else 0.0
@@ -61,7 +61,7 @@ def bearing_se2(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
 @inline_kernel
 def bearing_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
     """r = n − z, n = u/|u|, u = Rᵀ (l − t);  P = (I − n nᵀ)/|u|,  A = [ −P | ⌊n⌋ ],  B = P Rᵀ.  (3.25)"""
-    q = rotation(x, i + 3)
+    q = rotation_matrix(x, i + 3)
     t0, t1, t2 = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     u0, u1, u2 = q[0] * t0 + q[3] * t1 + q[6] * t2, q[1] * t0 + q[4] * t1 + q[7] * t2, q[2] * t0 + q[5] * t1 + q[8] * t2
     distance = math.sqrt(u0 * u0 + u1 * u1 + u2 * u2)

@@ -14,7 +14,7 @@ class Graph(NamedTuple):
     payload  float64         per factor: measurement, upper triangle of its information, scale of its loss if any
     counts   (7,)   int64    how much of each array is in use
     keys     (n,)   int64    the variables' keys
-    table    int64           where a key is found (`graph.admit`)
+    table    int64           where a key is found (`graph.key_table`)
     dims     (c,)   int64    scalars of each block column of Λ
     stamps   (n,)   int64    the variables' time stamps, which the solver carries and never looks into; NO_STAMP: none
     """
@@ -28,6 +28,13 @@ class Graph(NamedTuple):
     table: Ints
     dims: Ints
     stamps: Ints
+
+
+class Ends(NamedTuple):
+    """Where the values of a factor's variables begin; j means nothing where it has one variable."""
+
+    i: int
+    j: int
 
 
 graph_at = opener(Graph)

@@ -60,7 +60,7 @@ def differs(x: int, size: int, a: I64, b: I64) -> bool:
 
 
 @kernel("int64(int64[::1], int64[::1])")
-def label_of(picked: I64, graph_table: I64) -> int:
+def common_label(picked: I64, graph_table: I64) -> int:
     """2 · kind of the picked variables, and 1 more where they are fixed; −1: they differ, or there are none."""
     graph = graph_at(graph_table)
     var, label = graph.var, -1
@@ -73,7 +73,7 @@ def label_of(picked: I64, graph_table: I64) -> int:
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1], float64[:,::1])")
-def gather(picked: I64, graph_table: I64, out_keys: I64, out_values: F64) -> None:
+def gather_values(picked: I64, graph_table: I64, out_keys: I64, out_values: F64) -> None:
     """Keys and values of the picked variables, which are of one kind: those that follow each other, together.
 
     graph_table: of its arrays (`records`).  Without room in out_keys only the values.

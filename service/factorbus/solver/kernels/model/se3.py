@@ -11,7 +11,7 @@ HALF_TURN = 1e-6  # an error quaternion with less than that for w is one of 180�
 
 
 @inline_kernel
-def rotation(q: F64, k: int) -> tuple:
+def rotation_matrix(q: F64, k: int) -> tuple:
     """The nine entries of R(q), row by row; q (x y z w) at offset k is of unit length."""
     x, y, z, w = q[k], q[k + 1], q[k + 2], q[k + 3]
     return (
@@ -54,7 +54,7 @@ def prior_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) 
 
     A = [ R_zᵀ R | 0 ; 0 | ½ (w I + ⌊v⌋) ]
     """
-    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation(p, k + 3)
+    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
     dx, dy, dz = x[i] - p[k], x[i + 1] - p[k + 1], x[i + 2] - p[k + 2]
     r[0] = z0 * dx + z3 * dy + z6 * dz
     r[1] = z1 * dx + z4 * dy + z7 * dz
@@ -65,7 +65,7 @@ def prior_se3(x: F64, i: int, _j: int, p: F64, k: int, r: F64, A: F64, _B: F64) 
     r[3], r[4], r[5] = vx, vy, vz
     w = turn_slope(w)
     A[:, :] = 0.0
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     A[0, 0], A[0, 1], A[0, 2] = z0 * a0 + z3 * a3 + z6 * a6, z0 * a1 + z3 * a4 + z6 * a7, z0 * a2 + z3 * a5 + z6 * a8
     A[1, 0], A[1, 1], A[1, 2] = z1 * a0 + z4 * a3 + z7 * a6, z1 * a1 + z4 * a4 + z7 * a7, z1 * a2 + z4 * a5 + z7 * a8
     A[2, 0], A[2, 1], A[2, 2] = z2 * a0 + z5 * a3 + z8 * a6, z2 * a1 + z5 * a4 + z8 * a7, z2 * a2 + z5 * a5 + z8 * a8
@@ -81,8 +81,8 @@ def between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
     d = Rᵢᵀ (tⱼ − tᵢ);  r = (R_zᵀ (d − t_z), v),  (v, w) = q_z⁻¹ ⊗ qᵢ⁻¹ ⊗ qⱼ with w ≥ 0
     A = [ −R_zᵀ | R_zᵀ ⌊d⌋ ; 0 | −½ (w I − ⌊v⌋) R_zᵀ ],   B = [ R_zᵀ Rᵢᵀ Rⱼ | 0 ; 0 | ½ (w I + ⌊v⌋) ]
     """
-    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation(p, k + 3)
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    z0, z1, z2, z3, z4, z5, z6, z7, z8 = rotation_matrix(p, k + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     tx, ty, tz = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     dx, dy, dz = a0 * tx + a3 * ty + a6 * tz, a1 * tx + a4 * ty + a7 * tz, a2 * tx + a5 * ty + a8 * tz
     ex, ey, ez = dx - p[k], dy - p[k + 1], dz - p[k + 2]
@@ -107,7 +107,7 @@ def between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
     A[4, 3], A[4, 4], A[4, 5] = hz * z0 - h * z1 - hx * z2, hz * z3 - h * z4 - hx * z5, hz * z6 - h * z7 - hx * z8
     A[5, 3], A[5, 4], A[5, 5] = -hy * z0 + hx * z1 - h * z2, -hy * z3 + hx * z4 - h * z5, -hy * z6 + hx * z7 - h * z8
 
-    b0, b1, b2, b3, b4, b5, b6, b7, b8 = rotation(x, j + 3)
+    b0, b1, b2, b3, b4, b5, b6, b7, b8 = rotation_matrix(x, j + 3)
     # m = R_zᵀ Rᵢᵀ, then m Rⱼ.
     m0, m1, m2 = z0 * a0 + z3 * a1 + z6 * a2, z0 * a3 + z3 * a4 + z6 * a5, z0 * a6 + z3 * a7 + z6 * a8
     m3, m4, m5 = z1 * a0 + z4 * a1 + z7 * a2, z1 * a3 + z4 * a4 + z7 * a5, z1 * a6 + z4 * a7 + z7 * a8
@@ -124,7 +124,7 @@ def between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) 
 @inline_kernel
 def landmark_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
     """A point seen from a pose: r = u − z, u = Rᵢᵀ (lⱼ − tᵢ);  A = [ −I | ⌊u⌋ ], B = Rᵢᵀ.  MATH (3.7)"""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     tx, ty, tz = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
     ux, uy, uz = a0 * tx + a3 * ty + a6 * tz, a1 * tx + a4 * ty + a7 * tz, a2 * tx + a5 * ty + a8 * tz
     r[0], r[1], r[2] = ux - p[k], uy - p[k + 1], uz - p[k + 2]
@@ -139,7 +139,7 @@ def landmark_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64)
 @inline_kernel
 def move_se3(x: F64, i: int, step: F64, d: int, out: F64) -> None:
     """out = x ⊞ δ = (t + R δt, q ⊗ exp(δφ)), both at offset i; δ at offset d.  MATH (2.2)"""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     ux, uy, uz = step[d], step[d + 1], step[d + 2]
     out[i] = x[i] + a0 * ux + a1 * uy + a2 * uz
     out[i + 1] = x[i + 1] + a3 * ux + a4 * uy + a5 * uz
@@ -158,7 +158,7 @@ def move_se3(x: F64, i: int, step: F64, d: int, out: F64) -> None:
 @inline_kernel
 def compose_se3(x: F64, i: int, p: F64, k: int, j: int) -> None:
     """xⱼ = xᵢ z."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     x[j] = x[i] + a0 * p[k] + a1 * p[k + 1] + a2 * p[k + 2]
     x[j + 1] = x[i + 1] + a3 * p[k] + a4 * p[k + 1] + a5 * p[k + 2]
     x[j + 2] = x[i + 2] + a6 * p[k] + a7 * p[k + 1] + a8 * p[k + 2]
@@ -173,7 +173,7 @@ def compose_inverse_se3(x: F64, j: int, p: F64, k: int, i: int) -> None:
     qx, qy, qz, qw = quat_product(x[j + 3], x[j + 4], x[j + 5], x[j + 6], -p[k + 3], -p[k + 4], -p[k + 5], p[k + 6])
     scale = 1.0 / math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     x[i + 3], x[i + 4], x[i + 5], x[i + 6] = scale * qx, scale * qy, scale * qz, scale * qw
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     x[i] = x[j] - a0 * p[k] - a1 * p[k + 1] - a2 * p[k + 2]
     x[i + 1] = x[j + 1] - a3 * p[k] - a4 * p[k + 1] - a5 * p[k + 2]
     x[i + 2] = x[j + 2] - a6 * p[k] - a7 * p[k + 1] - a8 * p[k + 2]
@@ -182,7 +182,7 @@ def compose_inverse_se3(x: F64, j: int, p: F64, k: int, i: int) -> None:
 @inline_kernel
 def place_landmark_se3(x: F64, i: int, p: F64, k: int, j: int) -> None:
     """lⱼ = tᵢ + Rᵢ z."""
-    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation(x, i + 3)
+    a0, a1, a2, a3, a4, a5, a6, a7, a8 = rotation_matrix(x, i + 3)
     x[j] = x[i] + a0 * p[k] + a1 * p[k + 1] + a2 * p[k + 2]
     x[j + 1] = x[i + 1] + a3 * p[k] + a4 * p[k + 1] + a5 * p[k + 2]
     x[j + 2] = x[i + 2] + a6 * p[k] + a7 * p[k + 1] + a8 * p[k + 2]

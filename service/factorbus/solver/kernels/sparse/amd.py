@@ -5,11 +5,10 @@ After Amestoy, Davis and Duff, "An approximate minimum degree ordering algorithm
 indistinguishable nodes found by hashing, absorption of elements, aggressive too.  A node of dim d weighs d, so degrees
 count scalars.  Constraint groups as in CAMD: only nodes of the present group may be pivots.
 
-In the quotient graph the list of a live node i is `lists[begin[i] : begin[i] + length[i]]`: first `elements[i]`
-elements, then nodes.  The list of an element holds nodes.  `weight[i]` is 0 for what is absorbed, and negative for the
-nodes of the element that is being made.  `queue` holds three lists of nodes by degree, doubly linked: head, after,
-before.  `mark[e]` is |Lₑ ∖ Lₚ| + clock when e was met in this step, and 0 when e is absorbed.
+Nodes of the same degree are in a list, doubly linked: head, after, before.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +16,42 @@ from factorbus.solver.kernels.jit.compile import I64, inline_kernel, kernel, par
 
 NONE = -1
 NODE, ELEMENT, GONE = 0, 1, 2
+
+
+class QuotientGraph(NamedTuple):
+    """Nodes, and behind them elements; each array has an entry for each (nodes + elements,).
+
+    begin, length  the list of a live node i is lists[begin[i] : begin[i] + length[i]]: elements, then nodes; that of an
+                   element holds nodes
+    elements       how many elements the list of a node has
+    kind           NODE, ELEMENT or GONE
+    degree         approximate external degree of a node; what an element weighs
+    weight         0 for what is absorbed, and negative for the nodes of the element that is being made
+    mark           |Lₑ ∖ Lₚ| + clock where element e was met in this step; 0 where it is absorbed
+    """
+
+    begin: I64
+    length: I64
+    elements: I64
+    kind: I64
+    degree: I64
+    weight: I64
+    mark: I64
+
+
+class _Members(NamedTuple):
+    """The nodes that became one with a node i: i, after[i], and so on to last[i], whose next is NONE."""
+
+    after: I64
+    last: I64
+
+
+@inline_kernel
+def quotient_graph(begin: I64, length: I64) -> QuotientGraph:
+    """The graph of these lists, of nodes alone.  Whoever has elements says so in `elements`, `kind` and `degree`."""
+    room = begin.size
+    elements, kind, degree = np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room, np.int64)
+    return QuotientGraph(begin, length, elements, kind, degree, np.ones(room, np.int64), np.ones(room, np.int64))
 
 
 @kernel("int64[::1](int64[::1], int64[::1], int64[::1], int64[::1])")
@@ -28,22 +63,19 @@ def amd(dims: I64, rows: I64, cols: I64, group: I64) -> I64:
     n = dims.size
     begin, length, lists = _graph(n, rows, cols)
     used = begin[-1] + length[-1] if n > 0 else 0
-    degree = np.zeros(n, np.int64)
-    return eliminate(n, dims, begin, length, np.zeros(n, np.int64), np.zeros(n, np.int64), lists, used, degree, group)
+    return order_nodes(dims, quotient_graph(begin, length), lists, used, group)
 
 
 @part
-def eliminate(
-    n: int, dims: I64, begin: I64, length: I64, elements: I64, kind: I64, lists: I64, used: int, degree: I64, group: I64
-) -> I64:
-    """The order of the n nodes of a quotient graph that may have elements from the start; all arguments are used up.
+def order_nodes(dims: I64, graph: QuotientGraph, lists: I64, used: int, group: I64) -> I64:
+    """The elimination order of the nodes of a quotient graph that may have elements from the start.
 
-    dims, group (n,); begin, length, elements, kind and degree have entries for the nodes, then for the elements, which
-    have their kind, and their weight as degree.
+    dims, group (nodes,)   lists: of the graph, with room behind the first `used`
+    The graph is used up.
     """
-    total, left, room = 0, 0, begin.size
+    begin, length, elements, kind, degree, weight, mark = graph
+    n, total, left, room = dims.size, 0, 0, begin.size
     length_at_first = length[:n].copy()
-    weight, mark = np.ones(room, np.int64), np.ones(room, np.int64)
     dense = max(16.0, 10.0 * np.sqrt(n))
     for i in range(n):
         weight[i] = dims[i]
@@ -51,8 +83,9 @@ def eliminate(
         if length[i] > dense:  # its place barely matters and its degree costs much: it becomes last of its group
             weight[i], kind[i] = 0, GONE
         left += weight[i]
-    _first_degrees(n, left, begin, length, elements, lists, weight, degree)
-    next_member, last_member = np.full(n, NONE), np.arange(n)
+    _first_degrees(n, left, graph, lists)
+    members_of = _Members(np.full(n, NONE), np.arange(n))
+    next_member = members_of.after
     head, after, before = np.full(total + 1, NONE), np.full(n, NONE), np.full(n, NONE)
     bucket, chain, code = np.full(n, NONE), np.full(n, NONE), np.zeros(n, np.int64)
     members, member_from = _by_group(group)
@@ -73,7 +106,7 @@ def eliminate(
             for p in range(begin[me], begin[me] + elements[me]):
                 need += length[lists[p]]
             if used + need > lists.size:
-                lists, used = _compact(need, begin, length, kind, weight, lists)
+                lists, used = _compact(need, graph, lists)
             # 2  its neighbours become the element Lₚ; elements next to it are absorbed
             own = weight[me]
             weight[me] = -own
@@ -109,11 +142,11 @@ def eliminate(
             # 4  approximate degrees; a node with no other neighbours goes with the pivot
             for p in range(start, used):
                 i = lists[p]
-                external, hashed = _update(i, me, clock, begin, length, elements, lists, weight, kind, mark)
+                external, hashed = _update(i, me, clock, graph, lists)
                 if external == 0 and group[i] == g:
                     own -= weight[i]
                     width += weight[i]
-                    _absorb(i, me, kind, weight, next_member, last_member)
+                    _absorb(i, me, graph, members_of)
                     continue
                 degree[i] = min(degree[i], external)
                 code[i] = hashed % n
@@ -127,10 +160,7 @@ def eliminate(
                     h = code[lists[p]]
                     i, bucket[h] = bucket[h], NONE
                     while i != NONE and chain[i] != NONE:
-                        _merge_twins(
-                            i, clock, begin, length, elements, lists, weight, kind, mark, group, chain,
-                            next_member, last_member,
-                        )  # fmt: skip
+                        _merge_twins(i, clock, graph, lists, group, chain, members_of)
                         clock += 1
                         i = chain[i]
             # 6  the nodes return to the queue, the pivot and what went with it leave
@@ -184,9 +214,8 @@ def _graph(n: int, rows: I64, cols: I64) -> tuple[I64, I64, I64]:
 
 
 @part
-def _first_degrees(
-    n: int, left: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, degree: I64
-) -> None:
+def _first_degrees(n: int, left: int, graph: QuotientGraph, lists: I64) -> None:
+    begin, length, elements, degree, weight = graph.begin, graph.length, graph.elements, graph.degree, graph.weight
     for i in range(n):
         degree[i] = 0
         for p in range(begin[i], begin[i] + length[i]):
@@ -244,10 +273,9 @@ def _drop(i: int, degree: I64, head: I64, after: I64, before: I64) -> None:
 
 
 @inline_kernel
-def _update(
-    i: int, me: int, clock: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, kind: I64, mark: I64
-) -> tuple:
+def _update(i: int, me: int, clock: int, graph: QuotientGraph, lists: I64) -> tuple:
     """Rewrite the list of i without what is absorbed and with `me`; gives its degree outside Lₚ and a hash."""
+    begin, length, elements, kind, _, weight, mark = graph
     first = begin[i]
     put, external, hashed = first, 0, 0
     for s in range(first, first + elements[i]):
@@ -276,17 +304,17 @@ def _update(
 
 
 @inline_kernel
-def _absorb(i: int, into: int, kind: I64, weight: I64, next_member: I64, last_member: I64) -> None:
-    kind[i], weight[i] = GONE, 0
-    next_member[last_member[into]], last_member[into] = i, last_member[i]
+def _absorb(i: int, into: int, graph: QuotientGraph, members_of: _Members) -> None:
+    graph.kind[i], graph.weight[i] = GONE, 0
+    members_of.after[members_of.last[into]], members_of.last[into] = i, members_of.last[i]
 
 
 @part
 def _merge_twins(
-    i: int, clock: int, begin: I64, length: I64, elements: I64, lists: I64, weight: I64, kind: I64, mark: I64,
-    group: I64, chain: I64, next_member: I64, last_member: I64,
-) -> None:  # fmt: skip
+    i: int, clock: int, graph: QuotientGraph, lists: I64, group: I64, chain: I64, members_of: _Members
+) -> None:
     """Absorb into i the nodes behind it in its hash chain that have the same list."""
+    begin, length, elements, _, _, weight, mark = graph
     for s in range(begin[i] + 1, begin[i] + length[i]):
         mark[lists[s]] = clock
     previous, j = i, chain[i]
@@ -299,7 +327,7 @@ def _merge_twins(
         following = chain[j]
         if same:
             weight[i] += weight[j]
-            _absorb(j, i, kind, weight, next_member, last_member)
+            _absorb(j, i, graph, members_of)
             chain[previous] = following
         else:
             previous = j
@@ -307,8 +335,9 @@ def _merge_twins(
 
 
 @part
-def _compact(need: int, begin: I64, length: I64, kind: I64, weight: I64, lists: I64) -> tuple:
+def _compact(need: int, graph: QuotientGraph, lists: I64) -> tuple:
     """Copy the living lists together, with room for `need` more."""
+    begin, length, kind, weight = graph.begin, graph.length, graph.kind, graph.weight
     alive = 0
     for i in range(begin.size):
         if kind[i] == ELEMENT or weight[i] != 0:

@@ -10,7 +10,9 @@ Of an update matrix GROUP rows at a time begin with the same column, the first t
 rows of a group have a common stride and little is kept below the diagonal.
 """
 
-from factorbus.solver.kernels.jit.compile import inline_kernel, vector_lanes
+from typing import NamedTuple
+
+from factorbus.solver.kernels.jit.compile import I64, inline_kernel, vector_lanes
 
 COLUMN = 0  # first pivot scalar, in elimination order
 PIVOTS = 1  # p
@@ -39,16 +41,34 @@ BLOCK = 5
 STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 
 # The first doubles of an arena: room for a 4 x 4 triangle, for each thread that may be at it.
-LENDERS = 7  # threads besides the one whose arena it is
+MOST_WORKERS = 7  # threads besides the one whose arena it is
 SCRATCH_OF_ONE = 16
-SCRATCH = SCRATCH_OF_ONE * (1 + LENDERS)
+SCRATCH = SCRATCH_OF_ONE * (1 + MOST_WORKERS)
 
 LANES = vector_lanes()
 GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time
 
 
+class Front(NamedTuple):
+    """Where a front is in its arena: its `pivots` rows of R begin at `rows`, `ld` apart, over `pivots` + `border`
+    columns; its update matrix begins at `update`, the first rows `width` wide."""
+
+    rows: int
+    ld: int
+    pivots: int
+    border: int
+    update: int
+    width: int
+
+
 @inline_kernel
-def padded(count: int) -> int:
+def front_of(record: I64) -> Front:
+    """The front of a record."""
+    return Front(record[ROWS], record[LD_ROWS], record[PIVOTS], record[BORDER], record[UPDATE], record[WIDTH_UPDATE])
+
+
+@inline_kernel
+def padded_size(count: int) -> int:
     """The next multiple of LANES."""
     return (count + LANES - 1) & ~(LANES - 1)
 
@@ -56,7 +76,7 @@ def padded(count: int) -> int:
 @inline_kernel
 def row_stride(count: int) -> int:
     """Padded, and not a multiple of a large power of two, whose rows would share a few sets of the cache."""
-    stride = padded(count)
+    stride = padded_size(count)
     return stride + 8 if stride >= 128 and stride % 16 == 0 else stride
 
 

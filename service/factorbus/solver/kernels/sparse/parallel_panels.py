@@ -1,17 +1,18 @@
 """What a panel takes off the rows behind it, in chunks of rows that several threads make.  Same bits, whoever does."""
 
-from factorbus.solver.kernels.jit.array_table import address_of, floats, put_place
+from factorbus.solver.kernels.jit.array_table import address_of, floats, put_entry
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+from factorbus.solver.kernels.sparse.fronts import Front
 from factorbus.solver.kernels.sparse.panels import take_panel_off
 from factorbus.solver.kernels.sparse.task_queue import (
     AT,
     MORE,
     PANEL,
+    claim,
+    finish_chunk,
     post,
-    say_done,
-    take_board,
     take_chunk,
-    wait_and_leave,
+    wait_and_release,
 )
 
 CHUNK = 32  # rows
@@ -27,29 +28,27 @@ def is_large(depth: int, behind: int) -> bool:
 
 
 @part
-def take_panel_off_together(
-    board: I64, a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, top: int, end: int
-) -> bool:
+def take_panel_off_together(queue: I64, a: F64, front: Front, top: int, end: int) -> bool:
     """As `take_panel_off`, from all rows behind the panel.  False: there is nobody to do it with; nothing is done."""
-    if not take_board(board):
+    if not claim(queue):
         return False
-    put_place(board, AT, address_of(a), a.size, 1)
-    board[R], board[LD], board[P], board[M] = r, ld, p, m
-    board[U], board[WIDTH], board[TOP], board[END] = u, width, top, end
-    post(board, PANEL, _chunks(p - end) + _chunks(m))
-    chunk = take_chunk(board)
+    put_entry(queue, AT, address_of(a), a.size, 1)
+    queue[R], queue[LD], queue[P], queue[M], queue[U], queue[WIDTH] = front
+    queue[TOP], queue[END] = top, end
+    post(queue, PANEL, _chunks(front.pivots - end) + _chunks(front.border))
+    chunk = take_chunk(queue)
     while chunk >= 0:
-        make_panel_chunk(board, chunk)
-        say_done(board)
-        chunk = take_chunk(board)
-    wait_and_leave(board)
+        make_panel_chunk(queue, chunk)
+        finish_chunk(queue)
+        chunk = take_chunk(queue)
+    wait_and_release(queue)
     return True
 
 
 @part
-def make_panel_chunk(board: I64, chunk: int) -> None:
+def make_panel_chunk(queue: I64, chunk: int) -> None:
     """CHUNK rows of R, or of the update matrix, lose what the panel has."""
-    p, m, end = board[P], board[M], board[END]
+    p, m, end = queue[P], queue[M], queue[END]
     in_r = _chunks(p - end)
     if chunk < in_r:
         low = end + chunk * CHUNK
@@ -57,8 +56,9 @@ def make_panel_chunk(board: I64, chunk: int) -> None:
     else:
         low = p + (chunk - in_r) * CHUNK
         high = min(low + CHUNK, p + m)
-    a = floats(board, AT)
-    take_panel_off(a, board[R], board[LD], p, m, board[U], board[WIDTH], board[TOP], end, low, high)
+    a = floats(queue, AT)
+    front = Front(queue[R], queue[LD], p, m, queue[U], queue[WIDTH])
+    take_panel_off(a, front, queue[TOP], end, low, high)
 
 
 @inline_kernel

@@ -10,8 +10,8 @@ taken off it, so every number is loaded and stored once per panel.
 import math
 
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
-from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, at, put, solve_rows
-from factorbus.solver.kernels.sparse.fronts import padded
+from factorbus.solver.kernels.jit.simd import LANES, TILE_ROWS, Block, Panel, at, put, solve_tile
+from factorbus.solver.kernels.sparse.fronts import Front, padded_size
 from factorbus.solver.kernels.sparse.panels import DEPTH, take_off, take_panel_off
 from factorbus.solver.kernels.sparse.parallel_panels import is_large, take_panel_off_together
 
@@ -28,33 +28,30 @@ RAISED = -2  # what `factor_front` gives where it raised a pivot
 
 
 @part
-def factor_front(
-    a: F64, r: int, ld: int, p: int, m: int, u: int, width: int, floors: F64, k: int, t: int, board: I64
-) -> int:
+def factor_front(a: F64, front: Front, floors: F64, t: int, queue: I64) -> int:
     """Factorize a front in place; the layout is that of `fronts`.  Gives the pivot that failed, or -1; or RAISED.
 
-    in   r, ld: its p rows over p + m columns   u, width: its m x m update matrix
-         floors[k + i]: pivot i must exceed it, or, where it is negative, is raised to its size if it does not
+    in   floors[i]: pivot i must exceed it, or, where it is negative, is raised to its size if it does not
          t: scratch of this thread
-         board: where cores are lent, see `task_queue`
+         queue: for worker threads, see `task_queue`
     out  rows: R and S   update matrix: U
     """
-    raised = False
+    r, ld, p, m = front.rows, front.ld, front.pivots, front.border
+    raised, lead = False, padded_size(p) - p
     for top in range(0, p, DEPTH):
         end = min(top + DEPTH, p)
         for i in range(top, end, TILE_ROWS):
             rows = min(TILE_ROWS, end - i)
-            take_off(a, rows, r + i * ld, ld, r + top * ld, ld, i, i, p + m, padded(p) - p, i - top)
-            failed = pivot_rows(a, rows, r + i * ld + i, ld, floors, k + i, t)
+            take_off(a, rows, Block(r + i * ld, ld), Panel(r + top * ld, ld, i - top), i, i, p + m, lead)
+            failed = pivot_rows(a, rows, r + i * ld + i, ld, floors, i, t)
             if failed >= 0:
                 return i + failed
             raised |= failed == RAISED
-            lead = padded(p) - p
             first = i - (lead + i) % LANES
-            solve_rows(a, rows, (padded(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, t)
+            solve_tile(a, rows, (padded_size(lead + p + m) - lead - first) // LANES, r + i * ld + first, ld, t)
         large = is_large(end - top, p + m - end)
-        if not (large and take_panel_off_together(board, a, r, ld, p, m, u, width, top, end)):
-            take_panel_off(a, r, ld, p, m, u, width, top, end, end, p + m)
+        if not (large and take_panel_off_together(queue, a, front, top, end)):
+            take_panel_off(a, front, top, end, end, p + m)
     return RAISED if raised else -1
 
 

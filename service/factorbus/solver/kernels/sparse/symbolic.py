@@ -219,8 +219,8 @@ def _place(records: I64) -> I64:
     for f in range(fronts):
         front = records[f]
         p, m = front[fr.PIVOTS], front[fr.BORDER]
-        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded(p) + m), fr.padded(m)
-        front[fr.ROWS] = end + fr.padded(p) - p
+        front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded_size(p) + m), fr.padded_size(m)
+        front[fr.ROWS] = end + fr.padded_size(p) - p
         end += p * front[fr.LD_ROWS]
         if front[fr.CHILD] != NONE:
             top[1 - depth[f]] = records[front[fr.CHILD], fr.UPDATE]
@@ -294,7 +294,7 @@ def _maps(
         front[fr.BLOCKS] = block
         for e in range(begin[first], begin[last]):
             b = block_of[e]
-            _block(blocks, block, b, label[rows[b]], label[cols[b]], dim, column, front[fr.ROWS], front[fr.LD_ROWS])
+            _block(blocks[block], b, label[rows[b]], label[cols[b]], dim, column, front)
             block += 1
         front[fr.BLOCKS_END] = block
         c = front[fr.CHILD]
@@ -323,13 +323,13 @@ def _by_earlier(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
 
 
 @inline_kernel
-def _block(out: I64, at: int, b: int, i: int, j: int, dim: I64, column: I64, r: int, ld: int) -> None:
-    """Block b of Λ, between the variables labelled i and j."""
+def _block(out: I64, b: int, i: int, j: int, dim: I64, column: I64, front: I64) -> None:
+    """Block b of Λ, between the variables labelled i and j, as `front` takes it in."""
     upper, later = min(i, j), max(i, j)
-    out[at, 0] = b
-    out[at, 1] = r + column[upper] * ld + column[later]
-    out[at, 2], out[at, 3] = dim[upper], dim[later]
-    out[at, 4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
+    out[0] = b
+    out[1] = front[fr.ROWS] + column[upper] * front[fr.LD_ROWS] + column[later]
+    out[2], out[3] = dim[upper], dim[later]
+    out[4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
 
 
 @inline_kernel

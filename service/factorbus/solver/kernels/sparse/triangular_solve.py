@@ -6,7 +6,7 @@ from factorbus.solver.kernels.sparse import fronts as fr
 
 
 @kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
-def solve_lower(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+def solve_fronts_transposed(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
     """x = R⁻ᵀx in place, from the leaves to the roots; scalars in elimination order.
 
     room: at least as long as the longest border
@@ -21,8 +21,8 @@ def solve_lower(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None
 
 
 @kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
-def solve_upper(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
-    """x = R⁻¹x in place, from the roots to the leaves; otherwise as `solve_lower`."""
+def solve_fronts(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+    """x = R⁻¹x in place, from the roots to the leaves; otherwise as `solve_fronts_transposed`."""
     for f in range(fronts.shape[0] - 1, -1, -1):
         front = fronts[f]
         r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.BORDER], front[fr.COLUMN]

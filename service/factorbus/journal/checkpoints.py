@@ -1,6 +1,6 @@
 """A solver's state as a file: written beside, made safe, then named; read only if not a bit of it has changed.
 
-magic   8 bytes        FBSNAP01
+magic   8 bytes        FBCHKP01
 size    8 bytes        of the head, little-endian
 head    MessagePack    the state, where every array is {"array": n}; {"type", "shape", "bytes"} of each array
 arrays                 one after the other, without the zero bytes at their ends
@@ -21,16 +21,16 @@ import numpy as np
 from factorbus.journal.folders import sync_folder
 from factorbus.ownership import private_file
 
-_MAGIC = b"FBSNAP01"
+_MAGIC = b"FBCHKP01"
 _BLOCK = 1 << 20
 
 
 def file_of(folder: Path, record: int) -> Path:
-    """Where the snapshot after record `record` is."""
-    return folder / f"snapshot-{record}.fbs"
+    """Where the checkpoint after record `record` is."""
+    return folder / f"checkpoint-{record}.fbs"
 
 
-def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
+def write_checkpoint(path: Path, state: Mapping[str, Any]) -> int:
     """Write `state` to `path`, all of it or nothing; gives its bytes.  Raises OSError."""
     arrays: list[np.ndarray] = []
     tree = _without_arrays(state, arrays)
@@ -60,7 +60,7 @@ def write_snapshot(path: Path, state: Mapping[str, Any]) -> int:
     return size + digest.digest_size
 
 
-def read_snapshot(path: Path) -> dict[str, Any]:
+def read_checkpoint(path: Path) -> dict[str, Any]:
     """The state in `path`.  Raises ValueError where a bit of it is wrong, OSError."""
     with path.open("rb") as file:
         content = file.read()
@@ -73,9 +73,9 @@ def read_snapshot(path: Path) -> dict[str, Any]:
 
 
 def remove_strangers(folder: Path, known: set[int]) -> None:
-    """Remove snapshot files that the journal does not know: begun, and not noted before the end came."""
+    """Remove checkpoint files that the journal does not know: begun, and not noted before the end came."""
     names = {file_of(folder, record).name for record in known}
-    for path in [*folder.glob("snapshot-*.fbs"), *folder.glob("snapshot-*.part")]:
+    for path in [*folder.glob("checkpoint-*.fbs"), *folder.glob("checkpoint-*.part")]:
         if path.name not in names:
             path.unlink(missing_ok=True)
 
@@ -112,7 +112,7 @@ def _arrays(rows: list[dict[str, Any]], data: memoryview) -> Iterator[np.ndarray
 
 
 def _check_room(path: Path, size: int) -> None:
-    """A snapshot only makes a restart quick: it must not take the room that the journal needs.  Raises OSError."""
+    """A checkpoint only makes a restart quick: it must not take the room that the journal needs.  Raises OSError."""
     free = shutil.disk_usage(path.parent).free
     if free < 2 * size:
         raise OSError(errno.ENOSPC, f"it has {size} bytes and {free} are free; there must be as much again", str(path))

@@ -12,7 +12,7 @@ def _none() -> F64:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class DriveHistory:
     """Per step of a drive: chi2 (n,), step_ms (n,), work (n, 3); each may be empty.
 
     work: variables in the map, eliminated, relinearized.

@@ -1,0 +1,58 @@
+"""The messages that tell of a step, written by the compiled writer: the answers to its inserts, and its delta."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from factorbus.proto import codec
+from factorbus.service.kernels.write import NO_DELTA, write_messages
+from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.kernels.jit.compile import I64
+
+# Of a usual step; those of a larger one are written to an array of their own.
+_ROOM = 48 << 10
+_NOTHING, _NO_GRAPH = np.empty(0, np.int64), Graph()
+
+
+class StepMessages:
+    """Writes the messages of the steps of one map.  For one thread at a time."""
+
+    def __init__(self) -> None:
+        self._out = np.empty(_ROOM, np.uint8)
+        self._pack = codec.report_encoder()
+
+    def write(
+        self,
+        answers: Sequence[tuple[int, int]],
+        step: tuple[int, int, int],
+        account: Mapping[str, Any],
+        changed: I64,
+        graph: Graph,
+    ) -> list[bytes]:
+        """The answers to the inserts of a step, and its delta.
+
+        answers: of each insert its sequence number and the id of its first factor.  step: epoch, revision, and the one
+        before.  changed: the variables that the delta tells of, ascending.
+        """
+        out, ends = self._out, np.empty(len(answers) + 1, np.int64)
+        numbers = np.array(answers, np.int64).reshape(-1, 2), np.array(step, np.int64)
+        columns = self._pack(account), changed, graph.array_table
+        if (size := write_messages(*numbers, *columns, out, ends)) > out.size:
+            out = np.empty(size, np.uint8)
+            write_messages(*numbers, *columns, out, ends)
+        written, begin = [], 0
+        for end in ends.tolist():
+            written.append(out[begin:end].tobytes())
+            begin = end
+        return written
+
+    def write_answers(
+        self, answers: Sequence[tuple[int, int]], epoch: int, revision: int, account: Mapping[str, Any]
+    ) -> list[bytes]:
+        """The answers alone."""
+        return self.write(answers, (epoch, revision, NO_DELTA), account, _NOTHING, _NO_GRAPH)[:-1]
+
+    def write_delta(self, step: tuple[int, int, int], account: Mapping[str, Any], changed: I64, graph: Graph) -> bytes:
+        """The delta alone."""
+        return self.write((), step, account, changed, graph)[0]

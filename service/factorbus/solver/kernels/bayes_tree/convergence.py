@@ -1,0 +1,68 @@
+"""Whether a step goes on, and what is left to do after it.  MATH §9.8."""
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.bayes_tree.linearization_error import await_all
+from factorbus.solver.kernels.bayes_tree.records import Tree
+from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
+from factorbus.solver.kernels.model.records import Graph
+
+MOST_ROUNDS = 10  # of a step that has not converged
+FINISHED = 1e-8  # a step with nothing new goes on while Σ error² is more than this share of χ²
+LARGE_GAIN = 0.05  # of χ², in one round or all,
+AFTER_LARGE_GAIN = 0.02  # times as much error² is allowed after it
+PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to factors none of whose variables moves
+
+
+@inline_kernel
+def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
+    """Whether what waits is relinearized and solved for again in the same step; pull: as `measure` gives it."""
+    rounds = state[tl.S_ROUNDS]
+    if state[tl.S_ONCE] != 0:
+        return False
+    if account[tl.A_ERROR] > allowed(settings, state, account):
+        return rounds < (settings[tl.P_MAX_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
+    return state[tl.S_CONTINUES] == 0 and pull > settings[tl.P_SAME_STEP_SHARE] and rounds < settings[tl.P_MAX_ROUNDS]
+
+
+@inline_kernel
+def await_bound(graph: Graph, tree: Tree, settings: F64) -> None:
+    """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
+    state, account = tree.state, tree.account
+    most = allowed(settings, state, account)
+    if account[tl.A_ERROR] > most:
+        least = PASSED_OVER * most / state[tl.S_FACTORS]
+        await_all(least, graph.var, graph.fac, tree.node, tree.stiff, tree.pending, state)
+        state[tl.S_DUE] = 1
+
+
+@inline_kernel
+def allowed(settings: F64, state: I64, account: F64) -> float:
+    """The Σ error² with which a step ends: what its report calls converged; FINISHED of χ² with nothing new."""
+    if state[tl.S_CONTINUES] != 0:
+        return FINISHED * (account[tl.A_CHI2] + LEAST_CHI2)
+    return converged_error(settings, state, account)
+
+
+@inline_kernel
+def converged_error(settings: F64, state: I64, account: F64) -> float:
+    """The Σ error² up to which the step has converged.  (9.32)"""
+    chi2 = account[tl.A_CHI2] + LEAST_CHI2
+    share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS], 1)
+    return share * chi2 * (AFTER_LARGE_GAIN if account[tl.A_GAINED] > LARGE_GAIN * chi2 else 1.0)
+
+
+@inline_kernel
+def note_after(settings: F64, state: I64, account: F64) -> None:
+    """What is to be done after the step, and what the optimum is at least."""
+    chi2 = account[tl.A_CHI2]
+    account[tl.A_ALLOWED] = converged_error(settings, state, account)
+    state[tl.S_AFTER] = 0
+    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * account[tl.A_BEFORE] + LEAST_CHI2:
+        state[tl.S_AFTER] += tl.WORSE
+    if state[tl.S_RISES] != 0:
+        state[tl.S_AFTER] += tl.ROSE
+    if state[tl.S_RAISED] != 0:
+        state[tl.S_AFTER] += tl.RAISED
+    if state[tl.S_AFTER] == 0:
+        account[tl.A_LEAST] = max(chi2 - account[tl.A_ERROR], 0.0)

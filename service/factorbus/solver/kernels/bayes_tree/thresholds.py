@@ -1,0 +1,51 @@
+"""The thresholds of a step in what a residual is like in this map.  MATH §9.6."""
+
+import math
+
+from factorbus.solver.kernels.bayes_tree import layout as tl
+from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
+
+LEAST_CHI2 = 1e-2
+
+
+@inline_kernel
+def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64, account: F64) -> F64:
+    """The settings of the tree with their thresholds for a graph of so many factors and scalars."""
+    unit, scaled = account[tl.A_UNIT], tree_settings.copy()
+    continues = state[tl.S_CONTINUES] != 0
+    per_scalar = unit * math.sqrt(factors / max(scalars, 1))  # (9.17)
+    scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0 if continues else scaled[tl.P_WILDFIRE_THRESHOLD] * per_scalar
+    scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
+    scaled[tl.P_MAX_ERROR] *= unit
+    scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARIZING] / tree_settings[tl.P_COOLDOWN_FLOPS], 1.0)
+    share = unit * unit * max(factors, 1) * reluctance(scaled, state)  # of χ²
+    scaled[tl.P_SAME_STEP_SHARE] *= share
+    scaled[tl.P_NEXT_STEP_SHARE] *= share
+    scaled[tl.P_MAX_WAIT] *= scaled[tl.P_COOLDOWN_FLOPS]
+    return scaled
+
+
+@inline_kernel
+def residual_unit(factors: int, account: F64) -> float:
+    """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
+    return math.sqrt((max(account[tl.A_MODEL], 0.0) + LEAST_CHI2) / max(factors, 1))
+
+
+@part
+def rescale(factors: int, settings: F64, account: F64) -> None:
+    """The thresholds in what a residual is like without the factors that were taken out, or with their new weights."""
+    unit = residual_unit(factors, account)
+    times = unit / account[tl.A_UNIT]
+    account[tl.A_UNIT] = unit
+    for each in (tl.P_WILDFIRE_THRESHOLD, tl.P_RELINEARIZE_THRESHOLD, tl.P_MAX_ERROR):
+        settings[each] *= times
+    for each in (tl.P_SAME_STEP_SHARE, tl.P_NEXT_STEP_SHARE):
+        settings[each] *= times * times
+
+
+@inline_kernel
+def reluctance(settings: F64, state: I64) -> float:
+    """The factor on both shares so soon after the last relinearization.  (9.19)"""
+    dear = settings[tl.P_COOLDOWN_FLOPS]
+    rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
+    return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(dear))

@@ -1,0 +1,133 @@
+"""What is wrong with the numbers of a new variable or factor.  Angles, quaternions and directions become normal.
+
+The numbers are those that stand behind the ones in use, in the arenas of the graph.
+"""
+
+import math
+
+from factorbus.solver.kernels.graph import group_table as gt
+from factorbus.solver.kernels.jit.compile import F64, inline_kernel, part
+from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.kernels.model.bounds import (
+    LEAST_INFORMATION,
+    MOST_INFORMATION,
+    MOST_LINEAR,
+    MOST_NUMBER,
+    are_within,
+)
+from factorbus.solver.kernels.model.kinds import direction_at, is_checked, is_linear, positive_at, quaternion_at
+from factorbus.solver.kernels.model.se2 import wrap
+from factorbus.solver.kernels.model.sizes import residual_dim, values_of_ends
+
+# A quaternion may be off unit length by what six printed digits leave, and more; beyond that it is another thing.
+_QUATERNION_TOLERANCE = 1e-3
+# A pivot of Ω below this share of its diagonal entry is rounding: the matrix is singular.
+_PIVOT_TOLERANCE = 1e-14
+
+
+@inline_kernel
+def check_value(kind: int, x: int, size: int, values: F64) -> int:
+    """What is wrong with the new value that starts at x; it is brought into its normal form."""
+    if not are_within(MOST_NUMBER, x, size, values):
+        return gt.OUT_OF_BOUNDS
+    if kind == at.SE2:
+        values[x + 2] = wrap(values[x + 2])
+    if kind == at.IDP:
+        values[x + 3] = wrap(values[x + 3])
+    if kind == at.SE3 and not make_unit(values, x + 3):
+        return gt.BAD_QUATERNION
+    return gt.GOOD
+
+
+@inline_kernel
+def check_factor(kind: int, p: int, size: int, triangle: int, payload: F64, scratch: F64) -> int:
+    """What is wrong with the new measurement that starts at p, or with its information."""
+    if not (are_within_kind(kind, p, size, payload) and are_within(MOST_INFORMATION, p + size, triangle, payload)):
+        return gt.OUT_OF_BOUNDS
+    if is_checked(kind):
+        wrong = check_measurement(kind, p, payload)
+        if wrong != gt.GOOD:
+            return wrong
+    dim = residual_dim(kind)
+    if not is_positive_definite(dim, payload, p + size, scratch):
+        return gt.NOT_POSITIVE_DEFINITE
+    c = p + size
+    for a in range(dim):
+        if payload[c] < LEAST_INFORMATION:
+            return gt.OUT_OF_BOUNDS
+        c += dim - a
+    return gt.GOOD
+
+
+@inline_kernel
+def are_within_kind(kind: int, p: int, size: int, payload: F64) -> bool:
+    """Whether the measurement that starts at p is within bounds; H and b of a linear factor are what R may hold."""
+    if not is_linear(kind):
+        return are_within(MOST_NUMBER, p, size, payload)
+    y = values_of_ends(kind)
+    return are_within(MOST_NUMBER, p, y, payload) and are_within(MOST_LINEAR, p + y, size - y, payload)
+
+
+@part
+def check_measurement(kind: int, p: int, payload: F64) -> int:
+    """What is wrong with a measurement whose numbers are within bounds; directions and quaternions become unit."""
+    n = positive_at(kind)
+    if n >= 0 and not payload[p + n] > 0.0:
+        return gt.BAD_RANGE
+    for e in range(2):
+        n = direction_at(kind, e)
+        if n >= 0 and not make_direction(payload, p + n):
+            return gt.BAD_DIRECTION
+        n = quaternion_at(kind, e)
+        if n >= 0 and not make_unit(payload, p + n):
+            return gt.BAD_QUATERNION
+    return gt.GOOD
+
+
+@inline_kernel
+def make_direction(v: F64, k: int) -> bool:
+    """Bring the vector at k to unit length, unless it is there to the last bit; False: it has none."""
+    n2 = v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2]
+    if not n2 > 1e-100:
+        return False
+    if abs(n2 - 1.0) > 4e-16:
+        scale = 1.0 / math.sqrt(n2)
+        for c in range(3):
+            v[k + c] *= scale
+    return True
+
+
+@inline_kernel
+def make_unit(q: F64, k: int) -> bool:
+    """Bring the quaternion at k to unit length, unless it is there to the last bit; False: it is none."""
+    n2 = q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3]
+    if not abs(n2 - 1.0) <= 2.0 * _QUATERNION_TOLERANCE:
+        return False
+    if abs(n2 - 1.0) > 4e-16:
+        scale = 1.0 / math.sqrt(n2)
+        for c in range(4):
+            q[k + c] *= scale
+    return True
+
+
+@inline_kernel
+def is_positive_definite(n: int, upper: F64, start: int, L: F64) -> bool:
+    """Whether the n × n symmetric matrix with this upper triangle (row by row from `start`) is positive definite: its
+    Cholesky factor, made in the (6, 6) scratch `L`, has pivots above rounding."""
+    k = start
+    for a in range(n):
+        for b in range(a, n):
+            L[b, a] = upper[k]
+            k += 1
+    for a in range(n):
+        diagonal = L[a, a]
+        for c in range(a):
+            L[a, a] -= L[a, c] * L[a, c]
+        if not (diagonal > 0.0 and L[a, a] > _PIVOT_TOLERANCE * diagonal):
+            return False
+        L[a, a] = math.sqrt(L[a, a])
+        for b in range(a + 1, n):
+            for c in range(a):
+                L[b, a] -= L[b, c] * L[a, c]
+            L[b, a] /= L[a, a]
+    return True

@@ -1,0 +1,119 @@
+"""A batch goes into the solver from where its columns lie as from arrays, and leaves no trace if it is refused."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from naive.random_graphs import camera_steps, random_steps
+
+from factorbus.proto import codec
+from factorbus.proto.kinds import LOSSES
+from factorbus.proto.limits import REQUEST_LIMITS
+from factorbus.proto.messages import Batch, Insert
+from factorbus.service.solving.arrival import try_parse
+from factorbus.solver import Solver, SolverError
+from factorbus.solver.graph.columns import Columns
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def arenas(solver: Solver) -> list[bytes]:
+    """All that is in use."""
+    graph = solver._graph
+    variables, factors, values, payload, columns, *_ = graph.counts.tolist()
+    return [
+        part.tobytes()
+        for part in (
+            graph.counts, graph.keys[:variables], graph.var[:variables], graph.dims[:columns], graph.values[:values],
+            graph.fac[:factors], graph.payload[:payload], np.flatnonzero(graph.table), graph.table[graph.table > 0],
+            graph.stamps[:variables],
+        )
+    ]  # fmt: skip
+
+
+def stage_both(quick: Solver, usual: Solver, batch: Batch) -> str:
+    """Stage in two solvers that are alike, once where it lies in a message; the code of the error, empty: it was taken.
+    They stay alike."""
+    message = codec.encode_insert(Insert(1, batch))
+    parsed = try_parse(message, REQUEST_LIMITS)
+    assert parsed is not None
+    before, came = arenas(quick), []
+    for solver, columns in ((quick, Columns(parsed[3].groups, message)), (usual, batch)):
+        try:
+            came.append(solver.stage(columns))
+        except SolverError as problem:
+            came.append((problem.code, str(problem)))
+    assert came[0] == came[1]
+    assert arenas(quick) == arenas(usual)
+    if isinstance(came[0], tuple):
+        assert arenas(quick) == before, "a trace is left"
+        return came[0][0]
+    return ""
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds)
+def test_columns_are_staged_where_they_lie_as_from_arrays(seed: int) -> None:
+    quick, usual = Solver(), Solver()
+    assert [stage_both(quick, usual, batch) for batch in random_steps(seed % 10_000, steps=12)] == [""] * 12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_cameras_see_and_losses_are_staged_where_they_lie(seed: int) -> None:
+    quick, usual = Solver(), Solver()
+    batches = [*camera_steps(seed), *(with_losses(batch) for batch in random_steps(seed, steps=6))]
+    for solvers in ((quick, usual), (Solver(), Solver())):
+        assert {stage_both(*solvers, batch) for batch in batches} <= {"", "duplicate_variable", "unknown_variable"}
+
+
+def with_losses(batch: Batch) -> Batch:
+    """Each group of factors with another loss."""
+    names = [*LOSSES, ""]
+    return batch._replace(
+        factors=tuple(
+            group._replace(loss=loss, scale=np.linspace(0.5, 3.0, len(group.keys)) if loss else None)
+            for group, loss in zip(batch.factors, names * len(batch.factors), strict=False)
+        )
+    )
+
+
+def damaged(batch: Batch, rng: np.random.Generator) -> Iterator[Batch]:
+    """The batch with something wrong in it, in many ways."""
+    for n, group in enumerate(batch.factors):
+        for bad in (np.nan, np.inf, 0.0, -1.0, 1e150):
+            measured, information = group.measured.copy(), group.information.copy()
+            measured.flat[rng.integers(measured.size)] = bad
+            information.flat[rng.integers(information.size)] = bad
+            ends = group.keys.copy()
+            ends.flat[rng.integers(ends.size)] = rng.choice([0, 7, *group.keys.flat])
+            for change in ({"measured": measured}, {"information": information}, {"keys": ends}):
+                yield batch._replace(factors=(*batch.factors[:n], group._replace(**change), *batch.factors[n + 1 :]))
+    for n, group in enumerate(batch.variables):
+        changes: list[dict[str, Any]] = [{"values": None}, {"keys": np.repeat(group.keys[:1], len(group.keys))}]
+        if group.values is not None:
+            for bad in (np.nan, -np.inf, 5.0):
+                values = group.values.copy()
+                values.flat[rng.integers(values.size)] = bad
+                changes.append({"values": values})
+        for change in changes:
+            yield batch._replace(variables=(*batch.variables[:n], group._replace(**change), *batch.variables[n + 1 :]))
+
+
+@settings(max_examples=8, deadline=None)
+@given(seeds)
+def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
+    *earlier, last = random_steps(seed % 10_000, steps=4)
+    quick, usual = Solver(), Solver()
+    for batch in earlier:
+        stage_both(quick, usual, batch)
+    held = quick._graph.mark()
+    codes = set()
+    for bad in damaged(last, np.random.default_rng(seed)):
+        codes.add(stage_both(quick, usual, bad))
+        for solver in (quick, usual):
+            solver._graph.forget(held)
+    assert len(codes) > 2
+    assert stage_both(quick, usual, last) == ""

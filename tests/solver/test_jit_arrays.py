@@ -1,0 +1,88 @@
+"""Arrays that compiled kernels are given, make and give back: none goes too soon, none is kept."""
+
+import sys
+
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+
+from factorbus.solver.kernels.jit import compile as _jit
+
+
+@_jit.part
+def larger(a, n):
+    """`a`, or a copy with room for n: what is given back may be what was given."""
+    if a.size >= n:
+        return a
+    b = np.zeros(n)
+    b[: a.size] = a
+    return b
+
+
+@_jit.part
+def first_row(rows):
+    return rows[0]
+
+
+@_jit.kernel("float64(float64[:,::1], int64)")
+def sum_of_first(rows, n):
+    """Of its own arrays none may go too soon, whoever has given them on."""
+    own = larger(first_row(rows).copy(), 0)
+    for k in range(n):
+        own = larger(first_row(np.ones((1, 1))) if k == 0 else own, k)
+    total = 0.0
+    for k in range(own.size):
+        total += own[k]
+    return total
+
+
+@_jit.kernel("Tuple((float64, float64[::1]))(float64[:,::1])")
+def last_row(rows):
+    return rows[0, 0], rows[len(rows) - 1]
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without compilation Python counts")
+def test_arrays_live_as_long_as_they_are_used():
+    rows = np.ones((2, 3))
+    sum_of_first(rows, 0)
+    before = sys.getrefcount(rows)
+    for n in (0, 5, 5000):
+        assert sum_of_first(rows, n) == (3.0 if n == 0 else 1.0)
+    assert sys.getrefcount(rows) == before
+    _, row = last_row(rows)
+    del rows
+    spoiled = [np.full((2, 3), 7.0) for _ in range(100)]
+    assert row.tolist() == [1.0, 1.0, 1.0]
+    assert len(spoiled) == 100
+    pair = np.ones((2, 3))
+    last_row(pair)
+    before = sys.getrefcount(pair)
+    for _ in range(10):
+        last_row(pair)
+    assert sys.getrefcount(pair) == before, "a row that is given back is counted, and let go again"
+
+
+@_jit.kernel("float64(float64[:,::1], int64[::1])")
+def first_of_chosen(rows, some):
+    """A choice of rows is a copy of them, and no call has made it."""
+    return rows[some][0, 0]
+
+
+@_jit.kernel("float64(float64[:,::1])")
+def first_of_sum(rows):
+    return (rows[0] + rows[1])[0]
+
+
+@pytest.mark.skipif(_jit.DISABLED, reason="without compilation Python counts")
+@pytest.mark.parametrize(("kernel", "more"), [(first_of_chosen, (np.ones(1, int),)), (first_of_sum, ())])
+def test_what_is_copied_in_passing_is_given_back(kernel, more):
+    rows = np.ones((2, 3))
+    assert kernel(rows, *more) == 1.0 + (not more)
+    _nrt_python.memsys_enable_stats()
+    before, references = rtsys.get_allocation_stats(), sys.getrefcount(rows)
+    for _ in range(10):
+        kernel(rows, *more)
+    after = rtsys.get_allocation_stats()
+    _nrt_python.memsys_disable_stats()
+    assert after.alloc - before.alloc == after.free - before.free > 0
+    assert sys.getrefcount(rows) == references
