@@ -59,7 +59,7 @@ def messages() -> dict[str, bytes]:
         changed.append(_variables(solver.changed()))
     variables, factors = solver.graph()
     graph = Graph(EPOCH, 3, Batch(_variables(variables), tuple(_factors(factors))))
-    chi2, optimum = solver.chi2(), codec.decode_optimum(jobs.do("batch", codec.encode_graph(graph)))
+    chi2, optimum = solver.chi2(), codec.decode_optimum(jobs.run_job("batch", codec.encode_graph(graph)))
     made = {
         "insert": codec.encode_insert(Insert(1, first(), epoch=EPOCH)),
         "insert_without_values": codec.encode_insert(Insert(2, second(), epoch=EPOCH)),
@@ -242,7 +242,7 @@ def _worse() -> dict[str, bytes]:
     solver.step(settle=True)
     variables, factors = solver.graph()
     graph = Graph(EPOCH, 1, Batch(_variables(variables), tuple(_factors(factors))))
-    optimum = codec.decode_optimum(jobs.do("batch", codec.encode_graph(graph)))
+    optimum = codec.decode_optimum(jobs.run_job("batch", codec.encode_graph(graph)))
     free = tuple(group for group in optimum.variables if not group.fixed)
     told = [_digits(number) for number in (solver.chi2(), optimum.chi2)]
     notice = BetterOptimum.or_none(told[0], told[1], optimum.start)

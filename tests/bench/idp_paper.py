@@ -42,13 +42,13 @@ def counted(n: int, existing: int = 0) -> dict[str, int]:
         "independent": independent.covariance(P, A, B, padd).multiplications,
         "minimal": minimal.covariance(P, sighting, seen).multiplications,
         "minimal-half": half_count(sighting, seen),
-        "factored": minimal.factored(sighting, seen).multiplications,
+        "factored": minimal.covariance_factors(sighting, seen).multiplications,
     }
 
 
 def half_count(sighting: Any, seen: Any) -> int:
     """Multiplications of the upper half."""
-    parts = minimal.Parts(sighting, seen)
+    parts = minimal.FeatureRows(sighting, seen)
     return parts.multiplications + parts.half(0, len(seen.y)).multiplications
 
 
@@ -62,7 +62,7 @@ def _table_1() -> list[dict[str, Any]]:
     A, B = idp.jacobians(sighting, idp.see(sighting))
     rows = []
     for k in range(3):
-        J, padded = classical.matrices(P, A[k], B[k], idp.padd(sighting))
+        J, padded = classical.step_matrices(P, A[k], B[k], idp.padd(sighting))
         P, count = classical.step(P, A[k], B[k], idp.padd(sighting))
         rows.append({"iteration": k + 1, "J": J.shape, "P": padded.shape, "Jt": J.T.shape, "multiplications": count})
     return rows

@@ -16,7 +16,7 @@ from naive.random_sightings import random_sighting
 
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
-from factorbus.idp.kernels.dense import product
+from factorbus.idp.kernels.dense import counted_product
 from factorbus.proto.arrays import F64
 from factorbus.proto.features import FEATURE, Sighting
 
@@ -63,7 +63,7 @@ def rows(features: int, existing: int = 0) -> list[dict[str, Any]]:
         c.row("independent", lambda: independent.covariance(c.P, c.A, c.B, c.padd, c.out).multiplications),
         c.row("minimal", lambda: minimal.covariance(c.P, c.sighting, c.seen, c.out).multiplications),
         c.row("minimal-half", lambda: half_count(c.sighting, c.seen)),
-        c.row("factored", lambda: minimal.factored(c.sighting, c.seen).multiplications),
+        c.row("factored", lambda: minimal.covariance_factors(c.sighting, c.seen).multiplications),
     ]
 
 
@@ -73,8 +73,8 @@ def factored(features: int) -> list[dict[str, Any]]:
     sighting, _ = random_sighting(1, features)
     c = replace(c, features=features, sighting=sighting, seen=idp.see(sighting))
     return [
-        c.row("factored", lambda: minimal.factored(sighting, c.seen).multiplications),
-        c.row("factored-from-pixels", lambda: minimal.factored(sighting, idp.see(sighting)).multiplications),
+        c.row("factored", lambda: minimal.covariance_factors(sighting, c.seen).multiplications),
+        c.row("factored-from-pixels", lambda: minimal.covariance_factors(sighting, idp.see(sighting)).multiplications),
     ]
 
 
@@ -90,13 +90,13 @@ def _classical(c: Case, blas: bool) -> dict[str, Any]:
     if c.features <= _WHOLE:
         return c.row(name, lambda: _all_steps(c, blas))
     state = np.random.default_rng(1).normal(size=(13 + FEATURE * (c.existing + _LAST_STEP),) * 2)
-    J, padded = classical.matrices(state, c.A[0], c.B[0], c.padd)
+    J, padded = classical.step_matrices(state, c.A[0], c.B[0], c.padd)
     left, after, Jt = np.empty(J.shape), np.empty((len(J), len(J))), np.ascontiguousarray(J.T)
     if blas:
         seconds, _ = _best(lambda: np.matmul(np.matmul(J, padded, out=left), Jt, out=after))
         count = J.size * len(padded) + left.size * len(J)
     else:
-        seconds, count = _best(lambda: product(J, padded, left) + product(left, Jt, after))
+        seconds, count = _best(lambda: counted_product(J, padded, left) + counted_product(left, Jt, after))
     sizes = [(len(c.P) + FEATURE * k + FEATURE, len(c.P) + FEATURE * k + 3) for k in range(c.features)]
     total = sum(a * b * b + a * a * b for a, b in sizes)
     row = {"features": c.features, "existing": c.existing, "method": name, "multiplications": total}
@@ -108,7 +108,7 @@ def _all_steps(c: Case, blas: bool) -> int:
         return classical.covariance(c.P, c.A, c.B, c.padd).multiplications
     P, count = c.P, 0
     for A_k, B_k in zip(c.A, c.B, strict=True):
-        J, padded = classical.matrices(P, A_k, B_k, c.padd)
+        J, padded = classical.step_matrices(P, A_k, B_k, c.padd)
         count += J.size * len(padded) + J.size * len(J)
         P = J @ padded @ J.T
     return count

@@ -86,7 +86,7 @@ def answer(job: Job, fault: str) -> bytes | Exception | None:
         return Refused("underconstrained", "x1 is free to move", {})
     if fault == "unreadable":
         return b"\xc1\xc1"
-    result = jobs.do(job.kind, job.payload)
+    result = jobs.run_job(job.kind, job.payload)
     if fault in OPTIMA:
         result = codec.encode_optimum(OPTIMA[fault](codec.decode_optimum(result)))
     if fault in SHARDS:

@@ -104,8 +104,7 @@ def test_a_common_error_is_found_out_by_looking_at_all_together() -> None:
 @pytest.mark.parametrize("kind", ["landmark_se2", "bearing_range_se2"])
 def test_sightings_are_told_apart_and_strangers_left_out(kind: str) -> None:
     solver, points = room(8.0, 0.05)
-    graph = solver._graph
-    x, y, t = graph.values[3:6]
+    x, y, t = next(values[0] for keys, values in ((g.keys, g.values) for g in solver.estimate()) if keys[0] == 1)
     turn = np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]])
     seen = (points[[5, 0, 3]] - [x, y]) @ turn.T
     seen = np.vstack([seen, [[40.0, 40.0]]])

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from naive.dense_covariances import DenseCovariance
 from naive.dense_least_squares import DenseGraph
 from naive.random_graphs import random_steps
-from naive.tree_records import tree_of
+from naive.solver_parts import fixed_in, graph_in, keys_in, kinds_in, linearization_points
 
 from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import FactorGroup, Group, Options, Solver, errors
@@ -17,8 +17,7 @@ from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.why import why_factor, why_variable
 from factorbus.solver.errors import UnknownFactor
 from factorbus.solver.graph.factors import FACTOR_KINDS
-from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
-from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.model.kinds import BOUNDED
 
 MODES = ("bayes-tree", "inc-l", "all-batch")
@@ -33,19 +32,14 @@ def solved(seed: int, mode: str, steps: int = 6) -> Solver:
     return solver
 
 
-def dense(solver: Solver, at_linearization: bool = True) -> DenseCovariance:
+def dense(solver: Solver) -> DenseCovariance:
     """The twin, linearized where the solver's R is."""
     graph = DenseGraph()
     variables, factors = solver.graph()
     graph.add(_Whole(variables, factors))
-    graph.kinds = dict.fromkeys(solver._graph.keys[: solver.variable_count].tolist(), "")  # in insertion order
-    for v, key in enumerate(graph.kinds):
-        kind = VARIABLE_KIND_OF_CODE[int(solver._graph.var[v, at.V_KIND])]
-        x = int(solver._graph.var[v, at.V_AT])
-        values = (
-            tree_of(solver).lin[0] if hasattr(solver._stepper, "tree") and at_linearization else solver._graph.values
-        )
-        graph.kinds[key], graph.values[key] = kind.name, values[x : x + kind.size].copy()
+    keys = keys_in(solver)
+    graph.kinds = dict(zip(keys, kinds_in(solver), strict=True))  # in insertion order
+    graph.values |= dict(zip(keys, linearization_points(solver), strict=True))
     return DenseCovariance(graph)
 
 
@@ -64,7 +58,7 @@ def close(found: np.ndarray, wanted: np.ndarray, tell: float = 1e-8) -> None:
 def test_blocks_are_those_of_the_dense_inverse(seed: int, mode: str) -> None:
     solver = solved(seed, mode)
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
-    keys = solver._graph.keys[: solver.variable_count].tolist()
+    keys = keys_in(solver)
     for v, found in enumerate(blocks.diagonal()):
         d = DIM[twin.graph.kinds[keys[v]]]
         close(found[:d, :d], twin.joint([keys[v]]), twin.tell)
@@ -140,10 +134,17 @@ def test_the_column_that_is_made_with_all_blocks(seed: int) -> None:
     for hub in every[:: max(1, len(every) // 4)]:
         blocks, here = CovarianceBlocks(solver.covariances.factored()), np.full(len(every), hub)
         np.testing.assert_array_equal(blocks.diagonal(int(hub)), diagonal)
-        wanted = alone._single_pairs(here, every)
+        wanted = np.stack([pair_by_itself(alone, int(hub), v) for v in every])
         scale = np.sqrt(np.abs(diagonal[hub]).max() * np.abs(diagonal).max()) + 1e-12
         np.testing.assert_allclose(blocks.pairs(here, every), wanted, rtol=0, atol=1e-10 * scale)
         np.testing.assert_allclose(blocks.pairs(every, here), wanted.transpose(0, 2, 1), rtol=0, atol=1e-10 * scale)
+
+
+def pair_by_itself(blocks: CovarianceBlocks, i: int, j: int) -> np.ndarray:
+    """(width, width): between two variables, in the upper left corner; cut out of what both are together."""
+    dims, out = blocks.factored.dims, np.zeros((blocks.width, blocks.width))
+    out[: dims[i], : dims[j]] = blocks.joint(np.array([i, j]))[: dims[i], dims[i] :]
+    return out
 
 
 def test_in_place_is_what_the_copy_says() -> None:
@@ -177,10 +178,10 @@ def test_a_copy_stays_as_it_is_while_the_map_goes_on() -> None:
 
 def test_making_r_anew_moves_nothing() -> None:
     solver = solved(5, "inc-l")
-    before = solver._graph.values[: solver._graph.counts[at.VALUES]].tobytes()
+    before = [group.values.tobytes() for group in solver.estimate()]
     copy = solver.covariances.factored()
-    assert solver._graph.values[: solver._graph.counts[at.VALUES]].tobytes() == before
-    assert copy.graph.values.tobytes() == before
+    assert [group.values.tobytes() for group in solver.estimate()] == before
+    assert [group.values.tobytes() for group in copy.graph.variables()] == before
 
 
 def candidates(solver: Solver, seed: int) -> list[FactorGroup]:
@@ -250,7 +251,7 @@ def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
     solver = solved(seed, "all-batch")
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     rng = np.random.default_rng(seed)
-    keys, kinds = solver._graph.keys[: solver.variable_count].tolist(), twin.graph.kinds
+    keys, kinds = keys_in(solver), twin.graph.kinds
     poses = [v for v, key in enumerate(keys) if kinds[key] in ("se2", "se3")]
     pairs = []
     for _ in range(6):
@@ -294,8 +295,7 @@ def test_relative_covariance_is_that_of_the_relative_value(seed: int) -> None:
 
 def test_relative_to_a_point_is_refused() -> None:
     solver = solved(2, "bayes-tree")
-    blocks, graph = CovarianceBlocks(solver.covariances.factored()), solver._graph
-    point = next(v for v in range(solver.variable_count) if graph.var[v, at.V_KIND] == at.POINT2)
+    blocks, point = CovarianceBlocks(solver.covariances.factored()), kinds_in(solver).index("point2")
     with pytest.raises(errors.KindMismatch):
         relative(blocks, np.array([point]), np.array([0]))
     with pytest.raises(errors.SelfLoop):
@@ -332,9 +332,9 @@ def test_why_a_variable(mode: str) -> None:
     twin, blocks = dense(solver), CovarianceBlocks(solver.covariances.factored())
     for v in range(solver.variable_count):
         account = why_variable(blocks, v, keeps_steps=mode == "bayes-tree")
-        assert account.fixed == (solver._graph.var[v, at.V_COLUMN] < 0)
+        assert account.fixed == fixed_in(solver)[v]
         assert [each.factor for each in account.factors] == sorted(each.factor for each in account.factors)
-        assert len(account.factors) == len(solver._graph.factors_of(v))
+        assert len(account.factors) == len(graph_in(solver).factors_of(v))
         if account.fixed:
             assert not account.sigmas.any()
             continue

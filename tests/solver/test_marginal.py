@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from naive.dense_least_squares import distance
+from naive.solver_parts import graph_in
 
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.symbols import symbol
@@ -72,7 +73,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 def covariance(solver: Solver, *names: int) -> np.ndarray:
     """The joint covariance of some poses."""
     blocks = CovarianceBlocks(solver.covariances.factored())
-    return blocks.joint(np.array([solver._graph.find(symbol("x", n)) for n in names]))
+    return blocks.joint(np.array([graph_in(solver).find(symbol("x", n)) for n in names]))
 
 
 @pytest.mark.parametrize("mode", ["bayes-tree", "inc-l", "all-batch"])
@@ -147,7 +148,7 @@ def test_a_window_over_a_long_drive_takes_constant_memory(poses: int) -> None:
             first += window
             sizes.append(solver.memory_bytes())
     assert solver.variable_count <= 2 * window + 1
-    assert solver._graph.next_id > poses
+    assert graph_in(solver).next_id > poses
     assert max(sizes[1:]) <= 1.2 * sizes[1], "it does not grow with the length of the drive"
     where = values(solver)[symbol("x", poses - 1)][1]
     assert np.hypot(*where[:2]) < 30.0, "the positions hold it, however long ago the first were"

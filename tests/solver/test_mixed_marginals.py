@@ -11,6 +11,7 @@ from naive.dense_factors import pose_matrix, pose_vector
 from naive.dense_least_squares import distance
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_others import other_steps
+from naive.solver_parts import graph_in
 
 from factorbus.pieces import MOST
 from factorbus.proto.messages import Batch, Change, Factors, Variables
@@ -46,7 +47,7 @@ def values(solver: Solver) -> dict[int, tuple[str, np.ndarray]]:
 
 
 def covariance(solver: Solver, keys: list[int]) -> np.ndarray:
-    return CovarianceBlocks(solver.covariances.factored()).joint(np.array([solver._graph.find(key) for key in keys]))
+    return CovarianceBlocks(solver.covariances.factored()).joint(np.array([graph_in(solver).find(key) for key in keys]))
 
 
 def without(solver: Solver, keys: list[int]) -> Solver:
@@ -181,7 +182,7 @@ class Window:
             del self.seen[tree]
         self.solver = with_changes(self.solver, [Change("marginalize", keys=np.array(gone))])[0]
         self.sizes.append(self.solver.memory_bytes())
-        self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(self.solver._graph)), 0)
+        self.widest = max(self.widest, *(len(joint.variables) for joint in find_joints(graph_in(self.solver))), 0)
 
 
 @pytest.mark.timeout(600)

@@ -22,7 +22,7 @@ def main() -> None:
     """Fork a service for every line, until there are no more."""
     logging.basicConfig(level=logging.INFO, format="%(process)d %(message)s")
     solver.warm()
-    idp.warm()
+    idp.warm_idp()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
     say("nursery")
     for line in sys.stdin:

@@ -16,14 +16,14 @@ from factorbus.proto.features_codec import encode_ask, encode_shard
 from factorbus.service.jobs.rates import example
 from factorbus.workers import jobs
 from factorbus.workers.app import work
-from factorbus.workers.config import Config
+from factorbus.workers.config import WorkerConfig
 
 
 def main() -> None:
     """Fork a worker for every line, until there are no more."""
-    idp.warm()
+    idp.warm_idp()
     for form in ("rows", "half", "factored"):
-        jobs.do("idp", encode_shard(Shard(encode_ask(example(form, 2)), 0, 2)))
+        jobs.run_job("idp", encode_shard(Shard(encode_ask(example(form, 2)), 0, 2)))
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
     print("ready", flush=True)
     for line in sys.stdin:
@@ -31,7 +31,7 @@ def main() -> None:
         pid = os.fork()
         if pid == 0:
             os.close(0)
-            config = Config((sys.argv[1],), name, slots=1, warm=False)
+            config = WorkerConfig((sys.argv[1],), name, slots=1, warm=False)
             work(config, lambda _: None, threading.Event())
             os._exit(0)
         print("born", name, pid, flush=True)

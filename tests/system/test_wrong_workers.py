@@ -118,7 +118,7 @@ def question() -> tuple[Sighting, bytes, np.ndarray]:
     sighting = random_sighting(31, N, 3)[0]
     seen = idp.see(sighting)
     rows = np.empty((6 * N, sighting.width + 6 * N))
-    minimal.Parts(sighting, seen).rows(0, N, rows)
+    minimal.FeatureRows(sighting, seen).rows(0, N, rows)
     return sighting, seen.y.tobytes(), rows
 
 

@@ -81,7 +81,7 @@ from naive.random_sightings import random_sighting
 from factorbus import idp
 from factorbus.idp import classical, independent, minimal
 from factorbus.idp.kernels import minimal as kernels
-from factorbus.idp.kernels.dense import product
+from factorbus.idp.kernels.dense import counted_product
 from factorbus.idp.kernels import independent as rows
 
 class Number:
@@ -106,23 +106,25 @@ sighting, P = random_sighting(9, n, 2)
 seen = idp.see(sighting)
 A, B = idp.jacobians(sighting, seen)
 padd = idp.padd(sighting)
-J, padded = classical.matrices(P, A[0], B[0], padd)
-check("classical", product(counting(J), counting(padded), room(*J.shape)))
+J, padded = classical.step_matrices(P, A[0], B[0], padd)
+check("classical", counted_product(counting(J), counting(padded), room(*J.shape)))
 At = A.transpose(2, 0, 1).reshape(13, -1)
 out = room(m + 6 * n, m + 6 * n)
 counts = np.zeros(rows.COUNTS, np.int64)
-given = [counting(array) for array in (P[:13], A, At, B, padd)]
-rows.independent(0, n, *given, room(6, m), room(12, 6), out, counts)
+rows.camera_blocks(0, n, counting(P[:13]), counting(A), out, counts)
+rows.feature_blocks(0, n, counting(At), out, counts)
+rows.add_own_blocks(0, n, counting(B), counting(padd), room(12, 6), out, counts)
 check("independent", counts.sum())
 U, S, V, W, own = room(6, m), room(3, 3), room(n, 6), room(n, 6), room(n, 3)
 turn, slope = counting(seen.turn), counting(seen.slope)
 x = sighting.state
 check("share", kernels.share(x, counting(P[:13]), U, S))
-check("spread", kernels.spread(0, turn, U, S, V, W))
+check("spread", kernels.feature_factors(0, turn, U, S, V, W))
 check("own", kernels.own_variances(slope, 1.5, own))
-check("rows", kernels.rows(0, n, turn, U, V, W, own, 1.0, room(6 * n, m + 6 * n)))
+factors = kernels.RowFactors(turn, U, V, W, own)
+check("rows", kernels.full_rows(factors, 0, n, 1.0, room(6 * n, m + 6 * n)))
 check("half", kernels.half_rows(
-    1, n, turn, U, V, W, own, 1.0, room(6 * (n - 1), m), room(36 * minimal.blocks_in(n, 1, n))))
+    factors, 1, n, 1.0, room(6 * (n - 1), m), room(36 * minimal.blocks_in(n, 1, n))))
 """
 
 
@@ -146,13 +148,13 @@ def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int,
     seen = idp.see(sighting)
     m = sighting.width
     whole = minimal.covariance(P, sighting, seen).P
-    parts = minimal.Parts(sighting, seen)
+    parts = minimal.FeatureRows(sighting, seen)
     cuts = sorted({0, n, *data.draw(st.lists(st.integers(0, n), max_size=4))})
     for first, last in pairwise(cuts):
         out = np.full((6 * (last - first), m + 6 * n), np.nan)
         parts.rows(first, last, out)
         assert out.tobytes() == whole[m + 6 * first : m + 6 * last].tobytes()
-        half = minimal.Parts(sighting, seen, first).half(first, last)
+        half = minimal.FeatureRows(sighting, seen, first).half(first, last)
         assert half.cross.tobytes() == np.ascontiguousarray(out[:, :m]).tobytes()
         at = 0
         for i in range(first, last):
@@ -161,8 +163,8 @@ def test_any_shards_have_the_bits_of_the_whole(seed: int, n: int, existing: int,
             at += 6 * width
             np.testing.assert_array_equal(block, out[6 * (i - first) : 6 * (i - first) + 6, m + 6 * i :])
         assert at == half.blocks.size
-        factored = minimal.factored(sighting, seen, first, last)
-        assert factored.own.tobytes() == minimal.factored(sighting, seen).own[first:last].tobytes()
+        factored = minimal.covariance_factors(sighting, seen, first, last)
+        assert factored.own.tobytes() == minimal.covariance_factors(sighting, seen).own[first:last].tobytes()
 
 
 @settings(max_examples=25)
@@ -181,7 +183,7 @@ def test_the_factored_form_has_o_of_n_numbers_and_gives_every_block() -> None:
     n, existing = 20, 4
     sighting, P = random_sighting(11, n, existing)
     seen = idp.see(sighting)
-    found = minimal.factored(sighting, seen)
+    found = minimal.covariance_factors(sighting, seen)
     numbers = sum(array.size for array in found[:4])
     assert numbers == 6 * sighting.width + 9 + 7 * n
     whole = minimal.covariance(P, sighting, seen).P

@@ -25,13 +25,13 @@ def sighting() -> Sighting:
 
 
 def done(ask: Ask, first: int = 0, last: int = N) -> ShardDone:
-    return decode_shard_done(jobs.do("idp", encode_shard(Shard(encode_ask(ask), first, last))))
+    return decode_shard_done(jobs.run_job("idp", encode_shard(Shard(encode_ask(ask), first, last))))
 
 
 def whole(sighting: Sighting) -> np.ndarray:
     """All new rows."""
     rows = np.empty((6 * N, M + 6 * N))
-    minimal.Parts(sighting, idp.see(sighting)).rows(0, N, rows)
+    minimal.FeatureRows(sighting, idp.see(sighting)).rows(0, N, rows)
     return rows
 
 
@@ -68,7 +68,7 @@ def test_rows_go_where_the_asker_wants_them() -> None:
     n = 70
     large = random_sighting(22, n)[0]
     expected = np.empty((6 * n, 13 + 6 * n))
-    minimal.Parts(large, idp.see(large)).rows(0, n, expected)
+    minimal.FeatureRows(large, idp.see(large)).rows(0, n, expected)
     for offset in (PAGE, PAGE + 8, 3 * PAGE - 8):
         with Memory(offset + new_rows_size(n, 13)) as memory:
             array = memory.array(offset, expected.shape)

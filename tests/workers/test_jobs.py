@@ -13,7 +13,7 @@ from factorbus.simulate import Spiral, sphere
 from factorbus.solver import SolverError
 from factorbus.solver.starts import descent
 from factorbus.workers import jobs
-from factorbus.workers.config import Config, checked
+from factorbus.workers.config import WorkerConfig, checked_worker_config
 
 INFORMATION = np.array([[100.0, 0, 0, 100, 0, 400]] * 3)
 
@@ -28,7 +28,7 @@ def triangle() -> Graph:
 
 
 def test_the_batch_job_finds_the_optimum() -> None:
-    optimum = codec.decode_optimum(jobs.do("batch", codec.encode_graph(triangle())))
+    optimum = codec.decode_optimum(jobs.run_job("batch", codec.encode_graph(triangle())))
     # Three springs of one stiffness share the gap of 0.3 evenly: χ² = 3 · 100 · 0.1².
     assert optimum.chi2 == pytest.approx(3.0, rel=1e-9)
     places = {int(k): row for g in optimum.variables for k, row in zip(g.keys, g.values, strict=True)}  # type: ignore[arg-type]
@@ -38,17 +38,17 @@ def test_the_batch_job_finds_the_optimum() -> None:
 def test_the_service_in_place_finds_the_same_bits() -> None:
     payload = codec.encode_graph(triangle())
     done = do_in_place(Job("j", "batch", payload))
-    assert done.payload == jobs.do("batch", payload)
+    assert done.payload == jobs.run_job("batch", payload)
 
 
 def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Much noise of rotation and few loops: some 800 iterations, where 500 tries are made."""
     world = sphere(200, 1, spiral=Spiral(20, 20), sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
     payload = codec.encode_graph(Graph(1, 1, merged(step.batch for step in world)))
-    early = codec.decode_optimum(jobs.do("batch", payload))
+    early = codec.decode_optimum(jobs.run_job("batch", payload))
     assert not early.converged
     monkeypatch.setattr(descent, "_MOST", 5000)
-    whole = codec.decode_optimum(jobs.do("batch", payload))
+    whole = codec.decode_optimum(jobs.run_job("batch", payload))
     assert whole.converged
     assert early.chi2 > 1.0001 * whole.chi2
 
@@ -57,11 +57,11 @@ def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.
     """By a worker and in place; here after a single try of each start."""
     drive, loop = in_one(60, 90.0), closing(60)
     payload = codec.encode_graph(Graph(1, 1, Batch(drive.variables, drive.factors + loop.factors)))
-    whole = codec.decode_optimum(jobs.do("batch", payload))
+    whole = codec.decode_optimum(jobs.run_job("batch", payload))
     assert whole.converged
     monkeypatch.setattr(descent, "_CHUNK", 1)
     monkeypatch.setattr(descent, "_MOST", 1)
-    early = jobs.do("batch", payload)
+    early = jobs.run_job("batch", payload)
     found = codec.decode_optimum(early)
     assert not found.converged
     assert found.chi2 > 1.0001 * whole.chi2
@@ -76,11 +76,11 @@ def test_what_cannot_be_done_has_a_code() -> None:
         ("batch", codec.encode_graph(loose), "underconstrained"),
     ):
         with pytest.raises((Problem, SolverError)) as refused:
-            jobs.do(kind, payload)
+            jobs.run_job(kind, payload)
         assert refused.value.code == code  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("config", [Config(connect=()), Config(slots=0), Config(name="a/b")])
-def test_a_configuration_that_cannot_work_is_refused(config: Config) -> None:
+@pytest.mark.parametrize("config", [WorkerConfig(connect=()), WorkerConfig(slots=0), WorkerConfig(name="a/b")])
+def test_a_configuration_that_cannot_work_is_refused(config: WorkerConfig) -> None:
     with pytest.raises(Problem):
-        checked(config)
+        checked_worker_config(config)

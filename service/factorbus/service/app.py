@@ -41,7 +41,7 @@ from factorbus.service.bus.zenoh_session import (
 )
 from factorbus.service.config import BadConfig, Config, checked_config
 from factorbus.service.core.events import ArrivedQuestion, Asker, Refuse
-from factorbus.service.jobs.features import FeatureQuestions
+from factorbus.service.jobs.features import FeatureLimits, FeatureQuestions
 from factorbus.service.jobs.optima import Optima
 from factorbus.service.jobs.running import Jobs
 from factorbus.service.jobs.worker_latency import WorkerLatency
@@ -146,9 +146,15 @@ class Shell:
         limits, deadline_s = config.limits, config.job_deadline_s
         self._optima = Optima(self._jobs, self._delivery.answer, self._delivery.refuse, deadline_s, limits.jobs)
         self._features = FeatureQuestions(
-            self._control, self._jobs, self._latencies, reply, refuse, self._decoding, limits.jobs, deadline_s,
-            Room(self.health_report.memory, limits.answer_bytes),
-        )  # fmt: skip
+            self._control,
+            self._jobs,
+            self._latencies,
+            reply,
+            refuse,
+            FeatureLimits(
+                self._decoding, limits.jobs, deadline_s, Room(self.health_report.memory, limits.answer_bytes)
+            ),
+        )
         if config.warm:
             rates = self._features.measure()
             log.info(

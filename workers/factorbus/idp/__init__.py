@@ -11,7 +11,7 @@
 Every covariance comes with the number of multiplications that made it, counted where they are made.
 """
 
-from factorbus.idp.sight import Seen, jacobians, padd, see
-from factorbus.idp.warm import warm
+from factorbus.idp.new_features import Seen, jacobians, padd, see
+from factorbus.idp.warm import warm_idp
 
-__all__ = ["Seen", "jacobians", "padd", "see", "warm"]
+__all__ = ["Seen", "jacobians", "padd", "see", "warm_idp"]

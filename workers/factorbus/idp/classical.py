@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorbus.idp.kernels.compile import F64
-from factorbus.idp.kernels.dense import product
+from factorbus.idp.kernels.dense import counted_product
 from factorbus.proto.features import CAMERA_STATE, FEATURE
 
 
@@ -31,14 +31,14 @@ def covariance(P: F64, A: F64, B: F64, padd: F64) -> Counted:
 
 def step(P: F64, A_k: F64, B_k: F64, padd: F64) -> Counted:
     """P ← J blkdiag(P, Padd) Jᵀ with J = [ I 0 ; A 0 B ]: one feature."""
-    J, padded = matrices(P, A_k, B_k, padd)
+    J, padded = step_matrices(P, A_k, B_k, padd)
     left, after = np.empty(J.shape), np.empty((len(J), len(J)))
-    count = product(J, padded, left)
-    count += product(left, np.ascontiguousarray(J.T), after)
+    count = counted_product(J, padded, left)
+    count += counted_product(left, np.ascontiguousarray(J.T), after)
     return Counted(after, count)
 
 
-def matrices(P: F64, A_k: F64, B_k: F64, padd: F64) -> tuple[F64, F64]:
+def step_matrices(P: F64, A_k: F64, B_k: F64, padd: F64) -> tuple[F64, F64]:
     """J (m + 6, m + 3) and blkdiag(P, Padd) (m + 3, m + 3)."""
     m = len(P)
     J = np.zeros((m + FEATURE, m + 3))

@@ -4,7 +4,7 @@ import numpy as np
 
 from factorbus.idp.classical import Counted
 from factorbus.idp.kernels.compile import F64, I64
-from factorbus.idp.kernels.independent import COUNTS, independent
+from factorbus.idp.kernels.independent import COUNTS, add_own_blocks, camera_blocks, feature_blocks
 from factorbus.proto.features import CAMERA_STATE, FEATURE
 
 
@@ -29,5 +29,6 @@ def some_rows(first: int, last: int, before: F64, A: F64, B: F64, padd: F64, out
     out  counts (5,): multiplications are added, by part (`kernels/independent.py`)
     """
     At = np.ascontiguousarray(A.transpose(2, 0, 1).reshape(CAMERA_STATE, -1))
-    left, own = np.empty((FEATURE, before.shape[1])), np.empty((2 * FEATURE, FEATURE))
-    independent(first, last, before, A, At, B, padd, left, own, out, counts)
+    camera_blocks(first, last, before, A, out, counts)
+    feature_blocks(first, last, At, out, counts)
+    add_own_blocks(first, last, B, padd, np.empty((2 * FEATURE, FEATURE)), out, counts)

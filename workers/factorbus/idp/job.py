@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from factorbus.idp.minimal import Parts, factored
-from factorbus.idp.sight import Seen, see
+from factorbus.idp.minimal import FeatureRows, covariance_factors
+from factorbus.idp.new_features import Seen, see
 from factorbus.proto import segments
 from factorbus.proto.features import FEATURE, Ask, Segment, Shard, ShardDone, answer_size, new_rows_size
 from factorbus.proto.features_codec import decode_ask, decode_shard, encode_shard_done
@@ -30,10 +30,10 @@ def done(shard: Shard, ask: Ask) -> ShardDone:
     seen = see(ask.sighting)
     y = seen.y[first:last]
     if ask.form == "factored":
-        found = factored(ask.sighting, seen, first, last)
+        found = covariance_factors(ask.sighting, seen, first, last)
         return ShardDone(first, last, y, turn=found.turn, own=found.own, U=found.U, S=found.S)
     if ask.form == "half":
-        half = Parts(ask.sighting, seen, first).half(first, last)
+        half = FeatureRows(ask.sighting, seen, first).half(first, last)
         return ShardDone(first, last, y, cross=half.cross, blocks=half.blocks)
     if ask.segment is not None and _stored(shard, ask, ask.segment, seen):
         return ShardDone(first, last, y, stored=True)
@@ -48,7 +48,7 @@ def _stored(shard: Shard, ask: Ask, segment: Segment, seen: Seen) -> bool:
     out = segments.try_array(segment, new_rows_size(n, m), start, (rows, width)) if rows else None
     if out is None:
         return False
-    Parts(ask.sighting, seen).rows(shard.first, shard.last, out)
+    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, out)
     return True
 
 
@@ -57,5 +57,5 @@ def _rows(shard: Shard, ask: Ask, seen: Seen) -> np.ndarray:
     if (size := new_rows_size(n, m)) > ANSWER_LIMITS.max_bytes:
         raise TooLarge("the answer, which cannot go to shared memory,", size, ANSWER_LIMITS.max_bytes, "bytes")
     rows = np.empty((FEATURE * (shard.last - shard.first), m + FEATURE * n))
-    Parts(ask.sighting, seen).rows(shard.first, shard.last, rows)
+    FeatureRows(ask.sighting, seen).rows(shard.first, shard.last, rows)
     return rows

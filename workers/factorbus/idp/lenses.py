@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import pixels as kernels
+from factorbus.idp.kernels.camera import CameraModel
 from factorbus.idp.kernels.compile import F64, I64
 from factorbus.proto.camera import Camera
 from factorbus.solver.lenses.limits import limit_of
@@ -24,7 +25,7 @@ def rays(camera: Camera, pixels: F64) -> Mapped:
     """Rays (x right, y down, z forward; any length) of distorted pixels (n, 2), with ∂ray/∂(u, v).  MATH §2"""
     n = len(pixels)
     mapped = Mapped(np.empty((n, 3)), np.empty((n, 3, 2)), np.empty(n, np.int64))
-    kernels.rays_of(*lens_of(camera), np.array(pixels, np.float64, order="C"), *mapped)
+    kernels.unproject_pixels(camera_model(camera), np.array(pixels, np.float64, order="C"), *mapped)
     return mapped
 
 
@@ -32,15 +33,14 @@ def pixels(camera: Camera, rays: F64) -> Mapped:
     """Distorted pixels of rays (n, 3), with ∂(u, v)/∂ray.  MATH §2"""
     n = len(rays)
     mapped = Mapped(np.empty((n, 2)), np.empty((n, 2, 3)), np.empty(n, np.int64))
-    size = float(camera.width), float(camera.height)
-    kernels.project_rays(*lens_of(camera), *size, np.array(rays, np.float64, order="C"), *mapped)
+    kernels.project_rays(camera_model(camera), np.array(rays, np.float64, order="C"), *mapped)
     return mapped
 
 
 @lru_cache(maxsize=64)
-def lens_of(camera: Camera) -> tuple[int, F64]:
-    """(code, numbers) of a camera's lens, as `factorbus.solver.lenses.layout` has them; the same array each time."""
+def camera_model(camera: Camera) -> CameraModel:
+    """A camera as the kernels have it; the same array each time."""
     lens = np.array(camera.lens())
     code, lens = int(lens[0]), lens[1:].copy()
     lens[at.LIMIT] = limit_of(code, lens[at.MORE :].tolist())
-    return code, lens
+    return CameraModel(code, lens, float(camera.width), float(camera.height))

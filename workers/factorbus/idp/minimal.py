@@ -7,7 +7,7 @@ import numpy as np
 from factorbus.idp.classical import Counted
 from factorbus.idp.kernels import minimal as kernels
 from factorbus.idp.kernels.compile import F64
-from factorbus.idp.sight import Seen, contiguous
+from factorbus.idp.new_features import Seen, contiguous
 from factorbus.proto.features import FEATURE, Sighting
 
 
@@ -23,7 +23,7 @@ class Half(NamedTuple):
     multiplications: int
 
 
-class Factored(NamedTuple):
+class CovarianceFactors(NamedTuple):
     """Numbers from which any block can be formed: six rows that all features share, and seven numbers a feature.
 
     U (6, m), S (3, 3) of (5.4).  turn (n, 4).  own (n, 3): σ² M Mᵀ: θθ, θφ, φφ (radians²).
@@ -45,13 +45,13 @@ def covariance(P: F64, sighting: Sighting, seen: Seen, out: F64 | None = None) -
     m, n = len(P), len(seen.y)
     after = np.empty((m + FEATURE * n, m + FEATURE * n)) if out is None else out
     after[:m, :m] = P
-    parts = Parts(sighting, seen)
-    count = parts.multiplications + parts.rows(0, n, after[m:])
+    new = FeatureRows(sighting, seen)
+    count = new.multiplications + new.rows(0, n, after[m:])
     kernels.mirror(m, after)
     return Counted(after, count)
 
 
-class Parts:
+class FeatureRows:
     """What the new rows are made of: O(m + n) numbers, from which any rows can be had.
 
     first: rows of features before this one are not asked for, nor, by the upper half, blocks with them.
@@ -60,11 +60,12 @@ class Parts:
 
     def __init__(self, sighting: Sighting, seen: Seen, first: int = 0) -> None:
         n = len(seen.y)
-        self._turn, self._variance = seen.turn, sighting.sigma_rho * sighting.sigma_rho
-        self._U, S, count = _shared(sighting)
-        self._V, self._W, self._own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
-        count += kernels.spread(first, seen.turn, self._U, S, self._V, self._W)
-        count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, self._own[first:])
+        self._variance = sighting.sigma_rho * sighting.sigma_rho
+        U, S, count = _shared(sighting)
+        V, W, own = np.empty((n, 6)), np.empty((n, 6)), np.empty((n, 3))
+        count += kernels.feature_factors(first, seen.turn, U, S, V, W)
+        count += kernels.own_variances(seen.slope[first:], sighting.sigma_pixel, own[first:])
+        self._factors = kernels.RowFactors(seen.turn, U, V, W, own)
         self.multiplications = count
 
     def rows(self, first: int, last: int, out: F64) -> int:
@@ -73,27 +74,23 @@ class Parts:
         Gives the number of multiplications.  Needs all parts.  The bits of a row do not depend on which rows are asked
         for with it.
         """
-        return kernels.rows(
-            first, last, self._turn, self._U, self._V, self._W, self._own, self._variance, out
-        )  # fmt: skip
+        return kernels.full_rows(self._factors, first, last, self._variance, out)
 
     def half(self, first: int, last: int) -> Half:
         """The upper half of the rows of features first .. last−1, with the bits of `rows`."""
-        cross = np.empty((FEATURE * (last - first), self._U.shape[1]))
-        blocks = np.empty(blocks_in(len(self._turn), first, last) * FEATURE * FEATURE)
-        count = kernels.half_rows(
-            first, last, self._turn, self._U, self._V, self._W, self._own, self._variance, cross, blocks
-        )
+        cross = np.empty((FEATURE * (last - first), self._factors.U.shape[1]))
+        blocks = np.empty(blocks_in(len(self._factors.turn), first, last) * FEATURE * FEATURE)
+        count = kernels.half_rows(self._factors, first, last, self._variance, cross, blocks)
         return Half(cross, blocks, count)
 
 
-def factored(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = None) -> Factored:
+def covariance_factors(sighting: Sighting, seen: Seen, first: int = 0, last: int | None = None) -> CovarianceFactors:
     """The factors, of features first .. last−1: O(m + n) numbers and multiplications.  MATH §5.4"""
     chosen = Seen(*(array[first:last] for array in seen))
     U, S, count = _shared(sighting)
     own = np.empty((len(chosen.y), 3))
     count += kernels.own_variances(chosen.slope, sighting.sigma_pixel, own)
-    return Factored(U, S, chosen.turn, own, count)
+    return CovarianceFactors(U, S, chosen.turn, own, count)
 
 
 def blocks_in(n: int, first: int, last: int) -> int:

@@ -7,8 +7,8 @@ import numpy as np
 from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import pixels as kernels
 from factorbus.idp.kernels.compile import F64, I64
-from factorbus.idp.lenses import lens_of
-from factorbus.idp.sight import contiguous
+from factorbus.idp.lenses import camera_model
+from factorbus.idp.new_features import contiguous
 from factorbus.proto.camera import Camera
 from factorbus.proto.features import CAMERA_STATE, FEATURE
 from factorbus.proto.problems import BadShape
@@ -50,15 +50,17 @@ class Points(NamedTuple):
 def predict(camera: Camera, state: F64, y: F64) -> Predicted:
     """Pixels of the features y (n, 6) from camera state (13,).  Raises BadShape."""
     _check(state, y)
-    code, lens = lens_of(camera)
     n = len(y)
     seen = Predicted(np.empty((n, 2)), np.empty((n, 2, CAMERA_STATE)), np.empty((n, 2, FEATURE)), np.empty(n, np.int64))
-    kernels.observe(code, lens, float(camera.width), float(camera.height), contiguous(state), contiguous(y), *seen)
+    kernels.observe(camera_model(camera), contiguous(state), contiguous(y), *seen)
     return seen
 
 
 def to_points(state: F64, y: F64, covariance: F64) -> Points:
-    """The features y (n, 6) with covariance (n, 6, 6) as points, judged from camera state (13,).  Raises BadShape."""
+    """The features y (n, 6) with covariance (n, 6, 6) as points, with their linearity from camera state (13,).
+
+    Raises BadShape.
+    """
     _check(state, y)
     n = len(y)
     if covariance.shape != (n, FEATURE, FEATURE):

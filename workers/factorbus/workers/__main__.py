@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from factorbus.ownership import UnsafeFolder
 from factorbus.proto.problems import Problem
-from factorbus.workers.config import Config, checked
+from factorbus.workers.config import WorkerConfig, checked_worker_config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,9 +39,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _config(options: argparse.Namespace) -> Config:
-    connect = tuple(options.connect) if options.connect else Config().connect
-    return checked(Config(connect, options.name, options.slots, options.zenoh, not options.no_warm))
+def _config(options: argparse.Namespace) -> WorkerConfig:
+    connect = tuple(options.connect) if options.connect else WorkerConfig().connect
+    return checked_worker_config(WorkerConfig(connect, options.name, options.slots, options.zenoh, not options.no_warm))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
 from factorbus.workers import jobs
-from factorbus.workers.config import BadConfig, Config, checked
+from factorbus.workers.config import BadWorkerConfig, WorkerConfig, checked_worker_config
 from factorbus.workers.heap import keep_freed_memory
 
 log = logging.getLogger(__name__)
@@ -34,19 +34,19 @@ _WAITING_PER_SLOT = 16
 _LOOK_S = 0.5
 
 
-def work(config: Config, on_ready: Callable[[str], None], stop: threading.Event) -> None:
+def work(config: WorkerConfig, on_ready: Callable[[str], None], stop: threading.Event) -> None:
     """Take jobs until `stop` is set, then finish those begun and return.  Waits for the bus as long as it takes.
 
-    `on_ready` gets the worker's name once it can be found.  Raises BadConfig, BadName.
+    `on_ready` gets the worker's name once it can be found.  Raises BadWorkerConfig, BadName.
     """
-    checked(config)
+    checked_worker_config(config)
     keep_freed_memory()
     from factorbus.solver import compile_seconds, warm, why_stock_numba
 
     if why := why_stock_numba():
         log.warning("kernels are compiled by Numba as it is, which takes longer, and take longer themselves: %s", why)
     if config.warm:
-        from factorbus.idp import warm as warm_idp
+        from factorbus.idp import warm_idp
 
         seconds = sum(make(lambda name: _announce(name, compile_seconds())) for make in (warm, warm_idp))
         log.info("kernels ready after %.1f s", seconds)
@@ -66,7 +66,7 @@ def _announce(kernels: str, compiled_s: float) -> None:
         log.info("compiling kernels: %s", kernels)
 
 
-def _open(config: Config, stop: threading.Event) -> zenoh.Session | None:
+def _open(config: WorkerConfig, stop: threading.Event) -> zenoh.Session | None:
     """A session, or None when `stop` was set before there was one."""
     settings = _settings(config)
     pause = _FIRST_PAUSE_S
@@ -80,7 +80,7 @@ def _open(config: Config, stop: threading.Event) -> zenoh.Session | None:
     return None
 
 
-def _settings(config: Config) -> zenoh.Config:
+def _settings(config: WorkerConfig) -> zenoh.Config:
     paths: dict[str, Any] = {
         "mode": "client",
         "connect/endpoints": list(config.connect),
@@ -98,7 +98,7 @@ def _settings(config: Config) -> zenoh.Config:
     except zenoh.ZError as error:
         # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
-        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
+        raise BadWorkerConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
     return settings
 
 
@@ -149,7 +149,7 @@ def _do(query: zenoh.Query) -> None:
     started = time.perf_counter()
     try:
         job = codec.decode_job(query.payload.to_bytes() if query.payload is not None else b"")
-        result = jobs.do(job.kind, job.payload)
+        result = jobs.run_job(job.kind, job.payload)
     except (Problem, SolverError) as problem:
         _refuse(query, problem)
     except Exception:

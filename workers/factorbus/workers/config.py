@@ -9,14 +9,14 @@ from factorbus.proto.problems import Problem
 from factorbus.wording import counted
 
 
-class BadConfig(Problem):
+class BadWorkerConfig(Problem):
     """A setting that cannot have the value it was given."""
 
     code = "bad_config"
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class WorkerConfig:
     """How a worker is on the bus.
 
     connect: the service, or a router.  name: in its keys; empty: made up.  slots: jobs at a time, each on a thread
@@ -30,14 +30,14 @@ class Config:
     warm: bool = True  # compile every kernel before taking the first job
 
 
-def checked(config: Config) -> Config:
-    """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
+def checked_worker_config(config: WorkerConfig) -> WorkerConfig:
+    """`config`, if it can work.  Raises BadWorkerConfig, BadEndpoint, BadName."""
     if not config.connect:
-        raise BadConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
+        raise BadWorkerConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
     for endpoint in config.connect:
         checked_endpoint(endpoint)
     if not 1 <= config.slots <= 1024:
-        raise BadConfig(
+        raise BadWorkerConfig(
             f"slots is {config.slots}; wanted 1 to 1024 (this machine has {counted(os.cpu_count() or 1, 'core')})"
         )
     if config.name:

@@ -12,7 +12,7 @@ from factorbus.proto.messages import Optimum, Variables
 from factorbus.proto.problems import UnknownKind
 
 
-def do(kind: str, payload: bytes) -> bytes:
+def run_job(kind: str, payload: bytes) -> bytes:
     """The result of a job of `kind`.  Raises Problem, SolverError."""
     job = JOBS.get(kind)
     if job is None:

@@ -36,7 +36,7 @@ def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...
     require("service", "factorbus work")
     from factorbus.cli.process.stopping import stop_on_signals
     from factorbus.workers.app import work
-    from factorbus.workers.config import Config
+    from factorbus.workers.config import WorkerConfig
 
     begin_logging(log_form, quiet)
     manager = Notifier()
@@ -45,6 +45,6 @@ def command(until_eof: bool, quiet: bool, log_form: str, connect: tuple[str, ...
         click.echo(READY + name)
         manager.ready(f"worker {name} takes jobs")
 
-    config = Config(connect=connect or (DEFAULT_ENDPOINT,), **given)
+    config = WorkerConfig(connect=connect or (DEFAULT_ENDPOINT,), **given)
     with stop_on_signals(until_eof, manager.stopping) as stop:
         work(config, on_ready, stop)

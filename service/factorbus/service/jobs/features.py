@@ -56,6 +56,19 @@ class _Cutting:
     rates: Rates
 
 
+@dataclass(frozen=True, slots=True)
+class FeatureLimits:
+    """What a question for features may come to.
+
+    messages: of one message   open: questions at a time   deadline_s: of a shard, at most   room: for answers
+    """
+
+    messages: MessageLimits
+    open: int
+    deadline_s: float
+    room: Room = _UNBOUNDED
+
+
 class FeatureQuestions:
     """The questions for features of one service.  Thread-safe: what is called from outside only hands over."""
 
@@ -66,14 +79,10 @@ class FeatureQuestions:
         latencies: WorkerLatency,
         reply: Callable[[Asker, bytes], None],
         refuse: Callable[[Asker, Any], None],
-        limits: MessageLimits,
-        most: int,
-        deadline_s: float,
-        room: Room = _UNBOUNDED,
+        limits: FeatureLimits,
     ) -> None:
         self._control, self._jobs, self._latencies = control, jobs, latencies
-        self._reply, self._refuse = reply, refuse
-        self._limits, self._most, self._deadline_s, self._room = limits, most, deadline_s, room
+        self._reply, self._refuse, self._limits = reply, refuse, limits
         self._rates: Rates | None = None
         self._open = 0  # on the control thread
         self._stopping = False
@@ -86,7 +95,7 @@ class FeatureQuestions:
 
     def ask(self, asker: Asker, payload: bytes) -> None:
         """A question came in."""
-        if (waiting := self._executor.waiting) >= self._most:
+        if (waiting := self._executor.waiting) >= self._limits.open:
             self._refuse(asker, Busy(waiting, 0.05))
         else:
             self._executor.hand(self._take, asker, payload)
@@ -108,7 +117,7 @@ class FeatureQuestions:
         try:
             if self._stopping:
                 raise ShuttingDown
-            ask = decode_ask(payload, self._limits)
+            ask = decode_ask(payload, self._limits.messages)
             self._check(ask)
             work, rates = work_of(ask), self._rates or self.measure()
             count = shards_for(work, rates, self._latencies.known, self._jobs.slots("idp"))
@@ -126,9 +135,9 @@ class FeatureQuestions:
 
     def _check(self, ask: Ask) -> None:
         """Is there room for the answer?  Raises TooLarge, OutOfMemory."""
-        size = answer_size(ask)
-        self._room.fits("the answer", size)
-        self._room.check(COPIES * size)
+        size, room = answer_size(ask), self._limits.room
+        room.fits("the answer", size)
+        room.check(COPIES * size)
 
     def _here(self, asker: Asker, payload: bytes, count: int) -> None:
         done = do_here(Job("in-place", "idp", encode_shard(Shard(payload, 0, count))))
@@ -143,13 +152,13 @@ class FeatureQuestions:
     # ---- on the control thread --------------------------------------------------------------------------------------
 
     def _submit(self, asker: Asker, cutting: _Cutting) -> None:
-        if self._open >= self._most:
+        if self._open >= self._limits.open:
             self._refuse(asker, Busy(self._open, 0.05))
             return
         self._open += 1
         # Into no more shards than are begun at once: a shard that waits only repeats what every shard does.
         count = min(cutting.most, max(1, self._jobs.free("idp")))
-        deadline_s = min(self._deadline_s, _BESIDES_S + _PATIENCE * seconds(cutting.work, cutting.rates, count))
+        deadline_s = min(self._limits.deadline_s, _BESIDES_S + _PATIENCE * seconds(cutting.work, cutting.rates, count))
         shards = [Shard(cutting.payload, first, last) for first, last in cuts(cutting.ask, count)]
         question = _Question(asker, [None] * len(shards))
         for place, shard in enumerate(shards):

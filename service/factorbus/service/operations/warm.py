@@ -20,7 +20,7 @@ from pathlib import Path
 
 from factorbus import solver
 from factorbus.idp import kernels as idp_kernels
-from factorbus.idp import warm as warm_idp
+from factorbus.idp import warm_idp
 from factorbus.service import kernels
 from factorbus.service.operations.compile_split import CompileSplit, functions_of
 from factorbus.service.process.memory import available

@@ -62,7 +62,7 @@ def viewed_square_root(graph: Graph, tree: CliqueTree) -> SquareRoot:
     """The same in place, until the next step: for what goes up from a few variables."""
     var = graph.var[: graph.counts[at.VARIABLES]]
     scalar = np.ascontiguousarray(var[:, at.V_SCALAR])
-    return SquareRoot(graph, tree, tangent_dims(var), scalar, np.empty(0, np.int64), int(tree.state[tl.S_STAMP]))
+    return SquareRoot(graph, tree, variable_dims(var), scalar, np.empty(0, np.int64), int(tree.state[tl.S_STAMP]))
 
 
 def computed_square_root(graph: Graph) -> SquareRoot:
@@ -79,7 +79,7 @@ def computed_square_root(graph: Graph) -> SquareRoot:
     return _copied(copy, tree)
 
 
-def tangent_dims(var: I64) -> I64:
+def variable_dims(var: I64) -> I64:
     """The dimension of the tangent space of every variable in `var`."""
     return DIMS[var[:, at.V_KIND]]
 
@@ -93,4 +93,4 @@ def _copied(graph: Graph, tree: CliqueTree) -> SquareRoot:
     copy_rows(order, clique, tree.numbers, numbers)
     scalar = np.ascontiguousarray(graph.var[:count, at.V_SCALAR])
     rows = CliqueRows(node, clique, tree.lists[: state[tl.S_LISTS]].copy(), numbers)
-    return SquareRoot(graph, rows, tangent_dims(graph.var[:count]), scalar, order, int(state[tl.S_STAMP]))
+    return SquareRoot(graph, rows, variable_dims(graph.var[:count]), scalar, order, int(state[tl.S_STAMP]))

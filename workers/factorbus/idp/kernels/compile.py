@@ -6,10 +6,10 @@ last bits would depend on where a loop was cut; without, only on the numbers.
 
 from pathlib import Path
 
-from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, KernelFolder
+from factorbus.solver.kernels.jit.compile import DISABLED, F64, I64, KernelFolder, types
 from factorbus.solver.lenses.compile import FOLDER as LENSES
 
-__all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part"]
+__all__ = ["DISABLED", "F64", "I64", "inline_kernel", "kernel", "part", "types"]
 
 _FOLDER = KernelFolder(Path(__file__).parent, "kernels-idp", exact=True, also=tuple(LENSES.glob("*.py")))
 kernel, inline_kernel, part = _FOLDER.kernel, _FOLDER.inline_kernel, _FOLDER.part

@@ -4,7 +4,7 @@ from factorbus.idp.kernels.compile import F64, kernel
 
 
 @kernel("int64(float64[:,::1], float64[:,::1], float64[:,::1])")
-def product(a: F64, b: F64, out: F64) -> int:
+def counted_product(a: F64, b: F64, out: F64) -> int:
     """out = a b; gives the number of multiplications.  Four columns of `a` at a time, along the rows of b.
 
     in   a (p, q)   b (q, r)

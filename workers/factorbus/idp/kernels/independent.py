@@ -15,22 +15,14 @@ LEFT, RIGHT, OWN_LEFT, OWN, BLOCKS = 0, 1, 2, 3, 4
 COUNTS = 5
 
 
-@kernel(
-    "void(int64, int64, float64[:,::1], float64[:,:,::1], float64[:,::1], float64[:,:,::1], float64[:,::1], "
-    "float64[:,::1], float64[:,::1], float64[:,::1], int64[::1])"
-)
-def independent(
-    first: int, last: int, before: F64, A: F64, At: F64, B: F64, padd: F64, left: F64, own: F64, out: F64, counts: I64
-) -> None:
-    """Rows and columns of the new features first .. last−1 of P after.
+@kernel("void(int64, int64, float64[:,::1], float64[:,:,::1], float64[:,::1], int64[::1])")
+def camera_blocks(first: int, last: int, before: F64, A: F64, out: F64, counts: I64) -> None:
+    """Between the new features first .. last−1 and all that was there before: left and right.
 
-    in   before (13, m): the camera's rows of P before   A (n, 6, 13)   At (13, 6 n): all A_kᵀ side by side
-         B (n, 6, 3)   padd (3, 3)
-    work left (6, m)   own (12, 6)
-    out  out (m + 6 n, m + 6 n): from row and column m on
-         counts (5,): multiplications are added for left, right, B Padd, (B Padd) Bᵀ, and blocks
+    in   before (13, m): the camera's rows of P before   A (n, 6, 13)
+    out  out (m + 6 n, m + 6 n)   counts (5,): multiplications are added
     """
-    m, width = before.shape[1], At.shape[1]
+    m = before.shape[1]
     for i in range(first, last):
         row = m + FEATURE * i
         for a in range(FEATURE):
@@ -39,7 +31,6 @@ def independent(
                 for t in range(CAMERA):
                     total += A[i, a, t] * before[t, c]
                     counts[LEFT] += 1
-                left[a, c] = total
                 out[row + a, c] = total
         for c in range(m):
             for a in range(FEATURE):
@@ -48,10 +39,33 @@ def independent(
                     total += before[t, c] * A[i, a, t]
                     counts[RIGHT] += 1
                 out[c, row + a] = total
-        for a in range(FEATURE):
-            counts[BLOCKS] += row_of_blocks(left[a], At, out[row + a, m : m + width])
-        counts[OWN_LEFT] += own_left(B[i], padd, own)
-        counts[OWN] += own_block(B[i], own)
+
+
+@kernel("void(int64, int64, float64[:,::1], float64[:,::1], int64[::1])")
+def feature_blocks(first: int, last: int, At: F64, out: F64, counts: I64) -> None:
+    """Between the new features first .. last−1 and all new ones, by what `camera_blocks` left in `out`.
+
+    in   At (13, 6 n): all A_kᵀ side by side
+    """
+    width = At.shape[1]
+    m = len(out) - width
+    for i in range(first, last):
+        for a in range(m + FEATURE * i, m + FEATURE * (i + 1)):
+            counts[BLOCKS] += row_of_blocks(out[a, :CAMERA], At, out[a, m : m + width])
+
+
+@kernel("void(int64, int64, float64[:,:,::1], float64[:,::1], float64[:,::1], float64[:,::1], int64[::1])")
+def add_own_blocks(first: int, last: int, B: F64, padd: F64, own: F64, out: F64, counts: I64) -> None:
+    """What is added to the block of each new feature with itself, after `feature_blocks`.
+
+    in   B (n, 6, 3)   padd (3, 3)
+    work own (12, 6)
+    """
+    m = len(out) - FEATURE * len(B)
+    for i in range(first, last):
+        row = m + FEATURE * i
+        counts[OWN_LEFT] += pixel_left(B[i], padd, own)
+        counts[OWN] += pixel_block(B[i], own)
         for a in range(FEATURE):
             for b in range(FEATURE):
                 out[row + a, row + b] += own[FEATURE + a, b]
@@ -74,7 +88,7 @@ def row_of_blocks(left: F64, At: F64, out: F64) -> int:
 
 
 @inline_kernel
-def own_left(B: F64, padd: F64, own: F64) -> int:
+def pixel_left(B: F64, padd: F64, own: F64) -> int:
     """B Padd into the first six rows of `own`, 6 × 3."""
     count = 0
     for a in range(FEATURE):
@@ -88,7 +102,7 @@ def own_left(B: F64, padd: F64, own: F64) -> int:
 
 
 @inline_kernel
-def own_block(B: F64, own: F64) -> int:
+def pixel_block(B: F64, own: F64) -> int:
     """(B Padd) Bᵀ into the last six rows of `own`."""
     count = 0
     for a in range(FEATURE):

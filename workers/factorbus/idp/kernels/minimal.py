@@ -14,9 +14,29 @@ and with G_i of (3.2), M_i of (3.4), every block is
 new features and are copied; the row of ρ is zero but for its variance.
 """
 
-from factorbus.idp.kernels.compile import F64, inline_kernel, kernel
+from typing import NamedTuple
+
+from factorbus.idp.kernels.compile import F64, inline_kernel, kernel, types
 from factorbus.idp.kernels.layout import FEATURE, Q, R
 from factorbus.idp.kernels.rays import turning
+
+
+class RowFactors(NamedTuple):
+    """Numbers that the rows of n new features are made of.
+
+    turn (n, 4): of which G is made   U (6, m): what all share   V (n, 6): G S row by row   W (n, 6): G C row by row
+    own (n, 3): σ² M Mᵀ: θθ, θφ, φφ
+    """
+
+    turn: F64
+    U: F64
+    V: F64
+    W: F64
+    own: F64
+
+
+_MATRIX = types.float64[:, ::1]
+_ROW_FACTORS = types.NamedUniTuple(_MATRIX, len(RowFactors._fields), RowFactors)
 
 
 @kernel("int64(float64[::1], float64[:,::1], float64[:,::1], float64[:,::1])")
@@ -50,7 +70,7 @@ def share(x: F64, before: F64, U: F64, S: F64) -> int:
 
 
 @kernel("int64(int64, float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1])")
-def spread(first: int, turn: F64, U: F64, S: F64, V: F64, W: F64) -> int:
+def feature_factors(first: int, turn: F64, U: F64, S: F64, V: F64, W: F64) -> int:
     """Each feature's part in the blocks it is in, for features first .. n−1; gives the number of multiplications.
 
     in   turn (n, 4)   U (6, m)   S (3, 3)
@@ -83,16 +103,14 @@ def own_variances(slope: F64, sigma: float, own: F64) -> int:
     return count
 
 
-@kernel(
-    "int64(int64, int64, float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64, "
-    "float64[:,::1])"
-)
-def rows(first: int, last: int, turn: F64, U: F64, V: F64, W: F64, own: F64, variance: float, out: F64) -> int:
+@kernel(types.int64(_ROW_FACTORS, types.int64, types.int64, types.float64, _MATRIX))
+def full_rows(factors: RowFactors, first: int, last: int, variance: float, out: F64) -> int:
     """The whole rows of the new features first .. last−1 of P after; gives the number of multiplications.
 
-    in   turn (n, 4)   U (6, m)   V, W (n, 6)   own (n, 3)   variance: σ_ρ²
+    in   variance: σ_ρ²
     out  out (6 (last − first), m + 6 n)
     """
+    turn, U, V, W, own = factors.turn, factors.U, factors.V, factors.W, factors.own
     m = U.shape[1]
     count = 0
     for i in range(first, last):
@@ -109,18 +127,14 @@ def rows(first: int, last: int, turn: F64, U: F64, V: F64, W: F64, own: F64, var
     return count
 
 
-@kernel(
-    "int64(int64, int64, float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64[:,::1], float64, "
-    "float64[:,::1], float64[::1])"
-)
-def half_rows(
-    first: int, last: int, turn: F64, U: F64, V: F64, W: F64, own: F64, variance: float, cross: F64, out: F64
-) -> int:
-    """As `rows`, from each feature's own block on: the upper half; gives the number of multiplications.
+@kernel(types.int64(_ROW_FACTORS, types.int64, types.int64, types.float64, _MATRIX, types.float64[::1]))
+def half_rows(factors: RowFactors, first: int, last: int, variance: float, cross: F64, out: F64) -> int:
+    """As `full_rows`, from each feature's own block on: the upper half; gives the number of multiplications.
 
     out  cross (6 (last − first), m): P(new, before)
          out: for every i six rows of 6 (n − i) numbers, P(new i, new i .. n−1), one i after the other
     """
+    turn, U, V, W, own = factors.turn, factors.U, factors.V, factors.W, factors.own
     n = turn.shape[0]
     count = 0
     at = 0

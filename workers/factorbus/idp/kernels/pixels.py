@@ -2,29 +2,29 @@
 
 import math
 
-from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel
+from factorbus.idp.kernels.camera import CAMERA_MODEL, CameraModel
+from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel, types
 from factorbus.idp.kernels.layout import BEHIND, GOOD, NOT_FINITE, OUTSIDE_IMAGE, OUTSIDE_LENS, Q, R
-from factorbus.idp.kernels.rays import rotation, turning
+from factorbus.idp.kernels.rays import camera_rotation, turning
 from factorbus.solver.lenses.models import project, ray
 
+_CUBE = types.float64[:, :, ::1]
+_MATRIX = types.float64[:, ::1]
+_STATUS = types.int64[::1]
 
-@kernel(
-    "void(int64, float64[::1], float64, float64, float64[::1], float64[:,::1], float64[:,::1], float64[:,:,::1], "
-    "float64[:,:,::1], int64[::1])"
-)
-def observe(
-    model: int, lens: F64, width: float, height: float, x: F64, y: F64, h: F64, Hx: F64, Hy: F64, status: I64
-) -> None:
+
+@kernel(types.void(CAMERA_MODEL, types.float64[::1], _MATRIX, _MATRIX, _CUBE, _CUBE, _STATUS))
+def observe(camera: CameraModel, x: F64, y: F64, h: F64, Hx: F64, Hy: F64, status: I64) -> None:
     """Distorted pixels of features, by the camera's state and by the feature.  MATH (6.1), (6.2)
 
         a = ((x, y, z) − r) ρ + m(θ, φ),   h_C = R(q)ᵀ a,   h = pixel of h_C,   F = ∂h/∂h_C R(q)ᵀ
         ∂h/∂r = −ρ F,  ∂h/∂q = F ⌊a⌋ T(q),  ∂h/∂(x, y, z) = ρ F,  ∂h/∂θ = F m_θ,  ∂h/∂φ = F m_φ,
         ∂h/∂ρ = F ((x, y, z) − r)
 
-    in   x (13,)   y (n, 6)   width, height: of the image; 0: any size
+    in   x (13,)   y (n, 6)
     out  h (n, 2)   Hx (n, 2, 13)   Hy (n, 2, 6)   status (n,)
     """
-    r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(x)
+    r0, r1, r2, r3, r4, r5, r6, r7, r8 = camera_rotation(x)
     t00, t01, t02, t03, t10, t11, t12, t13, t20, t21, t22, t23 = turning(x)
     Hx[:, :, :] = 0.0
     for k in range(y.shape[0]):
@@ -32,9 +32,9 @@ def observe(
         dx, dy, dz = y[k, 0] - x[R], y[k, 1] - x[R + 1], y[k, 2] - x[R + 2]
         a0, a1, a2 = dx * rho + cp * st, dy * rho - sp, dz * rho + cp * ct
         c0, c1, c2 = r0 * a0 + r3 * a1 + r6 * a2, r1 * a0 + r4 * a1 + r7 * a2, r2 * a0 + r5 * a1 + r8 * a2
-        good, u, v, e0, e1, e2, e3, e4, e5 = project(model, lens, c0, c1, c2)
+        good, u, v, e0, e1, e2, e3, e4, e5 = project(camera.model, camera.lens, c0, c1, c2)
         h[k, 0], h[k, 1] = u, v
-        status[k] = judged(good, c2, u, v, width, height)
+        status[k] = pixel_status(camera, good, c2, u, v)
         for i in range(2):
             g0, g1, g2 = (e0, e1, e2) if i == 0 else (e3, e4, e5)
             f0, f1, f2 = g0 * r0 + g1 * r1 + g2 * r2, g0 * r3 + g1 * r4 + g2 * r5, g0 * r6 + g1 * r7 + g2 * r8
@@ -48,32 +48,30 @@ def observe(
             Hy[k, i, 5] = f0 * dx + f1 * dy + f2 * dz
 
 
-@kernel("void(int64, float64[::1], float64, float64, float64[:,::1], float64[:,::1], float64[:,:,::1], int64[::1])")
-def project_rays(
-    model: int, lens: F64, width: float, height: float, rays: F64, h: F64, slope: F64, status: I64
-) -> None:
+@kernel(types.void(CAMERA_MODEL, _MATRIX, _MATRIX, _CUBE, _STATUS))
+def project_rays(camera: CameraModel, rays: F64, h: F64, slope: F64, status: I64) -> None:
     """Distorted pixels of rays in camera axes.  MATH §2
 
     in   rays (n, 3)
     out  h (n, 2)   slope (n, 2, 3) = ∂(u, v)/∂ray   status (n,)
     """
     for k in range(rays.shape[0]):
-        good, u, v, e0, e1, e2, e3, e4, e5 = project(model, lens, rays[k, 0], rays[k, 1], rays[k, 2])
+        good, u, v, e0, e1, e2, e3, e4, e5 = project(camera.model, camera.lens, rays[k, 0], rays[k, 1], rays[k, 2])
         h[k, 0], h[k, 1] = u, v
         slope[k, 0, 0], slope[k, 0, 1], slope[k, 0, 2] = e0, e1, e2
         slope[k, 1, 0], slope[k, 1, 1], slope[k, 1, 2] = e3, e4, e5
-        status[k] = judged(good, rays[k, 2], u, v, width, height)
+        status[k] = pixel_status(camera, good, rays[k, 2], u, v)
 
 
-@kernel("void(int64, float64[::1], float64[:,::1], float64[:,::1], float64[:,:,::1], int64[::1])")
-def rays_of(model: int, lens: F64, pixels: F64, rays: F64, slope: F64, status: I64) -> None:
+@kernel(types.void(CAMERA_MODEL, _MATRIX, _MATRIX, _CUBE, _STATUS))
+def unproject_pixels(camera: CameraModel, pixels: F64, rays: F64, slope: F64, status: I64) -> None:
     """Rays of distorted pixels in camera axes.  MATH §2
 
     in   pixels (n, 2)
     out  rays (n, 3)   slope (n, 3, 2) = ∂ray/∂(u, v)   status (n,)
     """
     for k in range(pixels.shape[0]):
-        good, a, b, c, d0, d1, d2, d3, d4, d5 = ray(model, lens, pixels[k, 0], pixels[k, 1])
+        good, a, b, c, d0, d1, d2, d3, d4, d5 = ray(camera.model, camera.lens, pixels[k, 0], pixels[k, 1])
         rays[k, 0], rays[k, 1], rays[k, 2] = a, b, c
         slope[k, 0, 0], slope[k, 0, 1] = d0, d1
         slope[k, 1, 0], slope[k, 1, 1] = d2, d3
@@ -120,12 +118,13 @@ def points(x: F64, y: F64, Pyy: F64, J: F64, p: F64, Ppp: F64, linearity: F64) -
 
 
 @inline_kernel
-def judged(good: int, depth: float, u: float, v: float, width: float, height: float) -> int:
+def pixel_status(camera: CameraModel, good: int, depth: float, u: float, v: float) -> int:
     """The status of a pixel that the lens gave: whether it is one, in front, and in the image."""
     if good != GOOD:
         return OUTSIDE_LENS if depth > 0.0 else BEHIND
     if not (abs(u) < math.inf and abs(v) < math.inf and abs(depth) < math.inf):
         return NOT_FINITE
+    width, height = camera.width, camera.height
     if width > 0.0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
         return OUTSIDE_IMAGE
     return GOOD

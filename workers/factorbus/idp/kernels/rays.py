@@ -14,7 +14,8 @@ Azimuth and elevation depend on the camera's attitude through its small rotation
 
 import math
 
-from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel
+from factorbus.idp.kernels.camera import CAMERA_MODEL, CameraModel
+from factorbus.idp.kernels.compile import F64, I64, inline_kernel, kernel, types
 from factorbus.idp.kernels.layout import NOT_FINITE, OUTSIDE_IMAGE, VERTICAL, Q, R
 from factorbus.solver.lenses.models import ray
 
@@ -22,23 +23,20 @@ from factorbus.solver.lenses.models import ray
 _VERTICAL = 1e-6
 
 
-@kernel(
-    "void(int64, float64[::1], float64, float64, float64[::1], float64, float64[:,::1], float64[:,::1], "
-    "float64[:,::1], float64[:,::1], int64[::1])"
-)
-def rays(
-    model: int, lens: F64, width: float, height: float, x: F64, rho: float, pixels: F64, y: F64, turn: F64, slope: F64,
-    status: I64,
-) -> None:  # fmt: skip
+@kernel(types.void(CAMERA_MODEL, types.float64[::1], types.float64, *[types.float64[:, ::1]] * 4, types.int64[::1]))
+def features_of_pixels(
+    camera: CameraModel, x: F64, rho: float, pixels: F64, y: F64, turn: F64, slope: F64, status: I64
+) -> None:
     """Features of distorted pixels.  MATH (3.1) to (3.4)
 
-    in   x (13,) camera state   pixels (n, 2)   rho: of all of them   width, height: of the image; 0: any size
+    in   x (13,) camera state   pixels (n, 2)   rho: of all of them
     out  y (n, 6)   turn (n, 4): tan φ sin θ, tan φ cos θ, cos θ, sin θ   slope (n, 4): M row by row   status (n,)
     """
-    r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation(x)
+    width, height = camera.width, camera.height
+    r0, r1, r2, r3, r4, r5, r6, r7, r8 = camera_rotation(x)
     for k in range(pixels.shape[0]):
         u, v = pixels[k, 0], pixels[k, 1]
-        good, a, b, c, d0, d1, d2, d3, d4, d5 = ray(model, lens, u, v)
+        good, a, b, c, d0, d1, d2, d3, d4, d5 = ray(camera.model, camera.lens, u, v)
         if width > 0.0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
             good = OUTSIDE_IMAGE
         hx, hy, hz = r0 * a + r1 * b + r2 * c, r3 * a + r4 * b + r5 * c, r6 * a + r7 * b + r8 * c
@@ -65,13 +63,13 @@ def rays(
 
 
 @kernel("void(float64[::1], float64[:,::1], float64[:,::1], float64[:,:,::1], float64[:,:,::1])")
-def jacobians(x: F64, turn: F64, slope: F64, A: F64, B: F64) -> None:
+def feature_jacobians(x: F64, turn: F64, slope: F64, A: F64, B: F64) -> None:
     """The dense Jacobians.  MATH (4.1), (4.2)
 
         A = ∂y/∂x_v:  I under r for (x, y, z);  G T under q for (θ, φ)
         B = ∂y/∂h_d, h_d = (u, v, ρ):  M for (θ, φ);  1 for ρ
 
-    in   x (13,)  turn, slope (n, 4) as from `rays`
+    in   x (13,)  turn, slope (n, 4) as from `features_of_pixels`
     out  A (n, 6, 13)   B (n, 6, 3)
     """
     t00, t01, t02, t03, t10, t11, t12, t13, t20, t21, t22, t23 = turning(x)
@@ -89,7 +87,7 @@ def jacobians(x: F64, turn: F64, slope: F64, A: F64, B: F64) -> None:
 
 
 @inline_kernel
-def rotation(x: F64) -> tuple:
+def camera_rotation(x: F64) -> tuple:
     """R(q) of the state's quaternion row by row, not normalized: R(s q) = s² R(q).  MATH (1.1)"""
     a, b, c, d = x[Q], x[Q + 1], x[Q + 2], x[Q + 3]
     return (

@@ -13,7 +13,7 @@ from factorbus.solver.kernels.jit.simd import at as load
 NEGLIGIBLE = 3e-10
 
 
-class Changes(NamedTuple):
+class BlockChanges(NamedTuple):
     """The present step, and at (n,): the last step that changed each variable's block by more than NEGLIGIBLE."""
 
     at: I64
@@ -21,7 +21,7 @@ class Changes(NamedTuple):
 
 
 @inline_kernel
-def has_changed_separator(tree: Tree, c: int, changes: Changes) -> bool:
+def has_changed_separator(tree: Tree, c: int, changes: BlockChanges) -> bool:
     """Whether this step changed the block of a variable in the separator of clique c."""
     row, lists, at = tree.clique[c], tree.lists, changes.at
     s = row[tl.C_LIST] + row[tl.C_FRONTALS]
@@ -32,7 +32,7 @@ def has_changed_separator(tree: Tree, c: int, changes: Changes) -> bool:
 
 
 @part
-def mark_changed(tree: Tree, c: int, dims: I64, a: F64, target: int, changes: Changes, blocks: F64) -> None:
+def mark_changed(tree: Tree, c: int, dims: I64, a: F64, target: int, changes: BlockChanges, blocks: F64) -> None:
     """Compare the frontals' `blocks` with those in the square of clique c at `target`."""
     row, lists, scalar = tree.clique[c], tree.lists, 0
     ld = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER])

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from factorbus.solver.covariance.kernels.changed_blocks import NEGLIGIBLE, Changes, has_changed_separator
+from factorbus.solver.covariance.kernels.changed_blocks import NEGLIGIBLE, BlockChanges, has_changed_separator
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.paths import list_paths
 from factorbus.solver.covariance.kernels.recursion import following
@@ -97,7 +97,7 @@ def downdate_blocks(
     on_path = np.zeros(len(clique), np.bool_)
     for c in path:
         on_path[c] = True
-    changes, x = Changes(changed_at, step), group_of_columns(0, ld, scratch)
+    changes, x = BlockChanges(changed_at, step), group_of_columns(0, ld, scratch)
     for c in path:
         if clique[c, tl.C_PARENT] < 0:
             descend(c, on_path, tree, layout, a, x, changes, blocks)
@@ -106,8 +106,8 @@ def downdate_blocks(
 
 @part
 def descend(
-    root: int, on_path: NDArray[np.bool_], tree: Tree, layout: ColumnLayout, a: F64, x: RightSides, changes: Changes,
-    blocks: F64,
+    root: int, on_path: NDArray[np.bool_], tree: Tree, layout: ColumnLayout, a: F64, x: RightSides,
+    changes: BlockChanges, blocks: F64,
 ) -> None:  # fmt: skip
     """Z and what it takes from the blocks, from a root down to where it is negligible."""
     clique, lists, dims, start, ld = tree.clique, tree.lists, layout.dims, layout.start, x.ld

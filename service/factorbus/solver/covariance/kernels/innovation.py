@@ -96,7 +96,7 @@ def distance_and_gain(dr: int, r: F64, W: F64, T: F64, L: F64, M: F64, y: F64) -
     for a in range(dr):
         for b in range(a + 1):
             L[a, b] = W[a, b]
-    cholesky(dr, L)
+    lower_factor(dr, L)
     for a in range(dr):
         y[a] = 0.0
         for k in range(a, dr):
@@ -107,7 +107,7 @@ def distance_and_gain(dr: int, r: F64, W: F64, T: F64, L: F64, M: F64, y: F64) -
                 for c in range(b, dr):
                     total += L[k, a] * T[k, c] * L[c, b]
             M[a, b] = total
-    cholesky(dr, M)
+    lower_factor(dr, M)
     total, root = 0.0, 1.0  # √det M
     for a in range(dr):
         value = y[a]
@@ -120,7 +120,7 @@ def distance_and_gain(dr: int, r: F64, W: F64, T: F64, L: F64, M: F64, y: F64) -
 
 
 @inline_kernel
-def cholesky(n: int, S: F64) -> None:
+def lower_factor(n: int, S: F64) -> None:
     """S := L of S = L Lᵀ, in its lower triangle."""
     for a in range(n):
         for b in range(a + 1):

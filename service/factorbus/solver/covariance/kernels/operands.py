@@ -20,7 +20,7 @@ class Strided(NamedTuple):
     column: int
 
 
-class Panel(NamedTuple):
+class VectorRows(NamedTuple):
     """Rows of vectors, as many as the product needs: the first at `at`, `ld` apart."""
 
     at: int

@@ -8,7 +8,7 @@ Y_A is zero but for the cliques between A and its root, so only those are read.
 import numpy as np
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.covariance.kernels.squares import whole_vectors
 from factorbus.solver.covariance.kernels.substitute import GROUP, ColumnLayout, forward, group_of_columns
 from factorbus.solver.covariance.kernels.tiles import negative_product
@@ -63,7 +63,7 @@ def square(rows: int, d: int, a: F64, ld: int) -> None:
         for j in range(i - i % LANES, d, TILE_VECTORS * LANES):
             vectors = min(TILE_VECTORS, (d - j + LANES - 1) // LANES)
             C = Tile(min(TILE_ROWS, d - i), vectors, (rows + i) * ld + j, ld)
-            negative_product(a, C, a, Strided(i, 1, ld), Panel(j, ld), rows)
+            negative_product(a, C, a, Strided(i, 1, ld), VectorRows(j, ld), rows)
 
 
 @part

@@ -11,10 +11,10 @@ not be visited again.
 
 import numpy as np
 
-from factorbus.solver.covariance.kernels.changed_blocks import Changes, has_changed_separator, mark_changed
+from factorbus.solver.covariance.kernels.changed_blocks import BlockChanges, has_changed_separator, mark_changed
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel, part
 from factorbus.solver.covariance.kernels.squares import (
-    gather_separator,
+    gather_separator_block,
     put_blocks,
     solve_square,
     square_size,
@@ -69,7 +69,7 @@ def diagonal_blocks(roots: I64, tree_table: I64, dims: I64, since: int, step: in
          step: `changed_at` of variables gets it where their blocks changed
     out  (n, d, d): upper left corners
     """
-    tree, changes = tree_at(tree_table), Changes(changed_at, step)
+    tree, changes = tree_at(tree_table), BlockChanges(changed_at, step)
     clique = tree.clique
     a, used, column, runs = np.empty(1 << 14), 0, np.empty(len(dims), np.int64), np.empty(5, np.int64)
     starts = np.zeros(len(clique) + 2, np.int64)
@@ -89,7 +89,7 @@ def diagonal_blocks(roots: I64, tree_table: I64, dims: I64, since: int, step: in
                     prefetch_rows(tree, after)
                 starts[depth + 1] = starts[depth] + square_size(p, m)
                 if m > 0:
-                    gather_separator(tree, c, dims, column, runs, a, starts[depth - 1], starts[depth])
+                    gather_separator_block(tree, c, dims, column, runs, a, starts[depth - 1], starts[depth])
                 solve_square(tree, c, a, starts[depth], child >= 0)
                 if since >= 0:
                     mark_changed(tree, c, dims, a, starts[depth], changes, out)

@@ -7,7 +7,7 @@ zero of it is at the ends of the rows, and the products stop before.
 """
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.covariance.kernels.tiles import (
     RUN,
     copy_runs,
@@ -58,7 +58,9 @@ def working_size(p: int, m: int) -> int:
 
 
 @part
-def gather_separator(tree: Tree, c: int, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int) -> None:
+def gather_separator_block(
+    tree: Tree, c: int, dims: I64, column: I64, runs: I64, a: F64, source: int, target: int
+) -> None:
     """Σ_SS of clique c into its square at `target`, from that of the parent at `source`.
 
     column (n,), runs (5 w,): scratch
@@ -112,14 +114,14 @@ def solve_square(tree: Tree, c: int, a: F64, target: int, whole: bool) -> None:
     high, w = height(p), target + (2 * p + m) * ld
     solve_for_square(row, tree.numbers, a, w, wide)
     for j in range(0, m, TILE_VECTORS * LANES):
-        vectors, Y = min(TILE_VECTORS, (m - j + LANES - 1) // LANES), Panel(target + p * ld + border + j, ld)
+        vectors, Y = min(TILE_VECTORS, (m - j + LANES - 1) // LANES), VectorRows(target + p * ld + border + j, ld)
         for i in range(0, p, high):
             C = Tile(min(high, p - i), vectors, target + i * ld + border + j, ld)
             negative_product(a, C, a, Strided(w + i * wide, wide, 1), Y, m)
     transpose(a, p, m, target + border, ld, target + p * ld, ld)
     transpose_negative(a, p, p, w + m, wide, target + (p + m) * ld, ld)
     for j in range(0, p, TILE_VECTORS * LANES):
-        vectors, Y = min(TILE_VECTORS, (p - j + LANES - 1) // LANES), Panel(target + p * ld + j, ld)
+        vectors, Y = min(TILE_VECTORS, (p - j + LANES - 1) // LANES), VectorRows(target + p * ld + j, ld)
         for i in range(0, min(p, j + vectors * LANES), high):
             if whole or j < i + high + _DIMS:
                 C = Tile(min(high, p - i), vectors, target + i * ld + j, ld)
@@ -147,7 +149,7 @@ def solve_for_square(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
             for j in range(0, width, TILE_VECTORS * LANES):
                 vectors = min(TILE_VECTORS, (width - j + LANES - 1) // LANES)
                 C = Tile(end - top, vectors, w + top * wide + j, wide)
-                subtract_product(a, C, numbers, X, Panel(w + end * wide + j, wide), p - end)
+                subtract_product(a, C, numbers, X, VectorRows(w + end * wide + j, wide), p - end)
         C = Tile(end - top, whole_vectors(m + p - top) // LANES, w + top * wide, wide)
         solve_tile_upper(a, C, numbers, start + top * step + top, step)
         end = top

@@ -6,7 +6,7 @@ What one clique needs of the right-hand sides is gathered in scratch, worked on 
 from typing import NamedTuple
 
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, part
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.covariance.kernels.tiles import (
     copy_vectors,
     negative_product,
@@ -57,7 +57,7 @@ def forward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides) -> 
     row, numbers = tree.clique[c], tree.numbers
     p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
     ld, every = x.vectors * LANES, row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]
-    variables, solved = tree.lists[row[tl.C_LIST] : row[tl.C_LIST] + every], Panel(x.scratch, ld)
+    variables, solved = tree.lists[row[tl.C_LIST] : row[tl.C_LIST] + every], VectorRows(x.scratch, ld)
     gather_rows(variables, layout, a, x, x.scratch)
     for top in range(0, p, TILE_ROWS):
         C = Tile(min(TILE_ROWS, p - top), x.vectors, x.scratch + top * ld, ld)
@@ -83,7 +83,7 @@ def backward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides, fr
     end = p
     while end > 0:
         top = max(0, end - TILE_ROWS)
-        C, solved = Tile(end - top, x.vectors, x.scratch + top * ld, ld), Panel(x.scratch + end * ld, ld)
+        C, solved = Tile(end - top, x.vectors, x.scratch + top * ld, ld), VectorRows(x.scratch + end * ld, ld)
         right = Strided(start + top * step + end, step, 1)
         if fresh:
             negative_product(a, C, numbers, right, solved, width - end)

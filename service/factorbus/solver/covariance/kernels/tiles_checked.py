@@ -2,7 +2,7 @@
 
 from factorbus.solver.covariance.kernels import tiles_llvm
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.kernels.jit.compile import vector_lanes
 
 prefetch = tiles_llvm.prefetch  # reaches nothing
@@ -51,13 +51,13 @@ def copy_vectors(a: F64, target: int, source: int, count: int) -> None:
 
 
 @inline_kernel
-def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: VectorRows, depth: int) -> None:
     _product_within(a, C, b, X, Y, depth)
     _subtract_product(a, C, b, X, Y, depth)
 
 
 @inline_kernel
-def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: VectorRows, depth: int) -> None:
     _product_within(a, C, b, X, Y, depth)
     _negative_product(a, C, b, X, Y, depth)
 
@@ -75,7 +75,7 @@ def solve_tile_lower(a: F64, C: Tile, b: F64, u: int, ldu: int) -> None:
 
 
 @inline_kernel
-def _product_within(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+def _product_within(a: F64, C: Tile, b: F64, X: Strided, Y: VectorRows, depth: int) -> None:
     _within(a, C.at, (C.rows - 1) * C.ld + C.vectors * _LANES)
     if depth > 0:
         _within(b, X.at, (C.rows - 1) * X.row + (depth - 1) * X.column + 1)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.kernels.jit.compile import F64, I64, vector_lanes
 
 _LANES = vector_lanes()
@@ -47,7 +47,7 @@ def prefetch(b: F64, first: int, count: int) -> None:
 
 
 @_whatever_is_beyond
-def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: VectorRows, depth: int) -> None:
     """C −= X Y:  C in `a`, X (C.rows, depth) in `b`, Y (depth, C.vectors·LANES) in `a`"""
     width = C.vectors * _LANES
     for i in range(C.rows):
@@ -57,7 +57,7 @@ def subtract_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) 
 
 
 @_whatever_is_beyond
-def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: Panel, depth: int) -> None:
+def negative_product(a: F64, C: Tile, b: F64, X: Strided, Y: VectorRows, depth: int) -> None:
     """C = −X Y, likewise"""
     for line in _lines(a, C):
         line[:] = 0.0

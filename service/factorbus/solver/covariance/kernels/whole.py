@@ -11,9 +11,9 @@ import numpy as np
 
 from factorbus.solver.covariance.kernels.columns import forward_path
 from factorbus.solver.covariance.kernels.compile import F64, I64, kernel, part
-from factorbus.solver.covariance.kernels.operands import Panel, Strided, Tile
+from factorbus.solver.covariance.kernels.operands import Strided, Tile, VectorRows
 from factorbus.solver.covariance.kernels.squares import (
-    gather_separator,
+    gather_separator_block,
     height,
     put_blocks,
     row_length,
@@ -78,7 +78,7 @@ def whole_blocks(order: I64, hub: int, tree_table: I64, dims: I64, start: I64, o
         starts[depth[c] + 1] = square + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
         prefetch_rows(tree, order[min(k + AHEAD, order.size - 1)])
         if parent >= 0:
-            gather_separator(tree, c, dims, places, runs, a, starts[depth[c] - 1], square)
+            gather_separator_block(tree, c, dims, places, runs, a, starts[depth[c] - 1], square)
         solve_square(tree, c, a, square, row[tl.C_CHILD] >= 0)
         put_blocks(tree, c, dims, a, square, out)
         if hub >= 0:
@@ -118,7 +118,7 @@ def put_column(
                 put(a, x.scratch + (m + p - 1 - i) * ldx + q, -load(a, result + i * ldx + q))
     for i in range(0, p, high):
         C = Tile(min(high, p - i), x.vectors, result + i * ldx, ldx)
-        negative_product(a, C, a, Strided(w + i * wide, wide, 1), Panel(x.scratch, ldx), depth)
+        negative_product(a, C, a, Strided(w + i * wide, wide, 1), VectorRows(x.scratch, ldx), depth)
     scatter_rows(frontals, layout, a, x, result)
     for s in range(frontals.size):
         block, d = out[frontals[s]], layout.dims[frontals[s]]

@@ -8,7 +8,7 @@ import numpy as np
 from factorbus.idp.kernels import layout as at
 from factorbus.idp.kernels import rays as kernels
 from factorbus.idp.kernels.compile import F64
-from factorbus.idp.lenses import lens_of
+from factorbus.idp.lenses import camera_model
 from factorbus.proto.features import CAMERA_STATE, FEATURE, BadPixel, BadState, Sighting
 from factorbus.proto.problems import BadShape
 
@@ -38,13 +38,11 @@ class Seen(NamedTuple):
 def see(sighting: Sighting) -> Seen:
     """The features of a sighting.  Raises BadShape, BadState, BadPixel: then nothing is computed for any of them."""
     _check(sighting)
-    code, lens = lens_of(sighting.camera)
     n = sighting.count
     seen = Seen(np.empty((n, FEATURE)), np.empty((n, 4)), np.empty((n, 4)))
     status = np.empty(n, np.int64)
-    size = float(sighting.camera.width), float(sighting.camera.height)
     state, pixels = contiguous(sighting.state), contiguous(sighting.pixels)
-    kernels.rays(code, lens, *size, state, float(sighting.rho), pixels, *seen, status)
+    kernels.features_of_pixels(camera_model(sighting.camera), state, float(sighting.rho), pixels, *seen, status)
     if status.any():
         first = int(np.flatnonzero(status)[0])
         u, v = pixels[first].tolist()
@@ -56,7 +54,7 @@ def jacobians(sighting: Sighting, seen: Seen) -> tuple[F64, F64]:
     """A = ∂y/∂x_v (n, 6, 13) and B = ∂y/∂h_d (n, 6, 3), h_d = (u, v, ρ).  MATH (4.1), (4.2)"""
     n = len(seen.y)
     A, B = np.empty((n, FEATURE, CAMERA_STATE)), np.empty((n, FEATURE, 3))
-    kernels.jacobians(contiguous(sighting.state), seen.turn, seen.slope, A, B)
+    kernels.feature_jacobians(contiguous(sighting.state), seen.turn, seen.slope, A, B)
     return A, B
 
 
