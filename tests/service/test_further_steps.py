@@ -296,7 +296,8 @@ def test_a_solver_that_fails_in_one_is_replaced_and_that_is_made_again(
 def test_one_that_fails_when_it_is_to_tell_what_changed_is_replaced_too(monkeypatch: pytest.MonkeyPatch) -> None:
     map_solver = unconverged()
     revision, broken = map_solver.revision, map_solver.solver
-    monkeypatch.setattr(broken, "changed", failing)
+    calls = iter((broken.pick_changed, failing))  # is it sound, and what changed
+    monkeypatch.setattr(broken, "pick_changed", lambda: next(calls)())
     (stepped,) = [event for event in map_solver.apply_whole((), further=True)[0] if isinstance(event, Stepped)]
     assert (stepped.rebuilt, stepped.further, stepped.revision) == (True, True, revision + 1)
     assert map_solver.solver is not broken

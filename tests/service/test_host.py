@@ -284,10 +284,10 @@ def test_stopping_during_a_short_run_answers_it_first(setup: Setup) -> None:
 def test_a_fault_in_a_short_run_ends_the_map_and_tells_who_waits(setup: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
     setup.until_short()
 
-    def broken(inserts: Any) -> Any:
+    def broken(inserts: Any, further: bool) -> Any:
         raise RuntimeError("applying failed")
 
-    monkeypatch.setattr(setup.host._map_solver, "apply", broken)
+    monkeypatch.setattr(setup.host._map_solver, "apply_batch", broken)
     setup.host.insert(setup.arrived(pose(1)))
     setup.host.insert(setup.arrived(pose(2)))
     codes = [effect.problem.code for effect, _ in setup.told.effects if isinstance(effect, Refuse)]

@@ -33,8 +33,8 @@ def content_of(parsed: ParsedInsert) -> tuple[list[Any], list[Any]]:
     """Kinds and columns, bit for bit, at the places that were found."""
 
     def column(row: np.ndarray, which: int, numbers: int) -> bytes | None:
-        address, count = int(row[which]), int(row[gt.G_COUNT]) * numbers
-        return None if address == gt.NOWHERE else ints_at(address, count).tobytes()
+        start, count = int(row[which]), int(row[gt.G_COUNT]) * numbers
+        return None if start == gt.NOWHERE else ints_at(parsed.message, start, count).tobytes()
 
     variables, factors = [], []
     for row in parsed.groups:

@@ -41,7 +41,7 @@ def stage_both(quick: Solver, usual: Solver, batch: Batch) -> str:
     parsed = try_parse(message, REQUEST_LIMITS)
     assert parsed is not None
     before, came = arenas(quick), []
-    for solver, columns in ((quick, Columns(parsed[3].groups, message)), (usual, batch)):
+    for solver, columns in ((quick, Columns(message, parsed[3].groups)), (usual, batch)):
         try:
             came.append(solver.stage(columns))
         except SolverError as problem:

@@ -14,7 +14,6 @@ from factorbus.service.kernels.compile import I64, inline_kernel, kernel, part
 from factorbus.service.kernels.digest import digest_bytes
 from factorbus.service.kernels.words import LONGEST, WORDS, look_up
 from factorbus.solver.kernels.graph import group_table as gt
-from factorbus.solver.kernels.jit.array_table import address_of
 
 # In place of where to read on: this is left to the codec.
 _LOST = -1
@@ -32,7 +31,7 @@ _MAP, _MAP_16, _ARRAY, _ARRAY_16, _SHORT_STR = 0x80, 0xDE, 0x90, 0xDC, 0xA0
 )
 def locate_insert(raw: bytes, groups: I64) -> tuple:
     """(sequence, epoch, settle, convert_below, digest, variables, factors) of an insert; where its groups lie goes to
-    `groups` (n + 1, G_WIDTH), by addresses in `raw`.  Sequence 0: left to the codec; MORE_GROUPS: these are too few.
+    `groups` (n + 1, G_WIDTH).  Sequence 0: left to the codec; MORE_GROUPS: these are too few.
 
     variables, factors: how many there are.
     """
@@ -76,9 +75,9 @@ def locate_insert(raw: bytes, groups: I64) -> tuple:
 @part
 def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
     """Read one group of variables or factors into its row; gives where to read on."""
-    kind, loss, fixed, seen, start = -1, -1, False, 0, address_of(raw)
-    # Of each column where it starts, −1: it is not there; and its bytes.
-    at, size = np.full(w.GROUP_FIELDS, -1), np.zeros(w.GROUP_FIELDS, np.int64)
+    kind, loss, fixed, seen = -1, -1, False, 0
+    # Of each column where it starts, and its bytes.
+    at, size = np.full(w.GROUP_FIELDS, gt.NOWHERE), np.zeros(w.GROUP_FIELDS, np.int64)
     fields, here = read_count(raw, here, _MAP, _MAP_16)
     for _ in range(fields):
         row, here = read_word(raw, here, w.IN_FACTORS if factors else w.IN_VARIABLES)
@@ -111,11 +110,8 @@ def read_group(raw: bytes, here: int, factors: int, group: I64) -> int:
     group[gt.G_KIND], group[gt.G_FACTORS], group[gt.G_COUNT] = WORDS[kind, w.W_CODE], factors, count
     group[gt.G_FIXED], group[gt.G_LIMITED] = 1 if fixed else 0, 0
     group[gt.G_LOSS] = WORDS[loss, w.W_CODE] if loss >= 0 else 0
-    group[gt.G_KEYS] = start + at[w.KEYS]
-    group[gt.G_NUMBERS] = start + at[w.NUMBERS] if at[w.NUMBERS] >= 0 else gt.NOWHERE
-    group[gt.G_INFORMATION] = start + at[w.INFORMATION] if factors else gt.NOWHERE
-    group[gt.G_SCALE] = start + at[w.SCALE] if loss >= 0 else gt.NOWHERE
-    group[gt.G_STAMPS] = start + at[w.STAMPS] if at[w.STAMPS] >= 0 else gt.NOWHERE
+    group[gt.G_KEYS], group[gt.G_NUMBERS], group[gt.G_STAMPS] = at[w.KEYS], at[w.NUMBERS], at[w.STAMPS]
+    group[gt.G_INFORMATION], group[gt.G_SCALE] = at[w.INFORMATION], at[w.SCALE]
     return here
 
 

@@ -38,6 +38,8 @@ from factorbus.solver.kernels.jit.compile import I64
 
 GOES_ON = "the map goes on converging, without an insert"
 
+_NOTHING: Mapping[str, int] = {}
+
 log = logging.getLogger(__name__)
 
 
@@ -207,12 +209,13 @@ class MapSolver(Holding):
         staged: list[_Staged] = []
         refused: list[Outcome] = []
         kept: Any = None  # the solver as it was, where inserts are tried on a copy
-        held = self._held
+        held, settle = self._held, False
         try:
             for insert in inserts:
                 try:
                     first_factor, held = self._stage(insert, held)
                     staged.append(_Staged(insert, first_factor))
+                    settle = settle or cast(Insert, insert.content).settle
                 except (Problem, SolverError) as problem:
                     refused.append(Outcome(insert, problem))
             if not staged:
@@ -221,7 +224,7 @@ class MapSolver(Holding):
                 kept, self._solver, held = self._solver, copied(self._solver), self._held
                 for each in staged:
                     _, held = self._stage(each.insert, held)
-            report = self._solver.step(settle=any(each.insert.content.settle for each in staged))  # type: ignore[union-attr]
+            report = self._solver.step(settle)
         except SolverError as problem:
             self._solver = kept or self._solver
             if len(staged) > 1:
@@ -238,7 +241,7 @@ class MapSolver(Holding):
             changed, graph = self._solver.pick_changed()
             diverged = find_diverged(changed, graph, report)
         except Exception:
-            return self._told_nothing(staged, refused, self._account_of(report, started, {}))
+            return self._told_nothing(staged, refused, self._account_of(report, started))
         if diverged is not None:
             steps = []
             if kept is not None:
@@ -249,7 +252,7 @@ class MapSolver(Holding):
                 raise _TakenBack(steps)
             return _Added(Verdict((*refused, Outcome(staged[0].insert, diverged))), steps)
         self._wary = self._wary or kept is not None
-        return self._told_of(staged, refused, self._account_of(report, started, {}), (changed, graph))
+        return self._told_of(staged, refused, self._account_of(report, started), (changed, graph))
 
     def _stage(self, insert: Arrived, held: tuple[int, int]) -> tuple[int, tuple[int, int]]:
         """Hand one insert to the solver, which holds so many variables and factors; gives the id of its first factor,
@@ -259,7 +262,7 @@ class MapSolver(Holding):
             raise Broken(self._broken)
         if isinstance(content, ParsedInsert):
             held = self._check_room(held, content.variables, content.factors)
-            return self._solver.stage(Columns(content.groups, content.message)), held
+            return self._solver.stage(Columns(content.message, content.groups)), held
         if isinstance(content, Problem):
             raise content
         held = self._check_room(held, content.batch.variable_count, content.batch.factor_count)
@@ -274,9 +277,10 @@ class MapSolver(Holding):
             raise TooLarge("the map with this insert", with_them[1], limits.factors, "factors")
         return with_them
 
-    def _account_of(self, report: Any, started: float, counted: Mapping[str, int]) -> dict[str, Any]:
+    def _account_of(self, report: Any, started: float, counted: Mapping[str, int] = _NOTHING) -> dict[str, Any]:
         """What the answers and the delta of a step say of it; the map is at its revision then."""
-        account = report.as_dict() | counted
+        account = report.as_dict()
+        account.update(counted)
         account["solver_ms"] = (time.perf_counter() - started) * 1e3
         self._next(account)
         self._held = self._held[0] + report.new_variables, self._held[1] + report.new_factors
@@ -357,9 +361,11 @@ class MapSolver(Holding):
         staged, account = [_Staged(insert, first_factor)], self._account_of(report, started, counted)
         self._held = self._solver.variable_count, self._solver.factor_count
         try:
-            added = self._told_of(staged, [], account, self._solver.pick_changed(), previous)
+            changed = self._solver.pick_changed()
         except Exception:
             added = self._told_nothing(staged, [], account)
+        else:
+            added = self._told_of(staged, [], account, changed, previous)
         yield added.verdict
         yield from added.steps
         if below := cast(Insert, insert.content).convert_below:

@@ -16,11 +16,17 @@ _NOTHING, _NO_GRAPH = np.empty(0, np.int64), Graph()
 
 
 class StepMessages:
-    """Writes the messages of the steps of one map.  For one thread at a time."""
+    """Writes the messages of the steps of one map.  For one thread at a time.
+
+    What the writer is given of a usual step, which has one insert, is put into arrays that are there already: to make
+    them anew takes as long as to write the messages.
+    """
 
     def __init__(self) -> None:
         self._out = np.empty(_ROOM, np.uint8)
         self._pack = codec.report_encoder()
+        self._step, self._answer, self._ends = np.empty(3, np.int64), np.empty((1, 2), np.int64), np.empty(2, np.int64)
+        self._step_view, self._answer_view = self._step.data, self._answer.data
 
     def write(
         self,
@@ -35,15 +41,21 @@ class StepMessages:
         answers: of each insert its sequence number and the id of its first factor.  step: epoch, revision, and the one
         before.  changed: the variables that the delta tells of, ascending.
         """
-        out, ends = self._out, np.empty(len(answers) + 1, np.int64)
-        numbers = np.array(answers, np.int64).reshape(-1, 2), np.array(step, np.int64)
-        columns = self._pack(account), changed, graph.array_table
-        if (size := write_messages(*numbers, *columns, out, ends)) > out.size:
+        view = self._step_view
+        view[0], view[1], view[2] = step
+        if len(answers) == 1:
+            numbers, ends, view = self._answer, self._ends, self._answer_view
+            ((view[0, 0], view[0, 1]),) = answers
+        else:
+            numbers, ends = np.array(answers, np.int64).reshape(-1, 2), np.empty(len(answers) + 1, np.int64)
+        report, out = self._pack(account), self._out
+        size = write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
+        if size > len(out):
             out = np.empty(size, np.uint8)
-            write_messages(*numbers, *columns, out, ends)
-        written, begin = [], 0
+            write_messages(numbers, self._step, report, changed, graph.places, out, ends)
+        written, begin, content = [], 0, out.data
         for end in ends.tolist():
-            written.append(out[begin:end].tobytes())
+            written.append(content[begin:end].tobytes())
             begin = end
         return written
 

@@ -44,16 +44,16 @@ def admit(graph: Graph, batch: BatchLike | Columns, whole: bool = True) -> int:
     columns, problem = (batch, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark = graph.mark()
     try:
-        fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+        fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
         if fault == gt.NO_LIMITS:
             columns, lens = limit_lenses(columns)
             problem = lens or problem
-            fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+            fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
         if fault == gt.NO_ROOM:
             graph.make_room(columns.groups)
-            fault, g, row, rest = admit_groups(columns.groups, whole, graph.array_table)
+            fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
         if g >= 0:
-            raise _find_bad_row(graph, columns.groups[g], row, fault, whole)
+            raise _find_bad_row(graph, columns, (g, row), fault, whole)
         if problem is not None:
             raise problem
         if fault == gt.COMPOSED_OUT_OF_BOUNDS:
@@ -114,24 +114,27 @@ def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> 
     return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
 
 
-def _find_bad_row(graph: Graph, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
-    """What is wrong with the n-th row of a group."""
+def _find_bad_row(
+    graph: Graph, columns: Columns, where: tuple[int, int], fault: int, whole: bool
+) -> errors.SolverError:
+    """What is wrong with a row of a group."""
+    raw, group, n = columns.raw, columns.groups[where[0]], where[1]
     code, keys, numbers = (int(group[column]) for column in (gt.G_KIND, gt.G_KEYS, gt.G_NUMBERS))
     if not group[gt.G_FACTORS]:
         kind = VARIABLE_KIND_OF_CODE[code]
-        value = floats_at(numbers + 8 * n * kind.size, kind.size) if numbers != gt.NOWHERE else None
-        return _bad_variable(kind.name, fault, int(ints_at(keys + 8 * n, 1)[0]), value)
+        value = floats_at(raw, numbers + 8 * n * kind.size, kind.size) if numbers != gt.NOWHERE else None
+        return _bad_variable(kind.name, fault, int(ints_at(raw, keys + 8 * n, 1)[0]), value)
     kind, loss = FACTOR_KIND_OF_CODE[code], int(group[gt.G_LOSS])
     if fault == gt.BAD_SCALE:
-        scale = floats_at(int(group[gt.G_SCALE]) + 8 * n, 1)[0]
+        scale = floats_at(raw, int(group[gt.G_SCALE]) + 8 * n, 1)[0]
         wanted = f"{LEAST_SCALE:g} to {MOST_NUMBER:g}, standard deviations"
         return errors.BadLoss(f"{kind} {LOSS_OF_CODE[loss]}", f"the scale {scale:g}", wanted)
     arity, triangle = len(kind.connects), kind.triangle
-    information = floats_at(int(group[gt.G_INFORMATION]) + 8 * n * triangle, triangle)
+    information = floats_at(raw, int(group[gt.G_INFORMATION]) + 8 * n * triangle, triangle)
     if whole and LINEAR_OF_ONE[code] and loss == at.NO_LOSS and information[0] < 0.0:
         information = -information  # as it was looked at
-    measured = floats_at(numbers + 8 * n * kind.size, kind.size)
-    return _bad_factor(graph, kind, fault, ints_at(keys + 8 * n * arity, arity), measured, information)
+    measured = floats_at(raw, numbers + 8 * n * kind.size, kind.size)
+    return _bad_factor(graph, kind, fault, ints_at(raw, keys + 8 * n * arity, arity), measured, information)
 
 
 def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.SolverError:

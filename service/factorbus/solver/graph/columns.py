@@ -1,9 +1,11 @@
-"""Where the columns of a batch lie, as the table that admission reads (`kernels/graph/group_table.py`).
+"""The columns of a batch as bytes, and where in them each lies: what admission reads, of arrays as of a message.
 
-Shapes and types are checked here; what concerns single rows is the kernel's.
+A robot's steps look alike: so many variables of this kind, so many factors of that.  What follows from the kinds, types
+and shapes of such a step is worked out once and remembered; what is left of a step is to join its columns.
 """
 
-import ctypes
+from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,139 +13,176 @@ from numpy import ndarray
 
 from factorbus.solver import errors
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS, LENS_AT, LOSSES
-from factorbus.solver.graph.groups import BatchLike, FactorsLike, VariablesLike
+from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.observations import with_limits
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.graph import group_table as gt
-from factorbus.solver.kernels.graph.locate import locate_column, locate_factors, locate_variables
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
-_I64, _F64 = np.dtype(np.int64), np.dtype(np.float64)
-_NO_VALUES = {size: np.empty((0, size)) for size in {kind.size for kind in VARIABLE_KINDS.values()}}
+_I64, _F64 = np.dtype("<i8"), np.dtype("<f8")
 _END = (gt.END,) + (0,) * (gt.G_WIDTH - 1)
 _WORD = 8
+_ABSENT = (None, ())  # the form of a column that is not there
 
 
 class Columns(NamedTuple):
-    """Groups of variables and factors by the addresses of their columns.
+    """Groups of variables and factors whose columns lie in `raw`; groups (n + 1, G_WIDTH) says where."""
 
-    groups (n + 1, G_WIDTH): the table.  held: what the columns lie in, and has to stay.
-    """
-
+    raw: bytes
     groups: I64
-    held: Any
 
 
 def locate_columns(batch: BatchLike) -> tuple[Columns, errors.SolverError | None]:
     """The columns of `batch`; or of its first groups, and what is wrong with the kind or a shape of the next one."""
-    rows: list[tuple[int, ...]] = []
-    held: list[ndarray] = []
-    problem = None
+    form: list[Any] = []
+    columns: list[Any] = []
+    for group in batch.variables:
+        keys, values, stamps = group.keys, group.values, group.stamps
+        columns.append(keys)
+        form += (group.kind, group.fixed, _form(keys))
+        for column in (values, stamps):
+            if column is None:
+                form.append(_ABSENT)
+            else:
+                columns.append(column)
+                form.append(_form(column))
+    variables = len(form)
+    for group in batch.factors:
+        keys, measured, information = group.keys, group.measured, group.information
+        columns += (keys, measured, information)
+        form += (group.kind, group.loss, _form(keys), _form(measured), _form(information))
+        if group.loss and group.scale is not None:
+            columns.append(group.scale)
+            form.append(_form(group.scale))
+        else:
+            form.append(_ABSENT)
     try:
-        for variables in batch.variables:
-            rows.append(_locate_variables(variables, held))  # noqa: PERF401  (those before a problem count)
-        for factors in batch.factors:
-            rows.append(_locate_factors(factors, held))  # noqa: PERF401
+        groups, problem = _table(variables, tuple(form)), None
     except errors.SolverError as found:
-        problem = found
-    rows.append(_END)
-    return Columns(np.array(rows, np.int64), held), problem
+        groups, problem = _table_before(variables, tuple(form)), found
+        columns = columns[: _count_columns(groups)]
+    try:
+        return Columns(b"".join(columns), groups), problem
+    except TypeError:  # one of them is not contiguous
+        return Columns(b"".join([column.tobytes() for column in columns]), groups), problem
 
 
 def limit_lenses(columns: Columns) -> tuple[Columns, errors.SolverError | None]:
     """The same columns, where lenses have their limits; or those before the first group of factors with a lens that is
     none, and what is wrong with it."""
-    groups, held = columns.groups.copy(), [columns.held]
+    raw, groups, added, end = columns.raw, columns.groups.copy(), list[bytes](), len(columns.raw)
     for g in range(len(groups)):
         row = groups[g]
         if row[gt.G_KIND] == gt.END:
             break
         kind = FACTOR_KIND_OF_CODE[int(row[gt.G_KIND])] if row[gt.G_FACTORS] else None
-        if kind is None or kind.name not in LENS_AT or row[gt.G_LIMITED]:
+        if kind is None or kind.name not in LENS_AT:
             continue
-        count = int(row[gt.G_COUNT])
-        measured = floats_at(int(row[gt.G_NUMBERS]), count * kind.size).reshape(count, kind.size)
+        row[gt.G_LIMITED], count = 1, int(row[gt.G_COUNT])
+        if not count:
+            continue
+        measured = floats_at(raw, int(row[gt.G_NUMBERS]), count * kind.size).reshape(count, kind.size)
         try:
             limited = with_limits(kind, measured)
         except errors.SolverError as problem:
-            stays = (groups[:, gt.G_FACTORS] == 0) | (np.arange(len(groups)) < g) | (groups[:, gt.G_KIND] == gt.END)
-            return Columns(groups[stays], held), problem
-        held.append(limited)
-        row[gt.G_NUMBERS], row[gt.G_LIMITED] = locate_column(limited.reshape(-1)), 1
-    return Columns(groups, held), None
+            stays = (groups[:, gt.G_FACTORS] == 0) | (np.arange(len(groups)) < g)
+            return Columns(b"".join([raw, *added]), groups[stays]), problem
+        added.append(limited.tobytes())
+        row[gt.G_NUMBERS], end = end, end + len(added[-1])
+    return Columns(b"".join([raw, *added]), groups), None
 
 
-def ints_at(address: int, count: int) -> I64:
-    """A copy of so many int64 at the address."""
-    return np.frombuffer(ctypes.string_at(address, _WORD * count), _I64)
+def ints_at(raw: bytes, start: int, count: int) -> I64:
+    """So many int64 from raw[start] on."""
+    return np.frombuffer(raw, _I64, count, start)
 
 
-def floats_at(address: int, count: int) -> F64:
-    """A copy of so many float64 at the address."""
-    return np.frombuffer(ctypes.string_at(address, _WORD * count), _F64)
+def floats_at(raw: bytes, start: int, count: int) -> F64:
+    """So many float64 from raw[start] on."""
+    return np.frombuffer(raw, _F64, count, start)
 
 
-def _locate_variables(group: VariablesLike, held: list[ndarray]) -> tuple[int, ...]:
-    """A row of the table; its columns go to `held`."""
-    kind = VARIABLE_KINDS.get(group.kind)
-    if kind is None:
-        raise errors.UnknownKind("variable", group.kind, tuple(VARIABLE_KINDS))
-    keys = _column(group.keys, _I64, (-1,), group.kind, "keys")
-    given = group.values
-    values = (
-        _NO_VALUES[kind.size] if given is None else _column(given, _F64, (keys.size, kind.size), group.kind, "values")
-    )
-    held += (keys, values)
-    at_keys, at_values = locate_variables(keys, values)
-    at_stamps = gt.NOWHERE
-    if group.stamps is not None:
-        stamps = _column(group.stamps, _I64, (keys.size,), group.kind, "stamps")
-        held.append(stamps)
-        at_stamps = locate_column(stamps)
-    at_values = gt.NOWHERE if given is None else at_values
-    return kind.code, 0, keys.size, bool(group.fixed), at.NO_LOSS, at_keys, at_values, 0, gt.NOWHERE, at_stamps, 0
+def _form(column: Any) -> tuple[Any, Any]:
+    """The type and the shape of an array; of anything else the name of what it is."""
+    return (column.dtype, column.shape) if isinstance(column, ndarray) else (type(column).__name__, None)
 
 
-def _locate_factors(group: FactorsLike, held: list[ndarray]) -> tuple[int, ...]:
-    """A row of the table; its columns go to `held`."""
-    kind = FACTOR_KINDS.get(group.kind)
-    if kind is None:
-        raise errors.UnknownKind("factor", group.kind, tuple(FACTOR_KINDS))
-    keys = _column(group.keys, _I64, (-1, len(kind.connects)), group.kind, "keys")
-    count = len(keys)
-    measured = _column(group.measured, _F64, (count, kind.size), group.kind, "measured")
-    information = _column(group.information, _F64, (count, kind.triangle), group.kind, "information")
-    is_camera = kind.name in LENS_AT
-    if is_camera:
-        measured = with_limits(kind, measured)
-    held += (keys, measured, information)
-    loss, at_scale = at.NO_LOSS, gt.NOWHERE
-    if group.loss:
-        loss, scale = _loss(group, count)
-        held.append(scale)
-        at_scale = locate_column(scale)
-    at_keys, at_measured, at_information = locate_factors(keys, measured, information)
-    return kind.code, 1, count, 0, loss, at_keys, at_measured, at_information, at_scale, gt.NOWHERE, is_camera
+@lru_cache(maxsize=1024)
+def _table(variables: int, form: tuple[Any, ...]) -> I64:
+    """The table of groups of a form; `variables` of its entries are of variables.  Raises as `_iter_rows`."""
+    return np.array([*_iter_rows(variables, form), _END], np.int64)
 
 
-def _loss(group: FactorsLike, count: int) -> tuple[int, F64]:
-    """(code, scales) of the loss of a group."""
-    code = LOSSES.get(group.loss)
-    if code is None:
-        raise errors.BadLoss(group.kind, f"the loss {group.loss!r}", f"none, or one of {', '.join(LOSSES)}")
-    if group.scale is None:
-        raise errors.BadLoss(f"{group.kind} {group.loss}", "no scale", "one for each factor, standard deviations")
-    return code, _column(group.scale, _F64, (count,), group.kind, "scale")
+def _table_before(variables: int, form: tuple[Any, ...]) -> I64:
+    """The table of the groups before the first that is wrong."""
+    rows = []
+    try:
+        for row in _iter_rows(variables, form):
+            rows.append(row)  # noqa: PERF402  (those before a problem count)
+    except errors.SolverError:
+        pass
+    return np.array([*rows, _END], np.int64)
 
 
-def _column(array: ndarray, dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> ndarray:
-    """`array` if it can be read where it is, a copy that can where it is not aligned or not contiguous."""
-    if not isinstance(array, ndarray) or array.dtype != dtype:
-        seen = str(array.dtype) if isinstance(array, ndarray) else type(array).__name__
-        raise errors.BadShape(f"{kind} {name}", seen, f"an array of {dtype}")
-    if array.shape != shape and (len(array.shape) != len(shape) or array.shape[1:] != shape[1:] or shape[0] >= 0):
+def _count_columns(groups: I64) -> int:
+    """How many columns the groups have."""
+    columns = groups[:-1, [gt.G_KEYS, gt.G_NUMBERS, gt.G_INFORMATION, gt.G_SCALE, gt.G_STAMPS]]
+    return int(np.count_nonzero(columns != gt.NOWHERE))
+
+
+def _iter_rows(variables: int, form: tuple[Any, ...]) -> Iterator[tuple[int, ...]]:
+    """The rows of the table.  Raises UnknownKind, BadShape, BadLoss."""
+    here = 0
+    for k in range(0, variables, 5):
+        name, fixed, keys, values, stamps = form[k : k + 5]
+        kind = VARIABLE_KINDS.get(name)
+        if kind is None:
+            raise errors.UnknownKind("variable", name, tuple(VARIABLE_KINDS))
+        _check(keys, _I64, (-1,), name, "keys")
+        count = keys[1][0]
+        at_keys, at_values, at_stamps, here = here, gt.NOWHERE, gt.NOWHERE, here + _WORD * count
+        if values is not _ABSENT:
+            _check(values, _F64, (count, kind.size), name, "values")
+            at_values, here = here, here + _WORD * count * kind.size
+        if stamps is not _ABSENT:
+            _check(stamps, _I64, (count,), name, "stamps")
+            at_stamps, here = here, here + _WORD * count
+        places = at_keys, at_values, gt.NOWHERE, gt.NOWHERE, at_stamps
+        yield kind.code, 0, count, bool(fixed), at.NO_LOSS, *places, 0
+    for k in range(variables, len(form), 6):
+        name, loss, keys, measured, information, scale = form[k : k + 6]
+        kind = FACTOR_KINDS.get(name)
+        if kind is None:
+            raise errors.UnknownKind("factor", name, tuple(FACTOR_KINDS))
+        _check(keys, _I64, (-1, len(kind.connects)), name, "keys")
+        count = keys[1][0]
+        _check(measured, _F64, (count, kind.size), name, "measured")
+        _check(information, _F64, (count, kind.triangle), name, "information")
+        at_keys, at_measured = here, here + _WORD * count * len(kind.connects)
+        at_information = at_measured + _WORD * count * kind.size
+        here = at_information + _WORD * count * kind.triangle
+        at_scale = gt.NOWHERE
+        if loss:
+            _check_loss(name, loss, scale, count)
+            at_scale, here = here, here + _WORD * count
+        places = at_keys, at_measured, at_information, at_scale, gt.NOWHERE
+        yield kind.code, 1, count, 0, LOSSES[loss] if loss else at.NO_LOSS, *places, 0
+
+
+def _check_loss(kind: str, loss: str, scale: tuple[Any, Any], count: int) -> None:
+    if loss not in LOSSES:
+        raise errors.BadLoss(kind, f"the loss {loss!r}", f"none, or one of {', '.join(LOSSES)}")
+    if scale is _ABSENT:
+        raise errors.BadLoss(f"{kind} {loss}", "no scale", "one for each factor, standard deviations")
+    _check(scale, _F64, (count,), kind, "scale")
+
+
+def _check(form: tuple[Any, Any], dtype: np.dtype, shape: tuple[int, ...], kind: str, name: str) -> None:
+    """Raises BadShape unless a column is of this type and shape; −1: any size."""
+    seen, has = form
+    if has is None or seen != dtype:
+        raise errors.BadShape(f"{kind} {name}", str(seen), f"an array of {dtype}")
+    if has != shape and (len(has) != len(shape) or has[1:] != shape[1:] or shape[0] >= 0):
         wanted = " × ".join("n" if n < 0 else str(n) for n in shape)
-        raise errors.BadShape(f"{kind} {name}", " × ".join(map(str, array.shape)), wanted)
-    flags = array.flags
-    return array if flags.carray or (flags.c_contiguous and flags.aligned) else np.array(array, dtype, order="C")
+        raise errors.BadShape(f"{kind} {name}", " × ".join(map(str, has)), wanted)

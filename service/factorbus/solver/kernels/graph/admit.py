@@ -11,7 +11,6 @@ from factorbus.solver.kernels.graph.check_rows import check_factor, check_value
 from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.graph.key_table import slot_of
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, kernel, part
-from factorbus.solver.kernels.jit.memory import float_at, int_at
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_SCALE, MOST_NUMBER, find_outside
 from factorbus.solver.kernels.model.kinds import is_camera, is_linear
@@ -19,12 +18,12 @@ from factorbus.solver.kernels.model.records import Graph, graph_at
 from factorbus.solver.kernels.model.sizes import dim_of, information_at, kinds_of_ends, scale_at, size_of
 
 
-@kernel("UniTuple(int64, 4)(int64[:,::1], boolean, int64[::1])")
-def admit_groups(groups: I64, whole: bool, graph_table: I64) -> tuple:
-    """Append the variables and factors of `groups`, and give values to the variables that come without.
+@kernel("UniTuple(int64, 4)(Bytes(uint8, 1, 'C', readonly=True), int64[:,::1], boolean, int64[::1])")
+def admit_groups(raw: bytes, groups: I64, whole: bool, graph_table: I64) -> tuple:
+    """Append the variables and factors whose columns lie in `raw`, and give values to the variables that come without.
 
-    groups (n + 1, G_WIDTH): see `group_table`.  whole: a linear factor of one variable may have a negative definite Ω.
-    graph_table: of the graph's arrays (`records`).
+    groups (n + 1, G_WIDTH): where they lie, see `group_table`; that they lie inside is not checked.  whole: a linear
+    factor of one variable may have a negative definite Ω.  graph_table: of the graph's arrays (`records`).
 
     Gives (fault, group, row, rest): GOOD and what is left to be done; or what is wrong, with which row of which group.
     With NO_ROOM and NO_LIMITS nothing was done.
@@ -41,9 +40,9 @@ def admit_groups(groups: I64, whole: bool, graph_table: I64) -> tuple:
         while groups[g, gt.G_KIND] != gt.END:
             if groups[g, gt.G_FACTORS] == factors:
                 if factors == 0:
-                    row, fault = append_variables(groups[g], graph)
+                    row, fault = append_variables(raw, groups[g], graph)
                 else:
-                    row, fault, left = append_factors(groups[g], whole, graph, scratch)
+                    row, fault, left = append_factors(raw, groups[g], whole, graph, scratch)
                     rest |= left
                 if fault != gt.GOOD:
                     return fault, g, row, 0
@@ -86,21 +85,21 @@ def look_over(groups: I64, graph: Graph) -> int:
 
 
 @part
-def append_variables(group: I64, graph: Graph) -> tuple:
+def append_variables(raw: bytes, group: I64, graph: Graph) -> tuple:
     """Append the variables of a group.  Gives (row, fault) of the first that is not in order, or (−1, GOOD)."""
     kind, stamps, values, counts = group[gt.G_KIND], graph.stamps, graph.values, graph.counts
     size = size_of(kind)
     for n in range(group[gt.G_COUNT]):
-        key, x = int_at(group[gt.G_KEYS] + 8 * n), counts[at.VALUES]
+        key, x = int_at(raw, group[gt.G_KEYS] + 8 * n), counts[at.VALUES]
         slot = slot_of(key, graph.table, graph.keys)
         if graph.table[slot] != 0:
             return n, gt.DUPLICATE
         if group[gt.G_NUMBERS] != gt.NOWHERE:
-            copy_numbers(group[gt.G_NUMBERS] + 8 * n * size, size, values, x)
+            copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, values, x)
             fault = check_value(kind, x, size, values)
             if fault != gt.GOOD:
                 return n, fault
-        stamp = int_at(group[gt.G_STAMPS] + 8 * n) if group[gt.G_STAMPS] != gt.NOWHERE else at.NO_STAMP
+        stamp = int_at(raw, group[gt.G_STAMPS] + 8 * n) if group[gt.G_STAMPS] != gt.NOWHERE else at.NO_STAMP
         stamps[counts[at.VARIABLES]] = stamp
         counts[at.STAMPED] += 1 if stamp != at.NO_STAMP else 0
         append_variable(kind, group[gt.G_FIXED] != 0, key, slot, graph)
@@ -108,7 +107,7 @@ def append_variables(group: I64, graph: Graph) -> tuple:
 
 
 @part
-def append_factors(group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple:
+def append_factors(raw: bytes, group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple:
     """Append the factors of a group.  Gives (row, fault, what is left to be done for them): of the first that is not in
     order, or (−1, GOOD, …).  scratch (6, 6)."""
     kind, loss, payload, counts = group[gt.G_KIND], group[gt.G_LOSS], graph.payload, graph.counts
@@ -118,11 +117,11 @@ def append_factors(group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple
     rest = gt.OBSERVED if is_camera(kind) else 0
     for n in range(group[gt.G_COUNT]):
         p, first = counts[at.PAYLOAD], group[gt.G_KEYS] + 8 * n * arity
-        i, j, fault = find_ends(kind, int_at(first), int_at(first + 8 * (arity - 1)), graph)
+        i, j, fault = find_ends(kind, int_at(raw, first), int_at(raw, first + 8 * (arity - 1)), graph)
         if fault != gt.GOOD:
             return n, fault, rest
-        copy_numbers(group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
-        copy_numbers(group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
+        copy_numbers(raw, group[gt.G_NUMBERS] + 8 * n * size, size, payload, p)
+        copy_numbers(raw, group[gt.G_INFORMATION] + 8 * n * triangle, triangle, payload, p + size)
         is_negative = may_be_negative and payload[p + size] < 0.0
         if is_negative:
             negate(p + size, triangle, payload)
@@ -134,7 +133,7 @@ def append_factors(group: I64, whole: bool, graph: Graph, scratch: F64) -> tuple
             negate(p + size, triangle, payload)
         numbers = width
         if loss != at.NO_LOSS:
-            scale = float_at(group[gt.G_SCALE] + 8 * n)
+            scale = float_at(raw, group[gt.G_SCALE] + 8 * n)
             if not (scale >= LEAST_SCALE and scale <= MOST_NUMBER):
                 return n, gt.BAD_SCALE, rest
             payload[p + width] = scale
@@ -221,11 +220,26 @@ def list_given(groups: I64, count: int) -> I64:
     return given
 
 
-@inline_kernel
-def copy_numbers(address: int, count: int, out: F64, to: int) -> None:
-    """So many numbers from the address on to out[to:]."""
+@part
+def copy_numbers(raw: bytes, start: int, count: int, out: F64, to: int) -> None:
+    """The doubles in raw[start:] to out[to:]."""
     for c in range(count):
-        out[to + c] = float_at(address + 8 * c)
+        out[to + c] = float_at(raw, start + 8 * c)
+
+
+@inline_kernel
+def float_at(raw: bytes, start: int) -> float:
+    """The little-endian double in raw[start : start + 8]."""
+    return np.int64(int_at(raw, start)).view(np.float64)
+
+
+@part
+def int_at(raw: bytes, start: int) -> int:
+    """The little-endian int64 in raw[start : start + 8]."""
+    bits = np.int64(0)
+    for k in range(8):
+        bits |= np.int64(raw[start + k]) << np.int64(8 * k)
+    return bits  # type: ignore[return-value]
 
 
 @inline_kernel

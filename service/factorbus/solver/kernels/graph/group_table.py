@@ -1,8 +1,7 @@
-"""The table that admission reads: groups of variables and factors whose columns lie anywhere in memory.
+"""The table that admission reads: groups of variables and factors whose columns lie in the bytes of a message.
 
-A row for each group, in any order, and after the last one a row of kind END.  A column is told by the address of its
-first byte: numbers of eight bytes in the byte order of the machine, row after row without gaps, aligned or not.  What
-the addresses are of is kept by whoever fills in the table.
+A row for each group, in any order, and after the last one a row of kind END.  A column is told by the offset of its
+first byte: little-endian numbers of eight bytes, row after row without gaps.
 """
 
 # Columns.
@@ -11,7 +10,7 @@ G_FACTORS = 1  # 0: variables, 1: factors
 G_COUNT = 2
 G_FIXED = 3  # 1: variables that are held where they are
 G_LOSS = 4  # code of the loss of factors
-G_KEYS = 5  # address of the keys
+G_KEYS = 5  # offset of the keys
 G_NUMBERS = 6  # of the values, NOWHERE: they come without; or of the measurements
 G_INFORMATION = 7  # of the upper triangles of the information matrices
 G_SCALE = 8  # of the scales of the loss; NOWHERE: there is none
@@ -20,7 +19,7 @@ G_LIMITED = 10  # 1: the lenses of what a camera saw have their limits
 G_WIDTH = 11
 
 END = -1
-NOWHERE = 0
+NOWHERE = -1
 
 # What is wrong with a row of a group.
 GOOD = 0

@@ -33,7 +33,7 @@ if DISABLED:
 
     def _first_entry(array: Any) -> int:
         """Where it is."""
-        return int((np.frombuffer(array, np.uint8) if isinstance(array, bytes) else array).ctypes.data)
+        return int(array.ctypes.data)
 
     def _plain(kind: type, dimensions: int) -> Any:
         return lambda table, entry: array_in_python(table, entry, kind, dimensions)
@@ -46,7 +46,7 @@ else:
 
     @intrinsic
     def _entry(_typing: Any, array: Any) -> Any:
-        """Where the first entry of the array is, or the first byte of a message."""
+        """Where the first entry of the array is."""
 
         def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             data = context.make_array(signature.args[0])(context, builder, args[0]).data
