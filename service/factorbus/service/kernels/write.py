@@ -10,6 +10,8 @@ from factorbus.solver.kernels.model.records import Graph, graph_at
 
 # In place of the revision before a delta: there is none to write.
 NO_DELTA = -1
+# Entries of `step`.
+EPOCH, REVISION, PREVIOUS = range(3)
 # No message is longer than this but for its columns and its report; nor is what a group adds to its columns.
 _MOST_HEAD, _MOST_GROUP = 128, 96
 
@@ -35,16 +37,16 @@ def write_messages(answers: I64, step: I64, report: bytes, changed: I64, graph_t
     here = 0
     for n in range(inserts):
         here = write_integer(out, write_piece(out, here, w.P_SEQUENCE), answers[n, 0])
-        here = write_integer(out, write_piece(out, here, w.P_EPOCH), step[0])
-        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[1])
+        here = write_integer(out, write_piece(out, here, w.P_EPOCH), step[EPOCH])
+        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[REVISION])
         here = write_integer(out, write_piece(out, here, w.P_FIRST_FACTOR), answers[n, 1])
         here = write_integer(out, write_piece(out, here, w.P_APPLIED), inserts)
         here = write_bytes(out, write_piece(out, here, w.P_REPORT), report, 0, len(report))
         ends[n] = here
-    if step[2] != NO_DELTA:
-        here = write_integer(out, write_piece(out, here, w.P_DELTA), step[0])
-        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[1])
-        here = write_integer(out, write_piece(out, here, w.P_PREVIOUS), step[2])
+    if step[PREVIOUS] != NO_DELTA:
+        here = write_integer(out, write_piece(out, here, w.P_DELTA), step[EPOCH])
+        here = write_integer(out, write_piece(out, here, w.P_REVISION), step[REVISION])
+        here = write_integer(out, write_piece(out, here, w.P_PREVIOUS), step[PREVIOUS])
         here = write_variables(out, write_piece(out, here, w.P_VARIABLES), groups, stamped, changed, graph)
         here = write_bytes(out, write_piece(out, here, w.P_REPORT), report, 0, len(report))
     ends[inserts] = here

@@ -52,7 +52,7 @@ class StepMessages:
         size = write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
         if size > len(out):
             out = np.empty(size, np.uint8)
-            write_messages(numbers, self._step, report, changed, graph.places, out, ends)
+            write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
         written, begin, content = [], 0, out.data
         for end in ends.tolist():
             written.append(content[begin:end].tobytes())

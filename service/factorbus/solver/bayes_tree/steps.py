@@ -40,6 +40,7 @@ _FINISHED_LEFT = 1e-7
 _AT_END = 1e-6
 # Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
 _STILL = 0.1
+_ASKED = "asked to settle"
 _WOULD_RISE = "χ² would have risen: Levenberg-Marquardt from where the estimate stood"
 _ROSE = "χ² rose from one round to the next: Levenberg-Marquardt"
 _GOES_ON = "pivots were raised above rounding: Levenberg-Marquardt to the optimum"
@@ -188,7 +189,8 @@ class TreeSteps:
             if not worse:
                 tree.exchange()
             course = self._batch(before, settle, continues)
-            because = "asked to settle" if settle else _WOULD_RISE if worse else _ROSE if rises else _GOES_ON if goes_on else _STALLS
+            reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
+            because = next(reason for holds, reason in reasons if holds)
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
                 course.converged = True

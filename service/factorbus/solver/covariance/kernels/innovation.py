@@ -11,6 +11,7 @@ import numpy as np
 from factorbus.solver.covariance.kernels.compile import F64, I64, inline_kernel, kernel
 
 _DIM = 6
+RESIDUAL, FIRST, SECOND = range(3)  # columns of `sizes`, the fields of `Sizes`
 
 
 class Sizes(NamedTuple):
@@ -33,7 +34,7 @@ def predicted_covariances(ends: I64, sizes: I64, A: F64, B: F64, diagonal: F64, 
     """
     scratch = np.empty((2, _DIM, _DIM))
     for k in range(len(ends)):
-        size, i, j = Sizes(sizes[k, 0], sizes[k, 1], sizes[k, 2]), ends[k, 0], max(0, ends[k, 1])
+        size, i, j = Sizes(sizes[k, RESIDUAL], sizes[k, FIRST], sizes[k, SECOND]), ends[k, 0], max(0, ends[k, 1])
         if size.residual == 3 and size.first == 3 and size.second == 3:
             # With constants the loops are unrolled: three times as fast.
             predicted_covariance(Sizes(3, 3, 3), A[k], B[k], diagonal[i], diagonal[j], cross[k], scratch, T[k])
@@ -84,10 +85,10 @@ def distances_and_gains(sizes: I64, r: F64, W: F64, T: F64, distance: F64, gain:
     """
     L, M, y = np.empty((_DIM, _DIM)), np.empty((_DIM, _DIM)), np.empty(_DIM)
     for k in range(len(sizes)):
-        if sizes[k, 0] == 3:
+        if sizes[k, RESIDUAL] == 3:
             distance[k], gain[k] = distance_and_gain(3, r[k], W[k], T[k], L, M, y)
         else:
-            distance[k], gain[k] = distance_and_gain(sizes[k, 0], r[k], W[k], T[k], L, M, y)
+            distance[k], gain[k] = distance_and_gain(sizes[k, RESIDUAL], r[k], W[k], T[k], L, M, y)
 
 
 @inline_kernel

@@ -17,6 +17,10 @@ from factorbus.solver.kernels.sparse import fronts as fr
 from factorbus.solver.kernels.sparse.panels import take_off
 from factorbus.solver.kernels.sparse.partial_cholesky import LEAST_PIVOT
 
+# Columns of `update`, a row for each orphan: where its update matrix is, its width, and the size of its block where it
+# was made for this elimination, else 0.
+UPDATE_AT, UPDATE_WIDTH, UPDATE_SIZE = range(3)
+
 
 @inline_kernel
 def number_columns(
@@ -136,13 +140,13 @@ def list_column_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64
         v = lists[s]
         into, dim = column[node[v, tl.N_LOCAL]], dim_of_variable(var, v)
         if into == stop and stop != p:
-            runs[count - 1, 1] += dim
+            runs[count - 1, fr.RUN_COUNT] += dim
         else:
-            runs[count, 0], runs[count, 1], runs[count, 2] = first, dim, into
+            runs[count, fr.RUN_FIRST], runs[count, fr.RUN_COUNT], runs[count, fr.RUN_INTO] = first, dim, into
             count += 1
         stop = into + dim
         first += dim
-    runs[count, 0], runs[count, 1], runs[count, 2] = first, 1, p + m
+    runs[count, fr.RUN_FIRST], runs[count, fr.RUN_COUNT], runs[count, fr.RUN_INTO] = first, 1, p + m
     return count + 1
 
 
@@ -153,18 +157,18 @@ def extend_add(a: F64, child: int, width: int, runs: I64, count: int, row: I64) 
     A pair of runs in another order there is turned.
     """
     for s in range(count):
-        first, length, into = runs[s, 0], runs[s, 1], runs[s, 2]
+        first, length, into = runs[s, fr.RUN_FIRST], runs[s, fr.RUN_COUNT], runs[s, fr.RUN_INTO]
         for i in range(length):
             source, target = child + fr.update_row(first + i, width), row_of(into + i, row)
             add_few(a, target + into + i, source + first + i, length - i)
             for t in range(s + 1, count):
-                other = runs[t, 2]
+                other = runs[t, fr.RUN_INTO]
                 if other > into:
-                    add_few(a, target + other, source + runs[t, 0], runs[t, 1])
+                    add_few(a, target + other, source + runs[t, fr.RUN_FIRST], runs[t, fr.RUN_COUNT])
                 else:
-                    for j in range(runs[t, 1]):
+                    for j in range(runs[t, fr.RUN_COUNT]):
                         turned = row_of(other + j, row) + into + i
-                        put(a, turned, load(a, turned) + load(a, source + runs[t, 0] + j))
+                        put(a, turned, load(a, turned) + load(a, source + runs[t, fr.RUN_FIRST] + j))
 
 
 @inline_kernel
@@ -181,14 +185,18 @@ def add_few(a: F64, i: int, j: int, count: int) -> None:
 def update_orphans(graph: Graph, tree: Tree, orphans: I64, update: I64) -> bool:
     """Where each orphan's update matrix is; those of split cliques are made.  False: no room, nothing is taken.
 
-    update (orphans, 3): its place, its width, and the size of its block where it was made here (else 0)
+    update (orphans, 3): gets them, see UPDATE_AT and so on
     """
     var = graph.var
     clique, lists, numbers, state = tree.clique, tree.lists, tree.numbers, tree.state
     stamp, need = state[tl.S_STAMP], state[tl.S_NUMBERS]
     for e in range(orphans.size):
         c = orphans[e]
-        update[e, 0], update[e, 1], update[e, 2] = clique[c, tl.C_UPDATE], clique[c, tl.C_WIDTH_UPDATE], 0
+        update[e, UPDATE_AT], update[e, UPDATE_WIDTH], update[e, UPDATE_SIZE] = (
+            clique[c, tl.C_UPDATE],
+            clique[c, tl.C_WIDTH_UPDATE],
+            0,
+        )
         if clique[c, tl.C_MARK] == stamp:
             need += size_class(update_layout(split_sizes(c, var, clique, lists)[1])[1])[1]
     if need > numbers.size:
@@ -200,7 +208,7 @@ def update_orphans(graph: Graph, tree: Tree, orphans: I64, update: I64) -> bool:
             p, m = split_sizes(c, var, clique, lists)
             width, size = update_layout(m)
             u, size = take_numbers(size, numbers, state)
-            update[e, 0], update[e, 1], update[e, 2] = u, width, size
+            update[e, UPDATE_AT], update[e, UPDATE_WIDTH], update[e, UPDATE_SIZE] = u, width, size
             split_update(graph, tree, c, p, m, u, width)
     return True
 
@@ -209,8 +217,8 @@ def update_orphans(graph: Graph, tree: Tree, orphans: I64, update: I64) -> bool:
 def give_back_updates(update: I64, numbers: F64, state: I64) -> None:
     """Free what `update_orphans` made."""
     for e in range(len(update)):
-        if update[e, 2] > 0:
-            give_numbers(update[e, 0], update[e, 2], numbers, state)
+        if update[e, UPDATE_SIZE] > 0:
+            give_numbers(update[e, UPDATE_AT], update[e, UPDATE_SIZE], numbers, state)
 
 
 @inline_kernel

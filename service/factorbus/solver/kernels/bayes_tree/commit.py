@@ -6,7 +6,7 @@ Until here a step has changed no link of the tree, so one that fails has only it
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.allocator import give_numbers
-from factorbus.solver.kernels.bayes_tree.assemble import split_sizes
+from factorbus.solver.kernels.bayes_tree.assemble import UPDATE_AT, UPDATE_SIZE, UPDATE_WIDTH, split_sizes
 from factorbus.solver.kernels.bayes_tree.eliminate import first_end
 from factorbus.solver.kernels.bayes_tree.fronts import free_clique
 from factorbus.solver.kernels.bayes_tree.hessian import hessian_size
@@ -93,7 +93,11 @@ def keep_leading(c: int, update: I64, var: I64, clique: I64, lists: I64, numbers
     row[tl.C_SEPARATORS] += lost
     row[tl.C_PIVOTS], row[tl.C_BORDER] = p, m
     give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
-    row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = update[0], update[1], update[2]
+    row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = (
+        update[UPDATE_AT],
+        update[UPDATE_WIDTH],
+        update[UPDATE_SIZE],
+    )
     child, row[tl.C_CHILD] = row[tl.C_CHILD], -1
     while child >= 0:
         following = clique[child, tl.C_NEXT]

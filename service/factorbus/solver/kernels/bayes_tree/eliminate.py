@@ -15,6 +15,8 @@ import numpy as np
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.affected import separators_of
 from factorbus.solver.kernels.bayes_tree.assemble import (
+    UPDATE_AT,
+    UPDATE_WIDTH,
     add_hessian,
     extend_add,
     front_of_clique,
@@ -251,7 +253,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
             start = clique[orphans[e], tl.C_LIST]
             low, high = separators_of(orphans[e], stamp, clique)
             k = list_column_runs(graph, tree, start + low, start + high, column, p, m, runs)
-            extend_add(numbers, update[e, 0], update[e, 1], runs, k, row)
+            extend_add(numbers, update[e, UPDATE_AT], update[e, UPDATE_WIDTH], runs, k, row)
             anchored |= clique[orphans[e], tl.C_ANCHORED]
             e = next_orphan[e]
         row[tl.C_ANCHORED] = anchored

@@ -19,7 +19,7 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import measure
 from factorbus.solver.kernels.bayes_tree.order import find_lowest, find_newest, list_pairs, order_affected
 from factorbus.solver.kernels.bayes_tree.order_small import analyze_few, join_few, order_few
 from factorbus.solver.kernels.bayes_tree.records import Affected, Fronts, Tree
-from factorbus.solver.kernels.bayes_tree.refactor_in_place import OLD, commit_renewed, give_back_renewed, renew
+from factorbus.solver.kernels.bayes_tree.refactor_in_place import commit_renewed, give_back_renewed, renew
 from factorbus.solver.kernels.bayes_tree.reroot import account_for
 from factorbus.solver.kernels.bayes_tree.thresholds import rescale
 from factorbus.solver.kernels.bayes_tree.touch import NewRows, find_touched
@@ -48,7 +48,7 @@ def eliminate_again(
         add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, account)
         return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings)
     now = lap(now, tl.MARK, state)
-    old = np.empty((renewed.size, OLD), np.int64)
+    old = np.empty((renewed.size, tl.C_WIDTH), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
         status = renew(graph, tree, renewed, variables.size, account[tl.A_STIFFEST], old, queue)

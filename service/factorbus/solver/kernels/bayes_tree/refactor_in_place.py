@@ -29,7 +29,6 @@ from factorbus.solver.kernels.sparse.multifrontal import clear_front
 from factorbus.solver.kernels.sparse.partial_cholesky import RAISED, ROUNDING, factor_front
 
 ORDERING = 1e4  # flops of a variable: from there on it is worth to order it, for the fill that this may spare
-OLD = 8  # what is remembered of a clique: its two blocks and where things are in them
 
 
 @part
@@ -100,7 +99,7 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, queue: I64) -> int:
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
-    old (renewed, OLD): gets where the present ones are.  Local numbers of affected variables are below n.  queue: see
+    old (renewed, C_WIDTH): gets their present rows.  Local numbers of affected variables are below n.  queue: see
     `task_queue`.
     """
     var = graph.var
@@ -160,9 +159,7 @@ def take_blocks(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64) -
         return False
     for k in range(renewed.size):
         row = clique[renewed[k]]
-        old[k, 0], old[k, 1], old[k, 2] = row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], row[tl.C_ROWS]
-        old[k, 3], old[k, 4], old[k, 5] = row[tl.C_LD], row[tl.C_USED], row[tl.C_UPDATE]
-        old[k, 6], old[k, 7] = row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE]
+        old[k] = row
         lead, row[tl.C_LD], used, size = row_layout(row[tl.C_PIVOTS], row[tl.C_BORDER])
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used
@@ -178,9 +175,13 @@ def give_back_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: 
         row = clique[renewed[k]]
         give_numbers(row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], numbers, state)
         give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
-        row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], row[tl.C_ROWS] = old[k, 0], old[k, 1], old[k, 2]
-        row[tl.C_LD], row[tl.C_USED], row[tl.C_UPDATE] = old[k, 3], old[k, 4], old[k, 5]
-        row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = old[k, 6], old[k, 7]
+        row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE], row[tl.C_ROWS] = (
+            old[k, tl.C_BLOCK],
+            old[k, tl.C_BLOCK_SIZE],
+            old[k, tl.C_ROWS],
+        )
+        row[tl.C_LD], row[tl.C_USED], row[tl.C_UPDATE] = old[k, tl.C_LD], old[k, tl.C_USED], old[k, tl.C_UPDATE]
+        row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = old[k, tl.C_WIDTH_UPDATE], old[k, tl.C_UPDATE_BLOCK_SIZE]
         row[tl.C_MARK] = state[tl.S_STAMP]
 
 
@@ -193,7 +194,7 @@ def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64
         if row[tl.C_PARENT] < 0:
             roots[count] = renewed[k]
             count += 1
-            account[tl.A_MODEL] -= numbers[old[k, 5]]
+            account[tl.A_MODEL] -= numbers[old[k, tl.C_UPDATE]]
         row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
         state[tl.S_ELIMINATED] += row[tl.C_FRONTALS]
     if count == state[tl.S_ROOTS]:
@@ -201,7 +202,7 @@ def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64
     for k in range(count):
         account[tl.A_MODEL] += numbers[clique[roots[k], tl.C_UPDATE]]
     for k in range(renewed.size):
-        give_numbers(old[k, 0], old[k, 1], numbers, state)
-        give_numbers(old[k, 5], old[k, 7], numbers, state)
+        give_numbers(old[k, tl.C_BLOCK], old[k, tl.C_BLOCK_SIZE], numbers, state)
+        give_numbers(old[k, tl.C_UPDATE], old[k, tl.C_UPDATE_BLOCK_SIZE], numbers, state)
     state[tl.S_FLOPS] += int(flops_of(renewed, clique))
     return roots[:count]

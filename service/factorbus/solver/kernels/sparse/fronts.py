@@ -35,9 +35,11 @@ FRONT = 16  # int64 in a record: 128 bytes
 # A run: border columns [first, first + count) of a child are columns [into, into + count) of its parent; a run lies
 # wholly among the parent's pivots or wholly in its border.
 RUN = 3
+RUN_FIRST, RUN_COUNT, RUN_INTO = range(RUN)
 
 # A block: its number, where it goes, rows and columns there, and whether to turn it.
 BLOCK = 5
+BLOCK_NUMBER, BLOCK_AT, BLOCK_ROWS, BLOCK_COLUMNS, BLOCK_TURN = range(BLOCK)
 STRAIGHT, TURNED, DIAGONAL = 0, 1, 2
 
 # The first doubles of an arena: room for a 4 x 4 triangle, for each thread that may be at it.

@@ -27,7 +27,7 @@ def factorize(
         r, ld, p = front.rows, front.ld, front.pivots
         clear_front(arena, front)
         for b in range(record[fr.BLOCKS], record[fr.BLOCKS_END]):
-            write_block(arena, blocks, b, ld, values, offsets[blocks[b, 0]], 1.0 + damping)
+            write_block(arena, blocks, b, ld, values, offsets[blocks[b, fr.BLOCK_NUMBER]], 1.0 + damping)
         for i in range(p):
             floor = PIVOT_TOLERANCE * at(arena, r + i * ld + i)
             floors[i] = floor if floor > 0.0 else 0.0
@@ -52,7 +52,12 @@ def clear_front(a: F64, front: fr.Front) -> None:
 @inline_kernel
 def write_block(a: F64, blocks: I64, b: int, ld: int, values: F64, source: int, on_diagonal: float) -> None:
     """Write a block of Λ into the front; `on_diagonal` multiplies the diagonal of a diagonal block."""
-    target, height, width, how = blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 4]
+    target, height, width, how = (
+        blocks[b, fr.BLOCK_AT],
+        blocks[b, fr.BLOCK_ROWS],
+        blocks[b, fr.BLOCK_COLUMNS],
+        blocks[b, fr.BLOCK_TURN],
+    )
     for i in range(height):
         if how == fr.TURNED:
             for j in range(width):
@@ -69,10 +74,10 @@ def add_update(a: F64, child: fr.Front, runs: I64, run: int, run_end: int, front
     """Add the update matrix of `child` into the front above it, by its runs runs[run : run_end]."""
     r, ld, p, u, wide = front.rows, front.ld, front.pivots, front.update, front.width
     for s in range(run, run_end):
-        first, count, into = runs[s, 0], runs[s, 1], runs[s, 2]
+        first, count, into = runs[s, fr.RUN_FIRST], runs[s, fr.RUN_COUNT], runs[s, fr.RUN_INTO]
         for i in range(count):
             c, source = into + i, child.update + fr.update_row(first + i, child.width)
             target = r + c * ld if into < p else u + fr.update_row(c - p, wide) - p
             add_run(a, target + c, source + first + i, count - i)
             for t in range(s + 1, run_end):
-                add_run(a, target + runs[t, 2], source + runs[t, 0], runs[t, 1])
+                add_run(a, target + runs[t, fr.RUN_INTO], source + runs[t, fr.RUN_FIRST], runs[t, fr.RUN_COUNT])

@@ -326,10 +326,10 @@ def _by_earlier(n: int, label: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
 def _block(out: I64, b: int, i: int, j: int, dim: I64, column: I64, front: I64) -> None:
     """Block b of Λ, between the variables labelled i and j, as `front` takes it in."""
     upper, later = min(i, j), max(i, j)
-    out[0] = b
-    out[1] = front[fr.ROWS] + column[upper] * front[fr.LD_ROWS] + column[later]
-    out[2], out[3] = dim[upper], dim[later]
-    out[4] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
+    out[fr.BLOCK_NUMBER] = b
+    out[fr.BLOCK_AT] = front[fr.ROWS] + column[upper] * front[fr.LD_ROWS] + column[later]
+    out[fr.BLOCK_ROWS], out[fr.BLOCK_COLUMNS] = dim[upper], dim[later]
+    out[fr.BLOCK_TURN] = fr.DIAGONAL if i == j else (fr.STRAIGHT if i < j else fr.TURNED)
 
 
 @inline_kernel
@@ -339,9 +339,9 @@ def _runs(runs: I64, run: int, border_of: I64, begin: int, end: int, dim: I64, c
     for e in range(begin, end):
         v = border_of[e]
         if column[v] == stop and stop != pivots:
-            runs[run - 1, 1] += dim[v]
+            runs[run - 1, fr.RUN_COUNT] += dim[v]
         else:
-            runs[run, 0], runs[run, 1], runs[run, 2] = first, dim[v], column[v]
+            runs[run, fr.RUN_FIRST], runs[run, fr.RUN_COUNT], runs[run, fr.RUN_INTO] = first, dim[v], column[v]
             run += 1
         stop = column[v] + dim[v]
         first += dim[v]
