@@ -280,9 +280,8 @@ def apply_single(map_solver: MapSolver, insert: Arrived) -> tuple[Result, bool]:
     """What came of it, and whether it was had in one piece."""
     events = map_solver.apply_batch((insert,), False)
     if isinstance(events, SingleInsertResult):
-        outcome = Outcome(events.insert, events.answer, events.first_factor)
-        stepped = Stepped(events.revision, events.delta, events.strategy, events.chi2, events.solver_ms)
-        return Result((outcome,), (stepped,), events.variables, events.factors), True
+        applied = events.applied
+        return Result((events.outcome,), (events.stepped,), applied.variables, applied.factors), True
     *rest, end = events
     assert isinstance(end, Applied)
     outcomes = tuple(o for e in rest if isinstance(e, Verdict) for o in e.outcomes)

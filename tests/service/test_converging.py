@@ -189,7 +189,8 @@ def test_after_one_that_is_done_at_once_quiet_is_waited_for_too(driven: Driven) 
     insert = driven.arrived()._replace(content=ParsedInsert(b"", np.zeros((0, 0), np.int64), False))
     run = the_run(driven.core.insert(insert))
     assert run.short
-    alone = SingleInsertResult(insert, b"ok", b"", 0, 4, "tree", 9.0, 1.0, 3, 4, 0.0, driven.now, converged=False)
+    stepped = Stepped(4, b"", "tree", 9.0, 1.0, converged=False)
+    alone = SingleInsertResult(Outcome(insert, b"ok", 0), stepped, Applied(3, 4, 0.0, driven.now))
     assert not goes_on(driven.core.alone(alone, insert.askers[0]))
     assert driven.says() == CONVERGING
     assert not goes_on(driven.tick(LATER / 2))

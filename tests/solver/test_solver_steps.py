@@ -227,5 +227,7 @@ def test_shares_of_a_total() -> None:
     shares = PhaseShares(("order", "eliminate"), [1, 3], 8.0)
     assert shares == {"order": 2.0, "eliminate": 6.0}
     assert PhaseShares(("order",), [0], 0.0) == {"order": 0.0}
+    shares = PhaseShares(("order", "mark", "eliminate"), [1, 0, 2], 0.7)
+    assert shares.as_dict() == dict(shares)
     with pytest.raises(KeyError):
         shares["commit"]

@@ -126,22 +126,11 @@ class Applied(NamedTuple):
 
 
 class SingleInsertResult(NamedTuple):
-    """One insert was taken in by a step of its own: what Verdict, Stepped and Applied say of it, in one."""
+    """One insert was taken in by a step of its own: all that comes of it, at once."""
 
-    insert: Arrived
-    answer: bytes
-    delta: bytes
-    first_factor: int
-    revision: int
-    strategy: str
-    chi2: float
-    solver_ms: float
-    variables: int
-    factors: int
-    solver_cpu_s: float
-    now: float
-    converged: bool = True
-    unfinished: bool = False
+    outcome: Outcome
+    stepped: Stepped
+    applied: Applied
 
 
 # ---- what waits -------------------------------------------------------------------------------------------------

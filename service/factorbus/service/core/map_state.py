@@ -168,17 +168,18 @@ class MapCore:
 
     def alone(self, alone: SingleInsertResult, answered: Asker) -> list[Effect]:
         """One insert was applied by itself; `answered` has its answer, and the delta is published."""
-        insert, size = alone.insert, len(alone.delta)
-        others = self._admission.answer(insert, alone.answer, answered)
+        (insert, answer, _), stepped, applied = alone
+        size = len(stepped.delta)
+        others = self._admission.answer(insert, answer, answered)
         self._unjudged -= 1
         self._unjudged_bytes -= insert.size
-        seconds = alone.now - insert.now
-        self._account.note(InsertDone(alone.strategy, alone.chi2, alone.solver_ms, seconds, len(alone.answer), size))
-        self._moved_on(alone.revision, size)
-        self._converging.moved_on(alone.converged, alone.unfinished, alone.chi2)
-        self._moved_at = alone.revision
-        self._free(alone, 1)
-        return self._go_on(others, alone.now)
+        told = stepped.strategy, stepped.chi2, stepped.solver_ms
+        self._account.note(InsertDone(*told, applied.now - insert.now, len(answer), size))
+        self._moved_on(stepped.revision, size)
+        self._converging.moved_on(stepped.converged, stepped.unfinished, stepped.chi2)
+        self._moved_at = stepped.revision
+        self._free(applied, 1)
+        return self._go_on(others, applied.now)
 
     def kept(self, events: Sequence[Verdict | Stepped], now: float) -> list[Effect]:
         """What came of an InsertBatch is written down."""
@@ -248,7 +249,7 @@ class MapCore:
         self._free(applied, len(taken))
         return self._go_on([], applied.now)
 
-    def _free(self, applied: Applied | SingleInsertResult, taken: int) -> None:
+    def _free(self, applied: Applied, taken: int) -> None:
         self._running = None
         self._ended = applied.now
         self._converging.ended(applied.solver_cpu_s - self._solver_cpu_s, applied.now)

@@ -239,11 +239,12 @@ class Host:
             if not isinstance(events, SingleInsertResult):
                 self._tell(events, tell)
                 return
-            answered = events.insert.askers[0]
+            (insert, answer, _), delta = events.outcome, events.stepped.delta
+            answered = insert.askers[0]
             if tell is self._send:
-                self._send_both(answered, events.answer, events.delta)
+                self._send_both(answered, answer, delta)
             else:
-                tell([Answer(answered, events.answer), Publish("delta", events.delta)])
+                tell([Answer(answered, answer), Publish("delta", delta)])
             with self._lock:
                 effects = self.core.alone(events, answered)
             if effects:

@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
-from typing import Any, NamedTuple, cast
+from typing import Any, TypeAlias, cast
 
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
@@ -43,18 +43,9 @@ _NOTHING: Mapping[str, int] = {}
 log = logging.getLogger(__name__)
 
 
-class _Staged(NamedTuple):
-    """An insert that the solver has taken; of its first factor the id."""
-
-    insert: Arrived
-    first_factor: int
-
-
-class _Added(NamedTuple):
-    """What came of inserts: the verdict on them, and the steps that were made."""
-
-    verdict: Verdict
-    steps: Sequence[Stepped] = ()
+# Plain tuples, since a named one takes ten times as long to make.
+_Staged: TypeAlias = tuple[Arrived, int]  # an insert that the solver has taken, and the id of its first factor
+_Added: TypeAlias = tuple[Verdict, Sequence[Stepped]]  # what came of inserts, and the steps that were made
 
 
 class _TakenBack(Exception):
@@ -93,11 +84,7 @@ class MapSolver(Holding):
         """All that comes of them, at its end.  Of the same inserts in the same groups always the same, to the bit."""
         came = self.apply_batch(inserts, further)
         if isinstance(came, SingleInsertResult):
-            judged = Verdict((Outcome(came.insert, came.answer, came.first_factor),), came.revision, 1)
-            told = came.strategy, came.chi2, came.solver_ms
-            left = {"converged": came.converged, "unfinished": came.unfinished}
-            stepped = Stepped(came.revision, came.delta, *told, **left)
-            return [judged, stepped], Applied(came.variables, came.factors, came.solver_cpu_s, came.now)
+            return [Verdict((came.outcome,), came.stepped.revision, 1), came.stepped], came.applied
         events: list[Verdict | Stepped] = []
         applied = self._applied(time.thread_time())
         for event in came:
@@ -120,16 +107,12 @@ class MapSolver(Holding):
             return self.apply(inserts)
         started = time.perf_counter()
         verdict, steps = self._add_together(inserts)
-        now = time.monotonic()
         # By the clock, which a step without waiting comes to: to ask for the thread's time costs a call of the kernel.
         self._cpu_s += time.perf_counter() - started
+        applied = Applied(*self._held, self._cpu_s, time.monotonic())
         if not verdict.together or len(steps) != 1 or steps[0].rebuilt:
-            return iter((verdict, *steps, Applied(*self.size, self._cpu_s, now)))
-        (outcome,), (step,) = verdict.outcomes, steps
-        return SingleInsertResult(
-            outcome.insert, outcome.answer, step.delta, outcome.first_factor, step.revision, step.strategy, step.chi2,
-            step.solver_ms, *self._held, self._cpu_s, now, step.converged, step.unfinished,
-        )  # fmt: skip
+            return iter((verdict, *steps, applied))
+        return SingleInsertResult(verdict.outcomes[0], steps[0], applied)
 
     def go_on(self) -> Iterator[Stepped | Applied]:
         """One step without an insert: Stepped, unless the solver refuses it and is as it was; Applied."""
@@ -191,15 +174,15 @@ class MapSolver(Holding):
     def _add(self, inserts: Sequence[Arrived]) -> Iterator[Verdict | Stepped]:
         """Inserts that only add: in one step, or one at a time where that fails."""
         try:
-            added = self._add_together(inserts)
+            verdict, steps = self._add_together(inserts)
         except _TakenBack as taken_back:
             yield from taken_back.steps
             for insert in inserts:
                 yield from self._add([insert])
             return
-        yield added.verdict
-        yield from added.steps
-        accepted = [outcome.insert.content for outcome in added.verdict.outcomes if outcome.first_factor >= 0]
+        yield verdict
+        yield from steps
+        accepted = [outcome.insert.content for outcome in verdict.outcomes if outcome.first_factor >= 0]
         if below := max((cast(Insert, content).convert_below for content in accepted), default=0.0):
             yield from self._convert_to_points(below)
 
@@ -214,29 +197,29 @@ class MapSolver(Holding):
             for insert in inserts:
                 try:
                     first_factor, held = self._stage(insert, held)
-                    staged.append(_Staged(insert, first_factor))
+                    staged.append((insert, first_factor))
                     settle = settle or cast(Insert, insert.content).settle
                 except (Problem, SolverError) as problem:
                     refused.append(Outcome(insert, problem))
             if not staged:
-                return _Added(Verdict(tuple(refused)))
+                return Verdict(tuple(refused)), ()
             if self._wary or not is_usual(self._solver, *self._held):
                 kept, self._solver, held = self._solver, copied(self._solver), self._held
-                for each in staged:
-                    _, held = self._stage(each.insert, held)
+                for insert, _ in staged:
+                    _, held = self._stage(insert, held)
             report = self._solver.step(settle)
         except SolverError as problem:
             self._solver = kept or self._solver
             if len(staged) > 1:
                 raise _TakenBack from problem
-            return _Added(Verdict((*refused, Outcome(staged[0].insert, problem))))
+            return Verdict((*refused, Outcome(staged[0][0], problem))), ()
         except Exception:
             self._solver = kept or self._solver
             reference = self._fault()
             steps = list(self._replace_solver(reference))
             if len(inserts) > 1:
                 raise _TakenBack(steps) from None
-            return _Added(Verdict((Outcome(inserts[0], Internal(reference)),)), steps)
+            return Verdict((Outcome(inserts[0], Internal(reference)),)), steps
         try:
             changed, graph = self._solver.pick_changed()
             diverged = find_diverged(changed, graph, report)
@@ -250,7 +233,7 @@ class MapSolver(Holding):
                 steps = list(self._go_back(report))
             if len(staged) > 1:
                 raise _TakenBack(steps)
-            return _Added(Verdict((*refused, Outcome(staged[0].insert, diverged))), steps)
+            return Verdict((*refused, Outcome(staged[0][0], diverged))), steps
         self._wary = self._wary or kept is not None
         return self._told_of(staged, refused, self._account_of(report, started), (changed, graph))
 
@@ -296,18 +279,16 @@ class MapSolver(Holding):
             *answers, delta = self._messages.write(_numbers(staged), step, account, *changed)
         except Exception:
             return self._told_nothing(staged, refused, account)
-        return _Added(self._accepted(staged, refused, answers), (self._stepped_to(delta),))
+        return self._accepted(staged, refused, answers), (self._stepped_to(delta),)
 
     def _told_nothing(self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any]) -> _Added:
         """The step is done and is answered, but its delta cannot be made: who misses it sees the gap."""
         answers = self._messages.write_answers(_numbers(staged), self._epoch, self._revision, account)
         accepted = self._accepted(staged, refused, answers)
-        return _Added(accepted, list(self._replace_solver(self._fault())))
+        return accepted, list(self._replace_solver(self._fault()))
 
     def _accepted(self, staged: Sequence[_Staged], refused: Sequence[Outcome], answers: Sequence[bytes]) -> Verdict:
-        accepted = [
-            Outcome(each.insert, answer, each.first_factor) for each, answer in zip(staged, answers, strict=True)
-        ]
+        accepted = [Outcome(insert, answers[k], first_factor) for k, (insert, first_factor) in enumerate(staged)]
         return Verdict((*accepted, *refused), self._revision, len(staged))
 
     def _change(self, insert: Arrived) -> Iterator[Verdict | Stepped]:
@@ -358,16 +339,16 @@ class MapSolver(Holding):
         previous: int | None,
     ) -> Iterator[Verdict | Stepped]:  # fmt: skip
         """The step went well; previous: 0 where its delta is to have everything."""
-        staged, account = [_Staged(insert, first_factor)], self._account_of(report, started, counted)
+        staged, account = [(insert, first_factor)], self._account_of(report, started, counted)
         self._held = self._solver.variable_count, self._solver.factor_count
         try:
             changed = self._solver.pick_changed()
         except Exception:
-            added = self._told_nothing(staged, [], account)
+            verdict, steps = self._told_nothing(staged, [], account)
         else:
-            added = self._told_of(staged, [], account, changed, previous)
-        yield added.verdict
-        yield from added.steps
+            verdict, steps = self._told_of(staged, [], account, changed, previous)
+        yield verdict
+        yield from steps
         if below := cast(Insert, insert.content).convert_below:
             yield from self._convert_to_points(below)
 
@@ -398,4 +379,4 @@ class MapSolver(Holding):
 
 def _numbers(staged: Sequence[_Staged]) -> list[tuple[int, int]]:
     """Of each insert its sequence number and the id of its first factor."""
-    return [(each.insert.sequence, each.first_factor) for each in staged]
+    return [(insert.sequence, first_factor) for insert, first_factor in staged]

@@ -26,7 +26,7 @@ class StepMessages:
         self._out = np.empty(_ROOM, np.uint8)
         self._pack = codec.report_encoder()
         self._step, self._answer, self._ends = np.empty(3, np.int64), np.empty((1, 2), np.int64), np.empty(2, np.int64)
-        self._step_view, self._answer_view = self._step.data, self._answer.data
+        self._step_view, self._answer_view, self._written = self._step.data, self._answer[0].data, self._out.data
 
     def write(
         self,
@@ -45,19 +45,20 @@ class StepMessages:
         view[0], view[1], view[2] = step
         if len(answers) == 1:
             numbers, ends, view = self._answer, self._ends, self._answer_view
-            ((view[0, 0], view[0, 1]),) = answers
+            view[0], view[1] = answers[0]
         else:
             numbers, ends = np.array(answers, np.int64).reshape(-1, 2), np.empty(len(answers) + 1, np.int64)
-        report, out = self._pack(account), self._out
+        report, out, written = self._pack(account), self._out, self._written
         size = write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
         if size > len(out):
             out = np.empty(size, np.uint8)
             write_messages(numbers, self._step, report, changed, graph.array_table, out, ends)
-        written, begin, content = [], 0, out.data
+            written = out.data
+        messages, begin = [], 0
         for end in ends.tolist():
-            written.append(content[begin:end].tobytes())
+            messages.append(written[begin:end].tobytes())
             begin = end
-        return written
+        return messages
 
     def write_answers(
         self, answers: Sequence[tuple[int, int]], epoch: int, revision: int, account: Mapping[str, Any]

@@ -41,25 +41,25 @@ def admit(graph: Graph, batch: BatchLike | Columns, whole: bool = True) -> int:
     BadQuaternion, BadRange, BadLens, BadSight, BadLoss, NotPositiveDefinite, Apart, Uninitialized; `graph` is as it
     was then.
     """
-    columns, problem = (batch, None) if isinstance(batch, Columns) else locate_columns(batch)
+    raw, groups, problem = (batch.raw, batch.groups, None) if isinstance(batch, Columns) else locate_columns(batch)
     mark = graph.mark()
     try:
-        fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
+        fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
         if fault == gt.NO_LIMITS:
-            columns, lens = limit_lenses(columns)
+            raw, groups, lens = limit_lenses(raw, groups)
             problem = lens or problem
-            fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
+            fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
         if fault == gt.NO_ROOM:
-            graph.make_room(columns.groups)
-            fault, g, row, rest = admit_groups(*columns, whole, graph.array_table)
+            graph.make_room(groups)
+            fault, g, row, rest = admit_groups(raw, groups, whole, graph.array_table)
         if g >= 0:
-            raise _find_bad_row(graph, columns, (g, row), fault, whole)
+            raise _find_bad_row(graph, raw, groups[g], row, fault, whole)
         if problem is not None:
             raise problem
         if fault == gt.COMPOSED_OUT_OF_BOUNDS:
             raise value_out_of_bounds(graph, row)
         if rest:
-            _finish(graph, columns.groups, mark, rest)
+            _finish(graph, groups, mark, rest)
     except BaseException:
         graph.forget(mark)
         raise
@@ -114,11 +114,8 @@ def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> 
     return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
 
 
-def _find_bad_row(
-    graph: Graph, columns: Columns, where: tuple[int, int], fault: int, whole: bool
-) -> errors.SolverError:
-    """What is wrong with a row of a group."""
-    raw, group, n = columns.raw, columns.groups[where[0]], where[1]
+def _find_bad_row(graph: Graph, raw: bytes, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
+    """What is wrong with the n-th row of a group."""
     code, keys, numbers = (int(group[column]) for column in (gt.G_KIND, gt.G_KEYS, gt.G_NUMBERS))
     if not group[gt.G_FACTORS]:
         kind = VARIABLE_KIND_OF_CODE[code]

@@ -33,14 +33,14 @@ class Columns(NamedTuple):
     groups: I64
 
 
-def locate_columns(batch: BatchLike) -> tuple[Columns, errors.SolverError | None]:
+def locate_columns(batch: BatchLike) -> tuple[bytes, I64, errors.SolverError | None]:
     """The columns of `batch`; or of its first groups, and what is wrong with the kind or a shape of the next one."""
     form: list[Any] = []
     columns: list[Any] = []
     for group in batch.variables:
         keys, values, stamps = group.keys, group.values, group.stamps
         columns.append(keys)
-        form += (group.kind, group.fixed, _form(keys))
+        form += (group.kind, group.fixed, (keys.dtype, keys.shape) if type(keys) is ndarray else _form(keys))
         for column in (values, stamps):
             if column is None:
                 form.append(_ABSENT)
@@ -51,7 +51,11 @@ def locate_columns(batch: BatchLike) -> tuple[Columns, errors.SolverError | None
     for group in batch.factors:
         keys, measured, information = group.keys, group.measured, group.information
         columns += (keys, measured, information)
-        form += (group.kind, group.loss, _form(keys), _form(measured), _form(information))
+        form += (group.kind, group.loss)
+        if type(keys) is type(measured) is type(information) is ndarray:
+            form += (keys.dtype, keys.shape), (measured.dtype, measured.shape), (information.dtype, information.shape)
+        else:
+            form += _form(keys), _form(measured), _form(information)
         if group.loss and group.scale is not None:
             columns.append(group.scale)
             form.append(_form(group.scale))
@@ -63,15 +67,15 @@ def locate_columns(batch: BatchLike) -> tuple[Columns, errors.SolverError | None
         groups, problem = _table_before(variables, tuple(form)), found
         columns = columns[: _count_columns(groups)]
     try:
-        return Columns(b"".join(columns), groups), problem
+        return b"".join(columns), groups, problem
     except TypeError:  # one of them is not contiguous
-        return Columns(b"".join([column.tobytes() for column in columns]), groups), problem
+        return b"".join([column.tobytes() for column in columns]), groups, problem
 
 
-def limit_lenses(columns: Columns) -> tuple[Columns, errors.SolverError | None]:
+def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverError | None]:
     """The same columns, where lenses have their limits; or those before the first group of factors with a lens that is
     none, and what is wrong with it."""
-    raw, groups, added, end = columns.raw, columns.groups.copy(), list[bytes](), len(columns.raw)
+    groups, added, end = groups.copy(), list[bytes](), len(raw)
     for g in range(len(groups)):
         row = groups[g]
         if row[gt.G_KIND] == gt.END:
@@ -87,10 +91,10 @@ def limit_lenses(columns: Columns) -> tuple[Columns, errors.SolverError | None]:
             limited = with_limits(kind, measured)
         except errors.SolverError as problem:
             stays = (groups[:, gt.G_FACTORS] == 0) | (np.arange(len(groups)) < g)
-            return Columns(b"".join([raw, *added]), groups[stays]), problem
+            return b"".join([raw, *added]), groups[stays], problem
         added.append(limited.tobytes())
         row[gt.G_NUMBERS], end = end, end + len(added[-1])
-    return Columns(b"".join([raw, *added]), groups), None
+    return b"".join([raw, *added]), groups, None
 
 
 def ints_at(raw: bytes, start: int, count: int) -> I64:
