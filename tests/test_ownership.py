@@ -1,5 +1,6 @@
 """What others can write to is not trusted: the kernel cache, which is code, and journals.  What is made is private."""
 
+import json
 import os
 import shutil
 import stat
@@ -12,8 +13,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from factorbus.cli.doctor.checks import cache
-from factorbus.cli.output.exits import REFUSED
+from factorbus.cli.doctor.checks import CHECKS, cache
+from factorbus.cli.output.exits import FAILED, REFUSED
 from factorbus.journal.bundle import export_map, import_map
 from factorbus.journal.checkpoints import file_of, write_checkpoint
 from factorbus.journal.lock import own
@@ -177,6 +178,11 @@ def test_a_cache_that_others_can_write_to_is_refused_and_the_doctor_says_so(
     monkeypatch.setenv("FACTORBUS_CACHE", str(folder))
     finding = cache()
     assert (finding.state, str(folder) in finding.seen) == ("fail", True)
+    ran = factorbus("doctor", "--json", FACTORBUS_CACHE=str(folder))
+    checks = {check["name"]: check for check in json.loads(ran.stdout)["checks"]}
+    assert (ran.returncode, checks["kernel cache"]["state"], checks["bus"]["state"]) == (FAILED, "fail", "fail"), ran
+    assert (checks["numba"]["state"], checks["numba"]["mend"]) == ("warn", "see kernel cache")
+    assert len(checks) == len(CHECKS)
     folder.chmod(0o700)
     assert cache().state == "warn"  # empty
     inner = folder / "kernels" / "0123"

@@ -38,7 +38,7 @@ def test_another_version_is_said_and_not_waited_for(tmp_path: Path, ask: str, ve
     with someone_of(version, endpoint_in(tmp_path)), connect(endpoint_in(tmp_path), timeout_s=for_ever_s) as bus:
         with pytest.raises(OtherProtocol) as refused:
             ASKS[ask](bus)
-        assert refused.value.detail == {"versions": [version], "wanted": "v1"}
+        assert refused.value.detail == {"versions": [version], "seen": version, "wanted": "v1"}
         assert f"speak version {version} of the protocol, this client v1" in refused.value.message
 
 

@@ -85,7 +85,7 @@ def test_error_names_file_and_line(tmp_path: Path, case: str) -> None:
     assert str(problem).startswith(f"{path}:{line}: ")
     assert words in str(problem)
     assert "; wanted " in str(problem)
-    assert problem.detail == {"file": str(path), "line": line}
+    assert problem.detail == {"file": str(path), "line": line, "seen": problem.found, "wanted": problem.wanted}
 
 
 def test_first_wrong_line_of_several_is_named(tmp_path: Path) -> None:

@@ -76,7 +76,10 @@ OPENS = {
         0.00267980137,
         {"PARAMS_CAMERACALIB": 1},
     ),
-    "camera of the sensor's number": (  # g2o has 2.334492698 of it: two parameters of one number
+    # To g2o both are parameter 0, and the first stays.  In versions where a ParameterCamera is a ParameterSE3Offset the
+    # edge takes its place, which is the same here.  In g2o 2.3 it is none, but is read as one unchecked: a point at
+    # (x, y, z) is predicted at (z, 0, 0), so the 2.334492698 that it has of this file mean nothing.
+    "camera of the sensor's number": (
         "PARAMS_CAMERACALIB 0 0 0 0 0 0 0 1 500 500 320 240\nPARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n" + SEEN,
         0.00267980137,
         {"PARAMS_CAMERACALIB": 1},

@@ -200,6 +200,36 @@ def test_losses_and_antennas_beside_the_pose_are_left_out_and_said() -> None:
         g2o_text(Batch(batch.variables, (robust, sight)), strict=True)
 
 
+def test_what_is_left_out_of_several_groups_is_said_once_for_the_file() -> None:
+    """A map has a group of a kind that is fixed, and one that is not; a kind of factor by its losses."""
+    poses = [np.array([symbol("x", k)]) for k in range(4)]
+    at = np.array([[0, 0, 0, 0, 0, 0, 1.0]])
+    batch = Batch(
+        (
+            Variables("se3", poses[0], at, True, np.array([1])),
+            Variables("se3", poses[1], at, False, np.array([2])),
+            Variables("se3", poses[2]),
+            Variables("se3", poses[3], None, True),
+            Variables("idp", np.array([symbol("f", 1)]), np.ones((1, 6))),
+            Variables("idp", np.array([symbol("f", 2)]), np.ones((1, 6)), True),
+        ),
+        tuple(
+            Factors("between_se3", np.stack(poses[:2], 1), at, np.eye(6)[np.triu_indices(6)][None], "huber", np.ones(1))
+            for _ in range(3)
+        ),
+    )
+    written = as_g2o(batch)
+    assert written.notes == (
+        "2 time stamps left out: g2o has no record for the time of se3 variables",
+        "2 idp left out: g2o has no record for such variables",
+        "3 between_se3 losses left out: g2o has no losses: written without their huber",
+        "2 variables left out: neither a value nor an edge tells of x2, x3",
+    )
+    assert written.left_out == {"time stamps": 2, "idp": 2, "between_se3 loss": 3, "variables": 2}
+    with pytest.raises(FormatError, match="2 time stamps, g2o has no record"):
+        as_g2o(batch, strict=True)
+
+
 def test_variable_that_nothing_tells_of_is_left_out_and_said() -> None:
     lonely = Variables("se2", np.array([symbol("x", 3)]))
     written = as_g2o(Batch((lonely,)))

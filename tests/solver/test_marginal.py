@@ -115,6 +115,41 @@ def test_a_border_of_three_is_a_factor_in_pieces_and_marginalizing_comes_first()
         with_changes(solver, [Change("weigh", np.array([0]), weight=np.array([2.0])), *oldest(0, 5)])
 
 
+NO_KEYS = np.empty(0, np.int64)
+EARLIER = {
+    "a loss": Change("loss", np.array([1]), loss="huber", scale=np.ones(1)),
+    "no loss, where none is": Change("loss", np.array([1]), loss=""),
+    "a loss of nothing": Change("loss", NO_KEYS, loss=""),
+    "a weight": Change("weigh", np.array([1]), weight=np.full(1, 2.0)),
+    "a weight of 1": Change("weigh", np.array([1]), weight=np.ones(1)),
+    "a weight of nothing": Change("weigh", NO_KEYS, weight=np.empty(0)),
+    "a pose fixed": Change("fix", keys=np.array([symbol("x", 6)])),
+    "a fixed pose fixed": Change("fix", keys=np.array([symbol("x", 0)])),
+    "nothing fixed": Change("fix", keys=NO_KEYS),
+    "a pose freed": Change("free", keys=np.array([symbol("x", 0)])),
+    "a free pose freed": Change("free", keys=np.array([symbol("x", 3)])),
+    "a pose placed": Change("place", keys=np.array([symbol("x", 6)]), kind="se2", values=np.zeros((1, 3))),
+    "nothing placed": Change("place", keys=NO_KEYS, kind="se2", values=np.empty((0, 3))),
+    "a pose marginalized": Change("marginalize", keys=np.array([symbol("x", 1)])),
+    "nothing marginalized": Change("marginalize", keys=NO_KEYS),
+}
+
+
+@pytest.mark.parametrize("earlier", EARLIER)
+def test_marginalizing_comes_first_whether_or_not_the_earlier_change_has_an_effect(earlier: str) -> None:
+    solver, _ = driven("se2", 8)
+    with pytest.raises(errors.BadOrder, match="before any loss, weigh, fix, free, place or marginalize"):
+        with_changes(solver, [EARLIER[earlier], *oldest(5, 6)])
+
+
+def test_removals_may_come_before_marginalizing() -> None:
+    solver, _ = driven("se2", 8)
+    removed = [Change("remove_factors", NO_KEYS), Change("remove_variables", keys=np.array([symbol("x", 7)]))]
+    after, _, _, counted = with_changes(solver, [*removed, *oldest(5, 6)])
+    assert counted["removed_variables"] == 2
+    assert after.variable_count == 6
+
+
 def test_landmarks_seen_from_one_pose_that_stays_become_what_it_knows() -> None:
     solver, rng = driven("se2", 8)
     l = np.array([symbol("l", 1)])

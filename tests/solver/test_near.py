@@ -25,10 +25,10 @@ ALWAYS = {
 }  # of more than 27 flops
 NEVER = {"reroot_min_flops": math.inf}
 LINEAR = {
-    "relinearize_next_step_share": math.inf,
-    "relinearize_same_step_share": math.inf,
+    "relinearize_next_step_share": 1e9,
+    "relinearize_same_step_share": 1e9,
     "relinearize_max_error": math.inf,
-    "converged_share": math.inf,
+    "converged_share": 1e9,
 }  # little is relinearized
 WORLDS = {"manhattan": manhattan, "sphere": sphere}
 

@@ -51,19 +51,24 @@ def test_a_number_out_of_its_range_is_refused_by_name(name: str) -> None:
         assert refused.value.detail["wanted"] == str(allowed)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "batch_tolerance",
-        "incremental_tolerance",
-        "converge_tolerance",
-        "loop_threshold_share",
-        "chi2_epsilon",
-        "wildfire_threshold",
-        "relinearize_cooldown_factor",
-    ],
-)
-def test_infinity_is_refused_where_nothing_would_be_solved_and_called_converged(name: str) -> None:
+# Thresholds that may be infinite: what they are the threshold of then never happens, and a step says what is left to
+# do all the same.
+OFF_WHEN_INFINITE = {
+    "relinearize_threshold",
+    "relinearize_max_error",
+    "relinearize_cooldown_flops",
+    "reroot_min_flops",
+    "reroot_period",
+    "reroot_ring_ratio",
+    "reroot_max_extra",
+}
+
+
+@pytest.mark.parametrize("name", sorted(RANGES))
+def test_infinity_is_refused_but_where_it_turns_something_off(name: str) -> None:
+    if name in OFF_WHEN_INFINITE:
+        assert Options.of(**{name: math.inf}).as_dict()[name] == math.inf
+        return
     with pytest.raises(BadOption, match=f"option {name}: seen inf"):
         Options.of(**{name: math.inf})
 

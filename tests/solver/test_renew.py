@@ -15,10 +15,10 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 
 OFTEN = {
     "relinearize_next_step_share": 1e-9,
-    "relinearize_same_step_share": np.inf,
+    "relinearize_same_step_share": 1e9,
     "relinearize_threshold": 1e-6,
     "relinearize_cooldown_factor": 1.0,
-    "converged_share": np.inf,
+    "converged_share": 1e9,
 }
 WORLDS = {"manhattan": manhattan, "city_trees": city_trees, "sphere": sphere}
 

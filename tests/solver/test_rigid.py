@@ -16,10 +16,10 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model import layout as at
 
 FAR = {
-    "relinearize_next_step_share": np.inf,
-    "relinearize_same_step_share": np.inf,
+    "relinearize_next_step_share": 1e9,
+    "relinearize_same_step_share": 1e9,
     "relinearize_max_error": np.inf,
-    "converged_share": np.inf,
+    "converged_share": 1e9,
 }
 WORLDS: dict[str, Callable[[], Iterator[Batch]]] = {
     "poses": lambda: (step.batch for step in manhattan(500, 5)),

@@ -15,11 +15,11 @@ from factorbus.solver.kernels.bayes_tree.linearization_error import burden, dear
 from factorbus.solver.kernels.model import layout as at
 
 NEVER = {
-    "relinearize_next_step_share": np.inf,
-    "relinearize_same_step_share": np.inf,
+    "relinearize_next_step_share": 1e9,
+    "relinearize_same_step_share": 1e9,
     "relinearize_max_error": np.inf,
     "relinearize_max_wait": 10**9,
-    "converged_share": np.inf,
+    "converged_share": 1e9,
 }
 
 
@@ -40,7 +40,7 @@ def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[tuple[CliqueTree, 
 
 @pytest.mark.parametrize("world", [manhattan, city_trees])
 def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
-    options = Options.of(relinearize_same_step_share=np.inf, converged_share=np.inf)
+    options = Options.of(relinearize_same_step_share=1e9, converged_share=1e9)
     solver, waited, relinearized, largest = Solver(options), 0, 0, 0.0
     for tree, before, due in drive(solver, (step.batch for step in world(700, 11))):
         if due:
@@ -72,7 +72,7 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
         solver = Solver(
             Options.of(
                 relinearize_full_batch=many,
-                relinearize_same_step_share=np.inf,
+                relinearize_same_step_share=1e9,
                 relinearize_max_error=np.inf,
                 converged_share=1e5,
             )

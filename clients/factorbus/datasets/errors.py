@@ -32,16 +32,16 @@ class UnknownDataset(DatasetProblem):
     code = "unknown_dataset"
 
     def __init__(self, name: str, known: tuple[str, ...]) -> None:
-        super().__init__(f"there is no data set {name[:64]!r}; wanted one of {', '.join(known)}", seen=name[:64])
+        wanted = f"one of {', '.join(known)}"
+        super().__init__(f"there is no data set {name[:64]!r}; wanted {wanted}", seen=name[:64], wanted=wanted)
 
 
 class BadAddress(DatasetProblem):
     code = "bad_address"
 
     def __init__(self, address: str) -> None:
-        super().__init__(
-            f"address {address!r} cannot be fetched from; wanted one such as https://mirror.example/raw", seen=address
-        )
+        wanted = "one such as https://mirror.example/raw"
+        super().__init__(f"address {address!r} cannot be fetched from; wanted {wanted}", seen=address, wanted=wanted)
 
 
 class Unreachable(DatasetProblem):
@@ -68,7 +68,9 @@ class BrokenDownload(DatasetProblem):
     code = "broken_download"
 
     def __init__(self, url: str, seen: str, wanted: str) -> None:
-        super().__init__(f"{url}: {seen}; wanted {wanted}; nothing was kept, try again", url=url)
+        super().__init__(
+            f"{url}: {seen}; wanted {wanted}; nothing was kept, try again", url=url, seen=seen, wanted=wanted
+        )
 
 
 class BadChecksum(DatasetProblem):

@@ -9,7 +9,9 @@ class BadRosMessage(Problem):
     code = "bad_ros_message"
 
     def __init__(self, topic: str, found: str, wanted: str) -> None:
-        super().__init__(f"{topic}: {found}; wanted {wanted}; the message is not used", topic=topic)
+        super().__init__(
+            f"{topic}: {found}; wanted {wanted}; the message is not used", topic=topic, seen=found, wanted=wanted
+        )
 
 
 class Unusable(Problem):
@@ -31,4 +33,4 @@ class BadRosName(Problem):
     code = "bad_ros_name"
 
     def __init__(self, what: str, name: str, wanted: str) -> None:
-        super().__init__(f"{what} {name!r} cannot be; wanted {wanted}", name=name)
+        super().__init__(f"{what} {name!r} cannot be; wanted {wanted}", name=name, seen=name, wanted=wanted)

@@ -11,7 +11,7 @@ class BadParameter(Problem):
     code = "bad_parameter"
 
     def __init__(self, name: str, seen: object, wanted: str) -> None:
-        super().__init__(f"{name} is {seen!r}; wanted {wanted}", parameter=name)
+        super().__init__(f"{name} is {seen!r}; wanted {wanted}", parameter=name, seen=repr(seen), wanted=wanted)
 
 
 def checked_run(poses: int, seed: int) -> None:

@@ -60,7 +60,7 @@ class BadSymbol(Problem):
     code = "bad_symbol"
 
     def __init__(self, text: str, wanted: str) -> None:
-        super().__init__(f"variable key {text!r} cannot be read: wanted {wanted}", seen=text)
+        super().__init__(f"variable key {text!r} cannot be read: wanted {wanted}", seen=text, wanted=wanted)
 
 
 class BadStamp(Problem):
@@ -75,9 +75,8 @@ class BadName(Problem):
     code = "bad_name"
 
     def __init__(self, what: str, name: str, most: int = 64) -> None:
-        super().__init__(
-            f"{what} name {name!r} will not do: wanted 1 to {most} of the characters A-Z a-z 0-9 _ -", seen=str(name)
-        )
+        wanted = f"1 to {most} of the characters A-Z a-z 0-9 _ -"
+        super().__init__(f"{what} name {name!r} will not do: wanted {wanted}", seen=str(name), wanted=wanted)
 
 
 class BadEndpoint(Problem):
@@ -85,14 +84,15 @@ class BadEndpoint(Problem):
 
     def __init__(self, endpoint: str, more: str = "") -> None:
         wanted = f"protocol/address{more and ' '}{more}, such as tcp/127.0.0.1:7447"
-        super().__init__(f"endpoint {endpoint!r} cannot be read; wanted {wanted}", seen=endpoint)
+        super().__init__(f"endpoint {endpoint!r} cannot be read; wanted {wanted}", seen=endpoint, wanted=wanted)
 
 
 class BadSetting(Problem):
     code = "bad_setting"
 
     def __init__(self, path: str, reason: str) -> None:
-        super().__init__(f"setting {path!r}: {reason}; wanted a path and value of a zenoh configuration", seen=path)
+        wanted = "a path and value of a zenoh configuration"
+        super().__init__(f"setting {path!r}: {reason}; wanted {wanted}", seen=path, wanted=wanted)
 
 
 class BadShape(Problem):
@@ -151,7 +151,9 @@ class BadSequence(Problem):
     code = "bad_sequence"
 
     def __init__(self, client: str, seen: int, wanted: str, next_sequence: int) -> None:
-        super().__init__(f"client {client} sent sequence {seen}; wanted {wanted}", seen=seen, next=next_sequence)
+        super().__init__(
+            f"client {client} sent sequence {seen}; wanted {wanted}", seen=str(seen), wanted=wanted, next=next_sequence
+        )
 
 
 class WrongEpoch(Problem):
@@ -180,7 +182,7 @@ class UnknownQuestion(Problem):
     code = "unknown_question"
 
     def __init__(self, question: str, wanted: str) -> None:
-        super().__init__(f"question {question!r} is not understood; wanted {wanted}", seen=question)
+        super().__init__(f"question {question!r} is not understood; wanted {wanted}", seen=question, wanted=wanted)
 
 
 class SeveralRobots(Problem):
@@ -283,10 +285,12 @@ class OtherProtocol(Problem):
     code = "other_protocol"
 
     def __init__(self, versions: list[str], wanted: str) -> None:
+        seen = ", ".join(versions)
         super().__init__(
-            f"the services here speak version {', '.join(versions)} of the protocol, this client {wanted}, and they do "
+            f"the services here speak version {seen} of the protocol, this client {wanted}, and they do "
             "not hear each other: update the older of the two",
             versions=versions,
+            seen=seen,
             wanted=wanted,
         )
 

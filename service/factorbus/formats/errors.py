@@ -20,7 +20,7 @@ class FormatError(Problem):
     def __init__(self, file: str, line: int | None, found: str, wanted: str) -> None:
         self.file, self.line, self.found, self.wanted = file, line, found, wanted
         place = file if line is None else f"{file}:{line}"
-        super().__init__(f"{place}: {found}; wanted {wanted}", file=file, line=line)
+        super().__init__(f"{place}: {found}; wanted {wanted}", file=file, line=line, seen=found, wanted=wanted)
 
 
 def refuse_first(

@@ -1,6 +1,7 @@
 """Write a graph as g2o text.  Numbers are written so that reading gives the same bits."""
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,8 @@ for _name, _record in G2O.edges.items():
     if not _record.lead:
         _EDGES.setdefault(_record.kind, (_name, _record))
 _OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
+# How many of what are left out, by name and reason.  A kind may come in several groups: each is said once for the file.
+_Lost = Counter[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,45 +105,50 @@ def _plain(numbers: Iterable[float]) -> str:
 def _writable(batch: Batch, left: LeftOut) -> Batch:
     """What of `batch` g2o has records for.  Raises FormatError for a factor of a variable that is not there."""
     _refuse_unknown(batch)
+    lost = _Lost()
     variables = []
     for group in batch.variables:
         if group.kind in _VERTEX_NAMES:
             variables.append(group)
         else:
-            left.drop(group.kind, len(group.keys), "g2o has no record for such variables")
+            lost[group.kind, "g2o has no record for such variables"] += len(group.keys)
         stamps = 0 if group.stamps is None else int((group.stamps != NO_STAMP).sum())
-        left.drop("time stamps", stamps, f"g2o has no record for the time of {group.kind} variables")
+        lost["time stamps", f"g2o has no record for the time of {group.kind} variables"] += stamps
     gone = np.concatenate(
         [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in _VERTEX_NAMES)]
     )
-    factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, left)) is not None]
+    factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, lost)) is not None]
     named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in factors)])
-    return Batch(tuple(_told(variables, named, left)), tuple(factors))
+    told = tuple(_told(variables, named, lost))
+    for (name, why), count in lost.items():
+        left.drop(name, count, why)
+    return Batch(told, tuple(factors))
 
 
-def _writable_factors(group: Factors, gone: I64, left: LeftOut) -> Factors | None:
+def _writable_factors(group: Factors, gone: I64, lost: _Lost) -> Factors | None:
     if group.kind not in _EDGES or np.isin(group.keys, gone).any():
-        left.drop(group.kind, len(group.keys), "g2o has no record for such factors")
+        lost[group.kind, "g2o has no record for such factors"] += len(group.keys)
         return None
     kept = np.ones(len(group.keys), bool)
     if group.kind in ("position_se2", "position_se3"):
         kept = (group.measured[:, _EDGES[group.kind][1].measured :] == 0.0).all(axis=1)
-        left.drop(group.kind, int((~kept).sum()), "g2o has no record for an antenna beside its pose")
+        lost[group.kind, "g2o has no record for an antenna beside its pose"] += int((~kept).sum())
     if group.loss:
-        left.drop(f"{group.kind} loss", len(group.keys), f"g2o has no losses: written without their {group.loss}")
+        lost[f"{group.kind} loss", f"g2o has no losses: written without their {group.loss}"] += len(group.keys)
     if not kept.any():
         return None
     return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
 
 
-def _told(variables: list[Variables], named: I64, left: LeftOut) -> Iterator[Variables]:
+def _told(variables: list[Variables], named: I64, lost: _Lost) -> Iterator[Variables]:
     """The variables that a vertex line or an edge tells of."""
+    untold: list[str] = []
     for group in variables:
         told = np.isin(group.keys, named) if group.values is None else np.ones(len(group.keys), bool)
-        lost = [format_symbol(key) for key in group.keys[~told].tolist()]
-        left.drop("variables", len(lost), f"neither a value nor an edge tells of {shown(lost)}")
+        untold += [format_symbol(key) for key in group.keys[~told].tolist()]
         if told.any():
             yield group if told.all() else group._replace(keys=group.keys[told])
+    lost["variables", f"neither a value nor an edge tells of {shown(untold)}"] += len(untold)
 
 
 def _refuse_unknown(batch: Batch) -> None:

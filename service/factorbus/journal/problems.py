@@ -78,7 +78,9 @@ class JournalVersion(Problem):
         newer = (
             "a newer version wrote it: use that one" if seen > wanted else "export it with the version that wrote it"
         )
-        super().__init__(f"{where} has the form {seen}, this version reads {wanted}; {newer}", seen=seen, wanted=wanted)
+        super().__init__(
+            f"{where} has the form {seen}, this version reads {wanted}; {newer}", seen=str(seen), wanted=str(wanted)
+        )
 
 
 class JournalDiffers(Problem):

@@ -35,6 +35,7 @@
 `code`, `message` and `detail` (plain types) are what a service needs to pass any of them on.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -70,7 +71,8 @@ class UnknownMode(SolverError):
     code = "unknown_mode"
 
     def __init__(self, seen: str, known: Sequence[str]) -> None:
-        super().__init__(f"there is no mode {seen!r}; wanted one of {', '.join(known)}", seen=seen)
+        wanted = f"one of {', '.join(known)}"
+        super().__init__(f"there is no mode {seen!r}; wanted {wanted}", seen=seen, wanted=wanted)
 
 
 class BadOption(SolverError):
@@ -106,7 +108,8 @@ class UnknownKind(SolverError):
     code = "unknown_kind"
 
     def __init__(self, what: str, seen: str, known: Sequence[str]) -> None:
-        super().__init__(f"there is no kind of {what} {seen!r}; wanted one of {', '.join(known)}", seen=seen)
+        wanted = f"one of {', '.join(known)}"
+        super().__init__(f"there is no kind of {what} {seen!r}; wanted {wanted}", seen=seen, wanted=wanted)
 
 
 class BadShape(SolverError):
@@ -171,7 +174,8 @@ class OutOfBounds(SolverError):
             f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; "
             "choose units and an origin near the data, or a larger sigma",
             where=where,
-            seen=seen,
+            seen=f"{seen:.6g}",
+            wanted=wanted,
             least=least,
             most=most,
         )
@@ -181,11 +185,13 @@ class Diverged(SolverError):
     code = "diverged"
 
     def __init__(self, what: str, seen: float, most: float, key: int | None = None) -> None:
+        wanted = f"at most {most:g} in magnitude" if math.isfinite(most) else "a finite number"
         super().__init__(
-            f"the step would leave {what} at {seen:.6g}, wanted at most {most:g}: what was inserted does not determine "
+            f"the step would leave {what} at {seen:.6g}, wanted {wanted}: what was inserted does not determine "
             "it, or contradicts the map; the map is as it was. Leave the factor out, or add a prior",
             where=what,
-            seen=seen,
+            seen=f"{seen:.6g}",
+            wanted=wanted,
             most=most,
             **({} if key is None else {"key": key}),
         )
@@ -196,7 +202,7 @@ class BadQuaternion(SolverError):
 
     def __init__(self, where: str, norm: float) -> None:
         super().__init__(
-            f"{where}: the quaternion has length {norm:.6g}, wanted 1 to within 1e-3, in the order qx qy qz qw",
+            f"{where}: the quaternion has length {norm:.6g}, wanted length 1 to within 1e-3, in the order qx qy qz qw",
             where=where,
             seen=f"{norm:.6g}",
             wanted="length 1 to within 1e-3",

@@ -44,8 +44,8 @@ def _count(least: int) -> Range:
 
 _SHARE, _FINITE, _AMOUNT, _FACTOR = Range(0.0, 1.0), Range(most=1e9), Range(), Range(above=True)
 
-# An amount may be infinite: what it is the threshold of then never happens.  Where that would be to solve nothing, and
-# to say that it has converged, it is a share, or finite.
+# An amount may be infinite: what it is the threshold of then never happens.  Where that would be to solve nothing, or
+# to relinearize nothing, and to say that it has converged, it is a share, or finite.
 RANGES = types.MappingProxyType(
     {
         "batch_tolerance": _SHARE,
@@ -60,8 +60,8 @@ RANGES = types.MappingProxyType(
         "converge_max_iterations": _count(0),
         "constrain_recent_poses": _count(1),
         "relinearize_threshold": _AMOUNT,
-        "relinearize_next_step_share": _AMOUNT,
-        "relinearize_same_step_share": _AMOUNT,
+        "relinearize_next_step_share": _FINITE,
+        "relinearize_same_step_share": _FINITE,
         "relinearize_full_batch": _count(1),
         "relinearize_max_error": _AMOUNT,
         "relinearize_max_wait": _count(0),
@@ -69,7 +69,7 @@ RANGES = types.MappingProxyType(
         "relinearize_cooldown_factor": _FINITE,
         "relinearize_cooldown_flops": _FACTOR,
         "max_rounds": _count(1),
-        "converged_share": _AMOUNT,
+        "converged_share": _FINITE,
         "wildfire_threshold": _SHARE,
         "constrain_recent_steps": _count(0),
         "reroot_min_flops": _AMOUNT,

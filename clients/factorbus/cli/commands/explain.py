@@ -44,7 +44,8 @@ def command(code: str | None) -> None:
     if name not in pages:
         near = difflib.get_close_matches(name, pages, n=3)
         hint = f"did you mean {' or '.join(near)}?" if near else "factorbus explain lists all of them"
-        raise Stopped("unknown_code", f"there is no error code {name!r}; {hint}", USAGE, seen=name)
+        wanted = "a code that factorbus explain lists"
+        raise Stopped("unknown_code", f"there is no error code {name!r}; {hint}", USAGE, seen=name, wanted=wanted)
     click.echo(f"{name}\n\n{pages[name]}")
 
 

@@ -83,6 +83,9 @@ def numba() -> Finding:
         from factorbus.solver import why_stock_numba
     except ValueError as wrong:
         return Finding("numba", "fail", str(wrong), "unset FACTORBUS_STOCK_NUMBA")
+    except UnsafeFolder:
+        seen = f"numba {installed('numba')}; not looked at: no kernel loads while their cache is not safe"
+        return Finding("numba", "warn", seen, "see kernel cache")
     seen = f"numba {installed('numba')}"
     if why := why_stock_numba():
         mend = "unset FACTORBUS_STOCK_NUMBA" if "FACTORBUS_STOCK_NUMBA" in why else "pip install one of those tested"

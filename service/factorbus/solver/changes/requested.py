@@ -36,6 +36,8 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.bounds import LEAST_INFORMATION, LEAST_SCALE, MOST_INFORMATION, MOST_NUMBER
 
 CHANGES = ("remove_factors", "remove_variables", "loss", "weigh", "fix", "free", "place", "marginalize")
+# A marginal is of the graph as it is: of what came before in the insert, it sees what is removed and nothing else.
+_BEFORE_MARGINALIZE = {"remove_factors", "remove_variables"}
 _NONE = np.empty(0, np.int64)
 # Numbers of a measurement and its information, by the code of the kind.
 _WIDTH = np.array([k.size + k.triangle for _, k in sorted(FACTOR_KIND_OF_CODE.items())], np.int64)
@@ -77,6 +79,7 @@ class Edits:
     placed (n,): whether a variable was given a value; carry: whether others go along with such
     touched (m,): whether a factor was given a loss or a weight
     added: factors that take the place of some   counted: what is to be told of it
+    made: the names of the changes so far, also of those without an effect
     """
 
     stays: np.ndarray
@@ -91,6 +94,7 @@ class Edits:
     carry: bool = False
     added: list[FactorGroup] = field(default_factory=list)
     counted: dict[str, int] = field(default_factory=dict)
+    made: set[str] = field(default_factory=set)
 
 
 def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
@@ -106,6 +110,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
         if make is None:
             raise errors.UnknownKind("change", change.change, CHANGES)
         make(graph, edits, change)
+        edits.made.add(change.change)
     if edits.carry:
         edits.values = carry_along(graph, edits.values, edits.placed, edits.stays, edits.kept)
     check_kept(graph, edits.kept & (edits.loss == at.NO_LOSS))  # what gets a loss leaves the others as well
@@ -242,8 +247,7 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
 
 def _marginalize(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     gone = np.unique(_variables(graph, edits, change))
-    held = (edits.free != (graph.var[: edits.free.size, at.V_COLUMN] >= 0)).any()
-    if edits.added or edits.placed.any() or edits.touched.any() or held:
+    if not edits.made <= _BEFORE_MARGINALIZE:
         raise errors.BadOrder("marginalize", "before any loss, weigh, fix, free, place or marginalize")
     check_kept(graph, edits.kept, all_or_none=True)
     made, replaced = marginals(graph, gone, edits.kept)

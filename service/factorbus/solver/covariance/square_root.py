@@ -71,7 +71,8 @@ def computed_square_root(graph: Graph) -> SquareRoot:
     values = copy.values.copy()
     # The graph is solved, so all of it is held; and the linearization points are the estimate.  They stay there, in one
     # round, wherever what is left of the gradient leads.
-    tree = CliqueTree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1, converged_share=np.inf))
+    tree = CliqueTree(copy, Options(mode="bayes-tree", initialize_locally=False, max_rounds=1))
+    tree.settings[tl.P_CONVERGED] = np.inf
     if tree.step(sure=True) == tl.FAILED:
         key, factors = int(graph.keys[tree.failed]), graph.factors_of(tree.failed)
         raise errors.Underconstrained(key, factors, "its covariance is infinite; add a prior or a factor")
