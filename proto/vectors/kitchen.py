@@ -25,10 +25,10 @@ from factorbus.proto.messages import (
     Delta,
     Estimate,
     Factors,
-    Graph,
     Insert,
     Job,
     JobDone,
+    MapGraph,
     Optimum,
     Variables,
 )
@@ -58,7 +58,7 @@ def messages() -> dict[str, bytes]:
         reports.append(_short(solver.step(settle)))
         changed.append(_variables(solver.changed()))
     variables, factors = solver.graph()
-    graph = Graph(EPOCH, 3, Batch(_variables(variables), tuple(_factors(factors))))
+    graph = MapGraph(EPOCH, 3, Batch(_variables(variables), tuple(_factors(factors))))
     chi2, optimum = solver.chi2(), codec.decode_optimum(jobs.run_job("batch", codec.encode_graph(graph)))
     made = {
         "insert": codec.encode_insert(Insert(1, first(), epoch=EPOCH)),
@@ -201,7 +201,7 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
     return made | {"ask_repair": repairs.encode_ask_repair(ask), "repaired": repairs.encode_repaired(repaired)}
 
 
-def _without_the_false_one() -> Graph:
+def _without_the_false_one() -> MapGraph:
     """Revision 4, after an insert that removes it: ids are no longer 0, 1, 2, ..."""
     solver = Solver(Options(mode="all-batch"))
     closing = third()
@@ -212,10 +212,10 @@ def _without_the_false_one() -> Graph:
     variables, factors = solver.graph()
     ids = {"between_se2": [0, 1, 2], "landmark_se2": [4, 5, 6]}
     groups = tuple(group._replace(ids=np.array(ids[group.kind])) for group in _factors(factors))
-    return Graph(EPOCH, 4, Batch(_variables(variables), groups))
+    return MapGraph(EPOCH, 4, Batch(_variables(variables), groups))
 
 
-def _not_converged(graph: Graph, chi2: float) -> dict[str, bytes]:
+def _not_converged(graph: MapGraph, chi2: float) -> dict[str, bytes]:
     """A worker that ended after one iteration from composed odometry."""
     solver = Solver(Options(mode="all-batch", max_iterations=1))
     bare = tuple(each if each.fixed else Variables(each.kind, each.keys) for each in graph.batch.variables)
@@ -241,7 +241,7 @@ def _worse() -> dict[str, bytes]:
     solver.stage(batch)
     solver.step(settle=True)
     variables, factors = solver.graph()
-    graph = Graph(EPOCH, 1, Batch(_variables(variables), tuple(_factors(factors))))
+    graph = MapGraph(EPOCH, 1, Batch(_variables(variables), tuple(_factors(factors))))
     optimum = codec.decode_optimum(jobs.run_job("batch", codec.encode_graph(graph)))
     free = tuple(group for group in optimum.variables if not group.fixed)
     told = [_digits(number) for number in (solver.chi2(), optimum.chi2)]
@@ -267,7 +267,7 @@ def _stamped_answers() -> dict[str, bytes]:
         "insert_stamps": codec.encode_insert(Insert(1, stamped(), settle=True, epoch=EPOCH)),
         "estimate_stamps": codec.encode_estimate(Estimate(EPOCH, 1, groups)),
         "delta_stamps": codec.encode_delta(Delta(EPOCH, 1, 0, changed, report)),
-        "graph_stamps": codec.encode_graph(Graph(EPOCH, 1, Batch(groups, tuple(_factors(factors))))),
+        "graph_stamps": codec.encode_graph(MapGraph(EPOCH, 1, Batch(groups, tuple(_factors(factors))))),
     }
 
 

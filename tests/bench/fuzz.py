@@ -32,7 +32,7 @@ from processes import processes
 
 from factorbus.proto import codec, features_codec, keys
 from factorbus.proto.limits import MessageLimits as MessageLimits
-from factorbus.proto.messages import Batch, Graph, Insert
+from factorbus.proto.messages import Batch, Insert, MapGraph
 from factorbus.proto.problems import Problem, Refused
 from factorbus.service.config import Limits
 from factorbus.service.core.events import Answer, Applied, Arrived, InsertBatch, Refuse, Stepped, Verdict
@@ -286,8 +286,8 @@ def _same_content(ours: bytes, theirs: bytes) -> bool:
     left, right = (codec.decode_graph(each).batch for each in (ours, theirs))
     return [(g.kind, g.fixed, g.keys.tobytes()) for g in left.variables] == [
         (g.kind, g.fixed, g.keys.tobytes()) for g in right.variables
-    ] and codec.encode_graph(Graph(0, 0, Batch((), left.factors))) == codec.encode_graph(
-        Graph(0, 0, Batch((), right.factors))
+    ] and codec.encode_graph(MapGraph(0, 0, Batch((), left.factors))) == codec.encode_graph(
+        MapGraph(0, 0, Batch((), right.factors))
     )
 
 

@@ -14,7 +14,7 @@ from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
 from factorbus.client.uncertainty import factors_of
-from factorbus.proto.messages import Batch, Estimate, Graph
+from factorbus.proto.messages import Batch, Estimate, MapGraph
 from factorbus.proto.problems import BadOption, ClosedHere
 
 pytestmark = pytest.mark.timeout(60)
@@ -59,7 +59,7 @@ def kitchen(bus: Bus) -> Iterator[Map]:
         (lambda: factors_of(ANY), "candidates: 'n' (str); wanted a Draft, a Batch, or a sequence of Factors"),
         (lambda: factors_of(cast("Any", None)), "candidates: None (NoneType); wanted a Draft, a Batch"),
         (
-            lambda: fit_into(Estimate(1, 1, ()), Graph(1, 1, Batch()), anchors=ANY),
+            lambda: fit_into(Estimate(1, 1, ()), MapGraph(1, 1, Batch()), anchors=ANY),
             "anchors: 'no' (str); wanted a Draft or a Batch",
         ),
         (lambda: connect("tcp/127.0.0.1:1", timeout_s=ANY), "timeout_s: 'no' (str); wanted seconds"),
@@ -86,7 +86,7 @@ def test_true_and_false_of_numpy_will_do() -> None:
         (lambda m: m.send(POINT, settle="no"), "settle: 'no' (str); wanted True or False"),
         (lambda m: m.insert(POINT, changes=POINT), "changes: an object of type Draft; wanted a Changes"),
         (lambda m: m.change("no"), "changes: 'no' (str); wanted a Changes"),
-        (lambda m: m.merge("other"), "other: 'other' (str); wanted a Map, or the Graph of one"),
+        (lambda m: m.merge("other"), "other: 'other' (str); wanted a Map, or the MapGraph of one"),
         (lambda m: m.chi2("no"), "batch: 'no' (str); wanted True or False"),
         (lambda m: m.chi2(True, values="no"), "values: 'no' (str); wanted True or False"),
         (lambda m: m.export(strict="no"), "strict: 'no' (str); wanted True or False"),

@@ -22,7 +22,7 @@ from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.pieces import cut
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS, parts_of
-from factorbus.proto.messages import Batch, Estimate, Factors, Graph, Variables
+from factorbus.proto.messages import Batch, Estimate, Factors, MapGraph, Variables
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.symbols import parse_symbol
 from factorbus.solver import Options, Solver
@@ -164,12 +164,12 @@ def here(*names: str) -> Estimate:
     return Estimate(7, 1, (Variables("se2", keys, rows),))
 
 
-def there(*more: Callable[[Draft], Any]) -> Graph:
+def there(*more: Callable[[Draft], Any]) -> MapGraph:
     """x0 and x1, one metre apart along x, and something more."""
     draft = Draft().se2("x0", (0, 0, 0)).se2("x1", (1, 0, 0)).between_se2("x0", "x1", (1, 0, 0), sigmas=SIGMAS)
     for add in more:
         add(draft)
-    return Graph(9, 4, draft.batch())
+    return MapGraph(9, 4, draft.batch())
 
 
 LETTERS = {"x": "y"}
@@ -207,7 +207,7 @@ def test_of_several_anchors_a_false_one_does_not_say_where_the_map_begins() -> N
 def test_a_frame_alone_becomes_a_relative_pose_between_what_holds_the_maps() -> None:
     other = there()
     fixed = Variables("se2", np.array([parse_symbol("x5")]), np.array([[3.0, 0, 0]]), True)
-    other = Graph(9, 4, other.batch._replace(variables=(*other.batch.variables, fixed)))
+    other = MapGraph(9, 4, other.batch._replace(variables=(*other.batch.variables, fixed)))
     fitted = fit_into(here("x0", "x1"), other, frame=(1, 2, np.pi / 2), sigmas=SIGMAS, letters=LETTERS)
     tie = fitted.batch.factors[-1]
     assert tie.keys.tolist() == [[parse_symbol("x0"), parse_symbol("y5")]]
@@ -266,7 +266,7 @@ def test_what_is_known_of_many_poses_is_left_out_whole_or_kept_whole() -> None:
     sent = tuple(Factors(g.kind, g.keys, g.measured, g.information) for g in pieces)
     assert are_relative(sent[-1]).all()
     batch = there().batch
-    other = Graph(
+    other = MapGraph(
         9, 4, Batch((*batch.variables, Variables("se2", keys[2:], np.zeros((1, 3)))), (*batch.factors, *sent))
     )
     fit = partial(fit_into, here("x0", "x1"), other, letters=LETTERS, anchors=link())
@@ -293,7 +293,7 @@ def test_what_cannot_be_merged_says_why() -> None:
         (CannotMerge, other, {"letters": LETTERS, "frame": (0, 0)}),
         (CannotMerge, other, {"letters": LETTERS, "frame": (0, np.nan, 0)}),
         (CannotMerge, other, {"letters": LETTERS, "absolute": "perhaps"}),
-        (CannotMerge, Graph(1, 0, Batch()), {"anchors": link()}),
+        (CannotMerge, MapGraph(1, 0, Batch()), {"anchors": link()}),
         (CannotMerge, there(lambda d: d.se3("z1", (0, 0, 0, 0, 0, 0, 1))), {"letters": LETTERS, "anchors": link()}),
         (BadSymbol, other, {"letters": {"x": "yy"}, "anchors": link()}),
     ):
@@ -301,6 +301,6 @@ def test_what_cannot_be_merged_says_why() -> None:
             fit_into(ours, wrong, **how)
 
 
-def collided() -> Graph:
+def collided() -> MapGraph:
     """Has y0 already."""
     return there(lambda d: d.se2("y0", (5, 0, 0)).between_se2("x1", "y0", (4, 0, 0), sigmas=SIGMAS))

@@ -5,12 +5,12 @@ from naive.tree_records import tree_of
 
 from factorbus.solver import Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.model import layout as at
 
 
-def graph_in(solver: Solver) -> Graph:
+def graph_in(solver: Solver) -> FactorGraph:
     """The factor graph of a solver."""
     return solver._graph
 

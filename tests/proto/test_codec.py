@@ -24,10 +24,10 @@ from factorbus.proto.messages import (
     Delta,
     Estimate,
     Factors,
-    Graph,
     Insert,
     Job,
     JobDone,
+    MapGraph,
     Optimum,
     Variables,
 )
@@ -199,7 +199,7 @@ MESSAGES = {
     "accepted": st.builds(Accepted, NUMBERS, NUMBERS, NUMBERS, NUMBERS, NUMBERS, REPORTS),
     "estimate": st.builds(Estimate, NUMBERS, NUMBERS, VALUES),
     "delta": st.builds(Delta, NUMBERS, NUMBERS, NUMBERS, VALUES, REPORTS),
-    "graph": st.builds(Graph, NUMBERS, NUMBERS, BATCHES),
+    "graph": st.builds(MapGraph, NUMBERS, NUMBERS, BATCHES),
     "chi2": st.builds(
         Chi2, NUMBERS, NUMBERS, st.floats(), st.floats(), NAMES, st.floats(), NAMES, batch_converged=st.booleans()
     ),

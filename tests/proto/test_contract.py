@@ -50,7 +50,7 @@ def test_every_code_is_explained() -> None:
         messages.Accepted,
         messages.Estimate,
         messages.Delta,
-        messages.Graph,
+        messages.MapGraph,
         messages.Chi2,
         messages.Job,
         messages.JobDone,

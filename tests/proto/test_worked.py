@@ -14,7 +14,7 @@ from naive.dense_least_squares import DenseGraph, rho
 
 from factorbus.proto import asking_codec as asked
 from factorbus.proto import codec
-from factorbus.proto.messages import Accepted, Delta, Estimate, Graph
+from factorbus.proto.messages import Accepted, Delta, Estimate, MapGraph
 
 ROOT = Path(__file__).parents[2] / "proto" / "vectors"
 WORKED = ROOT / "worked"
@@ -123,7 +123,7 @@ def test_what_is_repaired_is_false(dense: DenseGraph) -> None:
 
 def test_a_form_in_pieces_says_what_it_stands_for() -> None:
     graph = codec.decode_graph(read("graph_pieces"))
-    assert isinstance(graph, Graph)
+    assert isinstance(graph, MapGraph)
     pieces = DenseGraph()
     pieces.add(graph.batch)
     pieces.put(graph.batch.variables)

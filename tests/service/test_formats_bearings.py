@@ -12,7 +12,7 @@ from factorbus.proto.symbols import format_symbol, symbol
 from factorbus.solver import Options, Solver, solve_batch
 from factorbus.solver.errors import Uninitialized
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout
 
 INFO3 = "400 0 0 400 0 2500"
@@ -135,7 +135,7 @@ def sees(poses: np.ndarray, angles: np.ndarray) -> Batch:
 
 def placed(batch: Batch, kind: str = "point2") -> np.ndarray:
     """Where the point is before any step."""
-    graph, size = Graph(), VARIABLE_KINDS[kind].size
+    graph, size = FactorGraph(), VARIABLE_KINDS[kind].size
     admit(graph, batch)
     behind = int(graph.counts[layout.VALUES])
     return graph.values[behind - size : behind]

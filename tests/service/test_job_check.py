@@ -10,7 +10,7 @@ from factorbus.idp import job as idp_job
 from factorbus.proto import codec
 from factorbus.proto.features import Ask, Shard, ShardDone
 from factorbus.proto.features_codec import decode_shard_done, encode_ask, encode_shard, encode_shard_done
-from factorbus.proto.messages import Batch, Factors, Graph, Job, JobDone, Optimum, Variables
+from factorbus.proto.messages import Batch, Factors, Job, JobDone, MapGraph, Optimum, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.service.jobs import running as service_jobs
 from factorbus.service.jobs.dispatch import Ended
@@ -36,7 +36,7 @@ def graph_job() -> Job:
     measured, information = np.array([[1.5, 0.25, 0.125]]), np.array([[100.0, 0, 0, 100, 0, 400]])
     edge = Factors("between_se2", np.array([[x0, x1]]), measured, information, "huber", np.array([1.5]))
     other = Factors("prior_se2", np.array([[x1]]), np.array([[1.0, 0.0, 0.0]]), information)
-    return Job("j", "batch", codec.encode_graph(Graph(1, 1, Batch(variables, (edge, other)))))
+    return Job("j", "batch", codec.encode_graph(MapGraph(1, 1, Batch(variables, (edge, other)))))
 
 
 def done(job: Job, payload: bytes) -> JobDone:

@@ -12,7 +12,7 @@ from naive.random_sights import SIGHTS, random_sight
 from factorbus.proto import kinds as wire
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS, FactorKind
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
@@ -30,7 +30,7 @@ def drawn(kind: FactorKind, rng: np.random.Generator) -> np.ndarray:
     return random_value(of, rng)
 
 
-def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Graph]:
+def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, FactorGraph]:
     """Values of the ends, a measurement far from them, and a graph of that one factor."""
     rng = np.random.default_rng(seed)
     if kind.name in SIGHTS:
@@ -40,7 +40,7 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Gra
         z = random_other(kind.name, ends, 1.0, rng) if kind.name in OTHERS else drawn(kind, rng)
     if kind.name == "bearing_range_se2":
         z = np.array([z[0] % 3.0, abs(z[1]) + 0.1])
-    graph = Graph()
+    graph = FactorGraph()
     admit(
         graph,
         Batch(
@@ -51,7 +51,7 @@ def case(kind: FactorKind, seed: int) -> tuple[list[np.ndarray], np.ndarray, Gra
     return ends, z, graph
 
 
-def evaluate(kind: FactorKind, graph: Graph) -> tuple[np.ndarray, list[np.ndarray]]:
+def evaluate(kind: FactorKind, graph: FactorGraph) -> tuple[np.ndarray, list[np.ndarray]]:
     r, A, B, W = (np.full((1, *shape), np.nan) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
     evaluate_factors(np.arange(1), graph.array_table, graph.values, r, A, B, W)
     return r[0, : kind.dim], [J[0, : kind.dim, : end.dim] for J, end in zip((A, B), kind.connects, strict=False)]

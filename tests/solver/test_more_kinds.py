@@ -9,7 +9,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.solver import Options, Solver, errors
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.kernels.model.kinds import FACTOR_MODELS
 from factorbus.solver.sparse.elimination import constraint
@@ -116,7 +116,7 @@ def test_what_cannot_be_measured_is_refused(name: str) -> None:
 
 def test_a_pose_that_is_joined_to_the_last_one_by_a_linear_factor_is_no_landmark() -> None:
     """Landmarks seen from the last pose are ordered right before it, and nothing else is."""
-    graph, keys = Graph(), np.arange(1, 5)
+    graph, keys = FactorGraph(), np.arange(1, 5)
     poses = Variables("se2", keys[:3], np.zeros((3, 3)))
     point = Variables("point2", keys[3:], np.zeros((1, 2)))
     pair = Factors("linear_pair_se2", keys[[2, 0]][None], np.zeros((1, 27)), _info(3))

@@ -36,7 +36,7 @@ from factorbus.client import Draft
 from factorbus.client.merging import AbsoluteFactors, fit_into
 from factorbus.proto import codec
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.messages import Estimate, Graph, Insert, Variables
+from factorbus.proto.messages import Estimate, MapGraph, Insert, Variables
 from factorbus.solver import Options, Solver
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
@@ -64,7 +64,7 @@ assert account.kind == "depth_se3"
 assert abs(account.residual[0] - r) < 1e-9
 here = Estimate(7, 1, (Variables("se3", np.array([1]), pose[None]),))
 try:
-    fit_into(here, Graph(9, 1, batch), frame=(0, 0, 0, 0, 0, 0, 1.0), letters={"x": "y"})
+    fit_into(here, MapGraph(9, 1, batch), frame=(0, 0, 0, 0, 0, 0, 1.0), letters={"x": "y"})
 except AbsoluteFactors as problem:
     assert "depth_se3" in str(problem)
 else:

@@ -12,7 +12,7 @@ from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
-from factorbus.solver.graph.factor_graph import Graph, roomy
+from factorbus.solver.graph.factor_graph import FactorGraph, roomy
 from factorbus.solver.kernels.model import layout as at
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "stamps": 1, "values": 7, "fac": 1, "payload": 28}
@@ -66,7 +66,7 @@ def test_what_is_small_grows_by_more() -> None:
 
 
 def test_what_has_a_row_for_each_of_the_same_things_grows_alike() -> None:
-    graph = Graph()
+    graph = FactorGraph()
     for _ in range(40):
         graph.reserve_variables(1000, 3000)
         graph.counts[at.VARIABLES] += 1000
@@ -81,7 +81,7 @@ def test_a_copy_of_a_graph_gives_its_own_values(again: Any) -> None:
         solver.stage(batch)
         solver.step()
     solver.estimate()
-    other: Graph = again(solver._graph)
+    other: FactorGraph = again(solver._graph)
     other.values += 1.0
     told = np.concatenate([group.values.ravel() for group in other.variables()])
     assert sorted(told) == sorted(other.values[: other.counts[at.VALUES]])

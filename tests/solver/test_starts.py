@@ -16,7 +16,7 @@ from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.simulate import Spiral, manhattan, sphere
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.starts.averaged import averaged
@@ -44,12 +44,12 @@ def scattered(batch: Batch, seed: int, kinds: tuple[str, ...] = ("se2", "se3", "
     return Batch(tuple(moved), batch.factors)
 
 
-def chi2_of(graph: Graph, values: np.ndarray) -> float:
+def chi2_of(graph: FactorGraph, values: np.ndarray) -> float:
     return sum_chi2(0, int(graph.counts[at.FACTORS]), graph.var, graph.fac, values, graph.payload)
 
 
-def starts_of(batch: Batch) -> tuple[Graph, list[np.ndarray]]:
-    graph = Graph()
+def starts_of(batch: Batch) -> tuple[FactorGraph, list[np.ndarray]]:
+    graph = FactorGraph()
     admit(graph, batch)
     return graph, averaged(graph)
 
@@ -232,7 +232,7 @@ def gtsam_chordal(batch: Batch) -> tuple[float, float]:
         else g._replace(values=np.array([pose_vector(theirs.atPose3(k).matrix()) for k in g.keys.tolist()]))
         for g in batch.variables
     ]
-    at_theirs = Graph()
+    at_theirs = FactorGraph()
     admit(at_theirs, Batch(tuple(moved), batch.factors))
     return chi2_of(at_theirs, at_theirs.values), best_of(batch)[0]
 

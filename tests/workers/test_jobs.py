@@ -6,7 +6,7 @@ from turned import closing, in_one
 
 from factorbus.cli.driving.columns import merged
 from factorbus.proto import codec
-from factorbus.proto.messages import Batch, Factors, Graph, Job, Variables
+from factorbus.proto.messages import Batch, Factors, Job, MapGraph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.service.jobs.running import do_in_place
 from factorbus.simulate import Spiral, sphere
@@ -18,13 +18,13 @@ from factorbus.workers.config import WorkerConfig, checked_worker_config
 INFORMATION = np.array([[100.0, 0, 0, 100, 0, 400]] * 3)
 
 
-def triangle() -> Graph:
+def triangle() -> MapGraph:
     """Three poses in a row whose three edges do not agree: 1 + 1 ≠ 2.3."""
     start = Variables("se2", np.array([0]), np.zeros((1, 3)), fixed=True)
     free = Variables("se2", np.array([1, 2]), np.array([[1.0, 0, 0], [2, 0, 0]]))
     measured = np.array([[1.0, 0, 0], [1, 0, 0], [2.3, 0, 0]])
     edges = Factors("between_se2", np.array([[0, 1], [1, 2], [0, 2]]), measured, INFORMATION)
-    return Graph(1, 1, Batch((start, free), (edges,)))
+    return MapGraph(1, 1, Batch((start, free), (edges,)))
 
 
 def test_the_batch_job_finds_the_optimum() -> None:
@@ -44,7 +44,7 @@ def test_the_service_in_place_finds_the_same_bits() -> None:
 def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Much noise of rotation and few loops: some 800 iterations, where 500 tries are made."""
     world = sphere(200, 1, spiral=Spiral(20, 20), sigma_rotation_rad=0.25, loop_share=0.05, revisit_share=0.0)
-    payload = codec.encode_graph(Graph(1, 1, merged(step.batch for step in world)))
+    payload = codec.encode_graph(MapGraph(1, 1, merged(step.batch for step in world)))
     early = codec.decode_optimum(jobs.run_job("batch", payload))
     assert not early.converged
     monkeypatch.setattr(descent, "_MOST", 5000)
@@ -56,7 +56,7 @@ def test_the_search_on_a_hard_graph_says_that_it_has_not_converged(monkeypatch: 
 def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a worker and in place; here after a single try of each start."""
     drive, loop = in_one(60, 90.0), closing(60)
-    payload = codec.encode_graph(Graph(1, 1, Batch(drive.variables, drive.factors + loop.factors)))
+    payload = codec.encode_graph(MapGraph(1, 1, Batch(drive.variables, drive.factors + loop.factors)))
     whole = codec.decode_optimum(jobs.run_job("batch", payload))
     assert whole.converged
     monkeypatch.setattr(descent, "_CHUNK", 1)
@@ -69,7 +69,7 @@ def test_a_search_that_ends_before_it_has_converged_says_so(monkeypatch: pytest.
 
 
 def test_what_cannot_be_done_has_a_code() -> None:
-    loose = Graph(1, 1, Batch((Variables("se2", np.array([0]), np.zeros((1, 3))),)))
+    loose = MapGraph(1, 1, Batch((Variables("se2", np.array([0]), np.zeros((1, 3))),)))
     for kind, payload, code in (
         ("bake", b"", "unknown_kind"),
         ("batch", b"\xc1", "bad_message"),

@@ -36,7 +36,7 @@ from factorbus.client.questions import logged
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.asking import Repaired
 from factorbus.proto.camera import Camera
-from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, Graph
+from factorbus.proto.messages import Accepted, Batch, Chi2, Delta, Estimate, MapGraph
 
 
 @asynccontextmanager
@@ -172,7 +172,7 @@ class Map:
 
     async def merge(
         self,
-        other: Graph | Map,
+        other: MapGraph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -183,8 +183,8 @@ class Map:
         timeout_s: float | None = None,
     ) -> Merged:
         """Take all of the map `other` into this one, as `factorbus.client.Map.merge`."""
-        if not isinstance(other, Graph):
-            other = await of_type("other", other, Map, "a Map, or the Graph of one").graph(timeout_s)
+        if not isinstance(other, MapGraph):
+            other = await of_type("other", other, Map, "a Map, or the MapGraph of one").graph(timeout_s)
         fitted = fit_into(
             await self.ask_estimate(timeout_s=timeout_s), other,
             anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute,
@@ -239,7 +239,7 @@ class Map:
         """Which factors are false, as in `factorbus.client.Map.repair`.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.repair(factors, probability, timeout_s))
 
-    async def graph(self, timeout_s: float | None = None) -> Graph:
+    async def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
         return await asyncio.wrap_future(self._map.ask.graph(timeout_s))
 

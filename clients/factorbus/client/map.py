@@ -29,7 +29,7 @@ from factorbus.client.window import Window
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Graph, Insert
+from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
 from factorbus.proto.problems import ClosedHere, Problem, Refused, TooLarge, Unavailable
 from factorbus.wording import counted
 
@@ -150,7 +150,7 @@ class Map:
 
     def merge(
         self,
-        other: Graph | Map,
+        other: MapGraph | Map,
         *,
         anchors: Batch | Draft | None = None,
         frame: ArrayLike | None = None,
@@ -175,8 +175,8 @@ class Map:
         Raises KeyCollision, NoAnchor, AbsoluteFactors, CannotMerge, BadSymbol, TooLarge: nothing was sent.  Raises
         Refused (the map is as it was), Unavailable.
         """
-        if not isinstance(other, Graph):
-            other = of_type("other", other, Map, "a Map, or the Graph of one").graph(timeout_s)
+        if not isinstance(other, MapGraph):
+            other = of_type("other", other, Map, "a Map, or the MapGraph of one").graph(timeout_s)
         here = self.ask_estimate(timeout_s=timeout_s)
         fitted = fit_into(here, other, anchors=anchors, frame=frame, sigmas=sigmas, letters=letters, absolute=absolute)
         return Merged(self.insert(fitted.batch, settle=settle, timeout_s=timeout_s), fitted)
@@ -274,7 +274,7 @@ class Map:
         """
         return self.ask.repair(factors, probability, timeout_s).result()
 
-    def graph(self, timeout_s: float | None = None) -> Graph:
+    def graph(self, timeout_s: float | None = None) -> MapGraph:
         """The whole map: variables with present values, and factors.  Raises Refused, Unavailable."""
         return self.ask.graph(timeout_s).result()
 

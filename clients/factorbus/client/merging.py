@@ -28,7 +28,7 @@ from factorbus.client.transform_linear import are_relative, says_nothing
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.linear import LINEAR, LINEAR_PAIRS
-from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, Graph, Variables
+from factorbus.proto.messages import Accepted, Batch, Estimate, Factors, MapGraph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol
 
@@ -107,7 +107,7 @@ class Merged:
 
 def fit_into(
     here: Estimate,
-    other: Graph,
+    other: MapGraph,
     *,
     anchors: Batch | Draft | None = None,
     frame: ArrayLike | None = None,

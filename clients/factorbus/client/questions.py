@@ -10,7 +10,7 @@ from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
 from factorbus.proto.asking import AskRepair, Repaired
-from factorbus.proto.messages import Chi2, Estimate, Graph
+from factorbus.proto.messages import Chi2, Estimate, MapGraph
 from factorbus.proto.problems import BadMessage
 from factorbus.proto.repair_codec import decode_repaired, encode_ask_repair
 
@@ -43,7 +43,7 @@ class Questions:
         question |= {"values": True} if checked_flag("values", values) else {}
         return self._ask("chi2", codec.encode_map(question), codec.decode_chi2, timeout_s)
 
-    def graph(self, timeout_s: float | None) -> Future[Graph]:
+    def graph(self, timeout_s: float | None) -> Future[MapGraph]:
         """Variables with present values, and factors."""
         return self._ask("graph", codec.encode_map({}), codec.decode_graph, timeout_s)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from factorbus.client import Bus, Map
 from factorbus.proto.asking import Covariances
-from factorbus.proto.messages import Graph
+from factorbus.proto.messages import MapGraph
 from factorbus.viz import Spread, spread_of
 from factorbus.viz.certainty import blocks_of, chosen
 
@@ -21,7 +21,7 @@ class Joined:
 
     map: Map
     lookers: int = 0
-    graph: Graph | None = None
+    graph: MapGraph | None = None
     covariances: Covariances | None = None
     asking: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -43,7 +43,7 @@ class JoinedMaps:
         finally:
             await asyncio.to_thread(self._leave, name, joined)
 
-    async def graph(self, joined: "Joined") -> Graph:
+    async def graph(self, joined: "Joined") -> MapGraph:
         """Variables and factors; asked for once a revision, for all clients.  Raises Refused, Unavailable."""
         async with joined.asking:
             mirror, have = joined.map.estimate, joined.graph

@@ -10,7 +10,7 @@ from factorbus.ros2.geometry import Transform, from_plane, from_quaternion, quat
 
 
 @dataclass(frozen=True, slots=True)
-class PoseSpace:
+class BridgeSpace:
     """axes: of x y z and the three rotations.  scale: from the tangent space to a pose's residual, axis by axis."""
 
     pose: str
@@ -54,6 +54,6 @@ class PoseSpace:
 
 # The rotation part of an se3 residual is the vector part of a quaternion: half an angle.
 SPACES = {
-    "plane": PoseSpace("se2", "point2", (0, 1, 5), np.ones(3)),
-    "space": PoseSpace("se3", "point3", (0, 1, 2, 3, 4, 5), np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])),
+    "plane": BridgeSpace("se2", "point2", (0, 1, 5), np.ones(3)),
+    "space": BridgeSpace("se3", "point3", (0, 1, 2, 3, 4, 5), np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])),
 }

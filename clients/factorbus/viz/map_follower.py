@@ -13,7 +13,7 @@ import numpy as np
 from factorbus.client import Map, Snapshot
 from factorbus.client.stream import DeltaStream
 from factorbus.proto.arrays import I64
-from factorbus.proto.messages import Batch, Delta, Factors, Graph, Variables
+from factorbus.proto.messages import Batch, Delta, Factors, MapGraph, Variables
 from factorbus.proto.problems import Problem
 from factorbus.viz.certainty import MapCertainty
 from factorbus.viz.ellipses import Spread
@@ -52,7 +52,7 @@ class MapFollower:
         self._map, self._mirror = joined, joined.estimate
         self._news = threading.Event()
         self._stream = DeltaStream(self._mirror, self._news.set)
-        self._graph = RateLimited(lambda: joined.ask.graph(None), Graph(0, 0, Batch()), self._news.set)
+        self._graph = RateLimited(lambda: joined.ask.graph(None), MapGraph(0, 0, Batch()), self._news.set)
         self._with_factors = with_factors
         self._certainty = MapCertainty(joined, ellipses, self._news.set) if ellipses else None
 
@@ -76,7 +76,7 @@ class MapFollower:
         if self._with_factors:
             graph = self._graph.refresh(lambda had: (had.epoch, had.revision) != now)
         variables = _groups(snapshot)
-        graph = graph if graph.epoch == snapshot.epoch else Graph(snapshot.epoch, 0, Batch())
+        graph = graph if graph.epoch == snapshot.epoch else MapGraph(snapshot.epoch, 0, Batch())
         spread = self._certainty.spread(*now, variables) if self._certainty else None
         return Look(
             snapshot.epoch,

@@ -18,7 +18,7 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.change_columns import changes_to_maps, read_changes
 from factorbus.proto.columns import factors_to_maps, read_batch, read_values, variables_to_maps
 from factorbus.proto.limits import ANSWER_LIMITS, REQUEST_LIMITS, MessageLimits
-from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Graph, Insert, Job, JobDone, Optimum
+from factorbus.proto.messages import Accepted, Chi2, Delta, Estimate, Insert, Job, JobDone, MapGraph, Optimum
 from factorbus.proto.problems import Refused
 from factorbus.proto.report import Report
 
@@ -135,7 +135,7 @@ def decode_delta(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Delta:
     )
 
 
-def encode_graph(message: Graph) -> bytes:
+def encode_graph(message: MapGraph) -> bytes:
     """The bytes of a whole graph."""
     return _pack(
         {
@@ -147,10 +147,10 @@ def encode_graph(message: Graph) -> bytes:
     )
 
 
-def decode_graph(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Graph:
+def decode_graph(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> MapGraph:
     """The graph that `data` is.  Raises BadMessage, TooLarge."""
     content = fields.read_map("graph", data, limits)
-    return Graph(
+    return MapGraph(
         epoch=fields.integer("", content, "epoch"),
         revision=fields.integer("", content, "revision"),
         batch=read_batch(content, limits),

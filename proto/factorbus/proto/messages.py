@@ -150,7 +150,7 @@ class Delta:
 
 
 @dataclass(frozen=True, slots=True)
-class Graph:
+class MapGraph:
     """A whole map at `revision`: variables with present values, factors in the order of their ids per kind."""
 
     epoch: int

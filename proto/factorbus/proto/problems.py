@@ -33,9 +33,11 @@ The solver's own errors (unknown_variable, not_positive_definite, underconstrain
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from factorbus.proto.nearest import nearest
+
+Raised = TypeVar("Raised", bound=Exception)
 
 _NAMED = 12  # maps named where one is asked for that is not there
 _FROM = {"values": "the map's own values", "odometry": "composed odometry", "rotations": "averaged rotations"}
@@ -54,6 +56,13 @@ class Problem(Exception):
     def message(self) -> str:
         """The text for a person."""
         return str(self.args[0])
+
+
+def without_frames(problem: Raised) -> Raised:
+    """`problem` without its traceback and without what it was raised from: the frames of both hold all that they had,
+    whole matrices, for as long as the problem is remembered."""
+    problem.__cause__ = problem.__context__ = None
+    return problem.with_traceback(None)
 
 
 class BadSymbol(Problem):

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
@@ -28,7 +28,7 @@ def check_step(solver: Solver, report: StepReport) -> None:
         raise diverged
 
 
-def find_diverged(changed: I64, graph: Graph, report: StepReport) -> errors.Diverged | None:
+def find_diverged(changed: I64, graph: FactorGraph, report: StepReport) -> errors.Diverged | None:
     """What the last step, which `changed` these variables, left out of bounds: one of them, or χ²."""
     v = int(find_escaped(changed, graph.array_table))
     if v >= 0:

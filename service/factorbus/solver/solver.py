@@ -14,7 +14,7 @@ from factorbus.solver.covariance.source import CovarianceSource
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.admission import admit
 from factorbus.solver.graph.columns import Columns
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import BatchLike, FactorGroup, Group
 from factorbus.solver.graph.joints import find_apart
 from factorbus.solver.inc_l.steps import STATE_TYPES, IncrementalSteps
@@ -44,7 +44,7 @@ class Solver:
         self._options = options or Options()
         if self._options.backend == "cholmod":
             require_cholmod()
-        self._graph = Graph()
+        self._graph = FactorGraph()
         steps = TreeSteps if mode_named(self._options.mode).tree else IncrementalSteps
         self._stepper: Stepper = steps(self._graph, self._options)
         self.covariances = CovarianceSource(self._graph, self._stepper)
@@ -85,7 +85,7 @@ class Solver:
         """The variables whose values have other bits than before the last step, new ones included, in the same form."""
         return self._graph.variables(self._stepper.changed())
 
-    def pick_changed(self) -> tuple[I64, Graph]:
+    def pick_changed(self) -> tuple[I64, FactorGraph]:
         """What `changed` lists, as indices of variables, ascending, and the arenas to look them up in, to be read."""
         return self._stepper.changed(), self._graph
 
@@ -134,7 +134,7 @@ class Solver:
         count = self.variable_count if variables is None else min(variables, self.variable_count)
         return self._graph.variables(np.arange(count)), self._graph.factors(factors, find_apart(self._graph))
 
-    def content(self) -> Graph:
+    def content(self) -> FactorGraph:
         """A copy of everything, as of the last step, for computations elsewhere."""
         return self._graph.copied()
 
@@ -159,7 +159,7 @@ class Solver:
         load(self._graph, parts["_graph"], _VALUES)
         return self._stepper.resume(False)
 
-    def _taken_over(self, graph: Graph) -> "Solver":
+    def _taken_over(self, graph: FactorGraph) -> "Solver":
         """A solver with the same options that has this graph, and has not solved it."""
         made = Solver(self._options)
         made._graph.take(graph)

@@ -15,7 +15,7 @@ from bench.replays.columns import F64, I64
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
 from factorbus.solver.kernels.model.retract import move
@@ -52,7 +52,7 @@ class Judge:
     """Takes in what a solver takes in, and judges its estimates."""
 
     def __init__(self) -> None:
-        self._graph, self._blocks, self._cholesky = Graph(), HessianBlocks(), Cholesky()
+        self._graph, self._blocks, self._cholesky = FactorGraph(), HessianBlocks(), Cholesky()
         self._mark = self._graph.mark()
         self._symbolic: Symbolic | None = None
         self._odometry: list[int] = []

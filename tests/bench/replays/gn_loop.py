@@ -11,7 +11,7 @@ import numpy as np
 from factorbus.proto.messages import Batch
 from factorbus.solver import Group, SolverError
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import move
 from factorbus.solver.sparse.blocks import HessianBlocks
@@ -28,7 +28,7 @@ class GaussNewtonAtLoops:
     """What is on the clock: taking in the step, solving if it closes a loop, a copy of all values."""
 
     def __init__(self) -> None:
-        self._graph, self._blocks, self._cholesky = Graph(), HessianBlocks(), Cholesky()
+        self._graph, self._blocks, self._cholesky = FactorGraph(), HessianBlocks(), Cholesky()
         self._mark = self._graph.mark()
         self._batch = Batch()
         self._groups: list[Group] = []

@@ -17,7 +17,7 @@ def command() -> None:
     factorbus warm
     """
     require("service", "factorbus warm")
-    from factorbus.service.operations.warm import seconds_compiling, warm
+    from factorbus.service.operations.warm import seconds_compiling, warm_service
 
-    seconds = warm(lambda kernel: print_note(f"  compiling {kernel}"))
+    seconds = warm_service(lambda kernel: print_note(f"  compiling {kernel}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {seconds_compiling():.1f} s of it compiling")

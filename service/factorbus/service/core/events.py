@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Insert
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Problem, without_frames
 from factorbus.service.questions.answers import Question
 
 Asker: TypeAlias = Any
@@ -78,6 +78,11 @@ class Outcome(NamedTuple):
     insert: Arrived
     answer: bytes | Any
     first_factor: int = -1
+
+
+def refusal(insert: Arrived, problem: Exception) -> Outcome:
+    """`insert` is refused, because of `problem`, which is remembered for when it is sent again."""
+    return Outcome(insert, without_frames(problem))
 
 
 class Verdict(NamedTuple):

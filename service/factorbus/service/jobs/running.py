@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 from factorbus.proto import codec
 from factorbus.proto.messages import Job, JobDone, Optimum
-from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable, UnknownKind
+from factorbus.proto.problems import Internal, Problem, ShuttingDown, Unavailable, UnknownKind, without_frames
 from factorbus.service.jobs.dispatch import Dispatch, Distrusted, Effect, Ended, InPlace, Send
 from factorbus.service.jobs.job_check import DoubtfulAnswer, WrongAnswer, checked_result, is_quick
 from factorbus.service.maps.serial_executor import SerialExecutor
@@ -200,7 +200,7 @@ def do_here(job: Job) -> JobDone | Any:
     try:
         return do_in_place(job)
     except (Problem, SolverError) as problem:
-        return problem
+        return without_frames(problem)
     except Exception:
         reference = secrets.token_hex(4)
         log.exception("fault %s: job %s (%s) in place", reference, job.job, job.kind)

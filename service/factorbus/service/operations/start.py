@@ -23,7 +23,7 @@ def ready_to_compute(warm: bool) -> Iterator[None]:
     if why := why_stock_numba():
         log.warning("kernels are compiled by Numba as it is, which takes longer, and take longer themselves: %s", why)
     if warm:
-        from factorbus.service.operations.warm import warm as warm_all
+        from factorbus.service.operations.warm import warm_service as warm_all
 
         seconds = warm_all(lambda name: log.info("compiling kernels: %s", name))
         log.info("kernels ready after %.1f s", seconds)

@@ -35,7 +35,7 @@ _PLAIN_MESSAGES = {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
 _apart: list[float] = []  # seconds of waiting for them
 
 
-def warm(progress: Callable[[str], None] | None = None) -> float:
+def warm_service(progress: Callable[[str], None] | None = None) -> float:
     """Compile (or load from disk) all kernels; gives the seconds that took.
 
     `progress` is called with the name of each kernel that is compiled, before it is.

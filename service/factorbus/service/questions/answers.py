@@ -16,8 +16,8 @@ from factorbus.proto.arrays import I64
 from factorbus.proto.asking import AskRepair, Repaired
 from factorbus.proto.keys import QUESTIONS
 from factorbus.proto.limits import REQUEST_LIMITS
-from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, Graph, Variables
-from factorbus.proto.problems import BadOption, Problem, UnknownQuestion
+from factorbus.proto.messages import Batch, Chi2, Estimate, Factors, MapGraph, Variables
+from factorbus.proto.problems import BadOption, Problem, UnknownQuestion, without_frames
 from factorbus.proto.repair_codec import decode_ask_repair, encode_repaired
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.service.questions.question_memory import COPIES, Room
@@ -82,9 +82,9 @@ class QuestionCopies:
     room: Room = _UNBOUNDED
 
     @property
-    def graph(self) -> Graph:
+    def graph(self) -> MapGraph:
         """The whole map, if it was copied for a question that needs it."""
-        return Graph(self.epoch, self.revision, Batch(self.variables, self.factors))
+        return MapGraph(self.epoch, self.revision, Batch(self.variables, self.factors))
 
 
 def parse(name: str, payload: bytes) -> Question:
@@ -256,7 +256,7 @@ def _answer_or_problem(uncertain: Uncertain, question: Question) -> bytes | Exce
     try:
         return uncertain.answer(question.ask)
     except (Problem, SolverError) as problem:
-        return problem
+        return without_frames(problem)
 
 
 def _uncertain(taken: QuestionCopies) -> Uncertain:

@@ -27,7 +27,7 @@ from factorbus.solver.covariance.gates import threshold
 from factorbus.solver.covariance.relative import relative
 from factorbus.solver.covariance.square_root import SquareRoot
 from factorbus.solver.covariance.why import why_factor, why_variable
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
 from factorbus.solver.kernels.model import layout as at
 
@@ -118,7 +118,7 @@ class Uncertain:
         return self._made
 
     @property
-    def _graph(self) -> Graph:
+    def _graph(self) -> FactorGraph:
         return self._blocks.factored.graph
 
     def answer(self, ask: Any) -> bytes:

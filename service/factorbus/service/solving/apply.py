@@ -27,13 +27,22 @@ from typing import Any, TypeAlias, cast
 from factorbus.proto.messages import Insert
 from factorbus.proto.problems import Internal, Problem, TooLarge
 from factorbus.service.config import Limits
-from factorbus.service.core.events import Applied, Arrived, Outcome, ParsedInsert, SingleInsertResult, Stepped, Verdict
+from factorbus.service.core.events import (
+    Applied,
+    Arrived,
+    Outcome,
+    ParsedInsert,
+    SingleInsertResult,
+    Stepped,
+    Verdict,
+    refusal,
+)
 from factorbus.service.solving.holding import Broken, Holding
 from factorbus.solver.changing import try_change, with_changes, with_converted
 from factorbus.solver.divergence import check_step, copied, find_diverged, is_usual
 from factorbus.solver.errors import SolverError
 from factorbus.solver.graph.columns import Columns
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import I64
 
 GOES_ON = "the map goes on converging, without an insert"
@@ -200,7 +209,7 @@ class MapSolver(Holding):
                     staged.append((insert, first_factor))
                     settle = settle or cast(Insert, insert.content).settle
                 except (Problem, SolverError) as problem:
-                    refused.append(Outcome(insert, problem))
+                    refused.append(refusal(insert, problem))
             if not staged:
                 return Verdict(tuple(refused)), ()
             if self._wary or not is_usual(self._solver, *self._held):
@@ -212,7 +221,7 @@ class MapSolver(Holding):
             self._solver = kept or self._solver
             if len(staged) > 1:
                 raise _TakenBack from problem
-            return Verdict((*refused, Outcome(staged[0][0], problem))), ()
+            return Verdict((*refused, refusal(staged[0][0], problem))), ()
         except Exception:
             self._solver = kept or self._solver
             reference = self._fault()
@@ -233,7 +242,7 @@ class MapSolver(Holding):
                 steps = list(self._go_back(report))
             if len(staged) > 1:
                 raise _TakenBack(steps)
-            return Verdict((*refused, Outcome(staged[0][0], diverged))), steps
+            return Verdict((*refused, refusal(staged[0][0], diverged))), steps
         self._wary = self._wary or kept is not None
         return self._told_of(staged, refused, self._account_of(report, started), (changed, graph))
 
@@ -271,7 +280,7 @@ class MapSolver(Holding):
 
     def _told_of(
         self, staged: Sequence[_Staged], refused: Sequence[Outcome], account: dict[str, Any],
-        changed: tuple[I64, Graph], previous: int | None = None,
+        changed: tuple[I64, FactorGraph], previous: int | None = None,
     ) -> _Added:  # fmt: skip
         """The step went well: the answers and the delta; previous: 0 where that has everything."""
         step = self._step(self._revision - 1 if previous is None else previous)
@@ -301,7 +310,7 @@ class MapSolver(Holding):
             # Numbers of unusual sizes are tried on another solver, as they are by inserts.
             came = None if self._wary else try_change(self._solver, content.changes, content.batch, content.settle)
         except (Problem, SolverError) as problem:
-            yield Verdict((Outcome(insert, problem),))
+            yield Verdict((refusal(insert, problem),))
             return
         except Exception:
             reference = self._fault()
@@ -324,7 +333,7 @@ class MapSolver(Holding):
             )
             check_step(solver, report)
         except (Problem, SolverError) as problem:
-            yield Verdict((Outcome(insert, problem),))
+            yield Verdict((refusal(insert, problem),))
             return
         except Exception:
             reference = secrets.token_hex(4)

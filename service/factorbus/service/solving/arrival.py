@@ -6,7 +6,7 @@ from factorbus.proto import codec
 from factorbus.proto.limits import ANSWER_LIMITS, MessageLimits
 from factorbus.proto.messages import Insert
 from factorbus.proto.place import find_place
-from factorbus.proto.problems import Problem
+from factorbus.proto.problems import Problem, without_frames
 from factorbus.service.core.events import Arrived, Asker, ParsedInsert, Refuse
 from factorbus.service.kernels.digest import digest
 from factorbus.service.kernels.read import MORE_GROUPS, locate_insert
@@ -32,7 +32,7 @@ def read_insert(asker: Asker, client: str, payload: bytes, limits: MessageLimits
         place = find_place(payload)
         if place is None:
             return Refuse(asker, problem)
-        return Arrived([asker], client, *place, size, message_digest(payload), problem, now, payload)
+        return Arrived([asker], client, *place, size, message_digest(payload), without_frames(problem), now, payload)
     return Arrived([asker], client, insert.sequence, insert.epoch, size, message_digest(payload), insert, now, payload)
 
 
@@ -43,7 +43,7 @@ def read_again(payload: bytes) -> tuple[int, Insert | ParsedInsert | Problem]:
     try:
         return message_digest(payload), codec.decode_insert(payload, ANSWER_LIMITS)
     except Problem as problem:
-        return message_digest(payload), problem
+        return message_digest(payload), without_frames(problem)
 
 
 def try_parse(payload: bytes, limits: MessageLimits) -> tuple[int, int, int, ParsedInsert] | None:

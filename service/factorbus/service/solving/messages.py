@@ -7,12 +7,12 @@ import numpy as np
 
 from factorbus.proto import codec
 from factorbus.service.kernels.write import NO_DELTA, write_messages
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import I64
 
 # Of a usual step; those of a larger one are written to an array of their own.
 _ROOM = 48 << 10
-_NOTHING, _NO_GRAPH = np.empty(0, np.int64), Graph()
+_NOTHING, _NO_GRAPH = np.empty(0, np.int64), FactorGraph()
 
 
 class StepMessages:
@@ -34,7 +34,7 @@ class StepMessages:
         step: tuple[int, int, int],
         account: Mapping[str, Any],
         changed: I64,
-        graph: Graph,
+        graph: FactorGraph,
     ) -> list[bytes]:
         """The answers to the inserts of a step, and its delta.
 
@@ -66,6 +66,8 @@ class StepMessages:
         """The answers alone."""
         return self.write(answers, (epoch, revision, NO_DELTA), account, _NOTHING, _NO_GRAPH)[:-1]
 
-    def write_delta(self, step: tuple[int, int, int], account: Mapping[str, Any], changed: I64, graph: Graph) -> bytes:
+    def write_delta(
+        self, step: tuple[int, int, int], account: Mapping[str, Any], changed: I64, graph: FactorGraph
+    ) -> bytes:
         """The delta alone."""
         return self.write((), step, account, changed, graph)[0]

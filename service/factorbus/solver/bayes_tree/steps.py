@@ -11,7 +11,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.bayes_tree.tree import CliqueTree
-from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.convergence import FINISHED
@@ -53,7 +53,7 @@ class TreeSteps:
 
     NOT_KEPT = ("_graph", "_options", "before_batch")
 
-    def __init__(self, graph: Graph, options: Options) -> None:
+    def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._tree = CliqueTree(graph, options)
         self._mark = graph.mark()
@@ -213,13 +213,13 @@ class TreeSteps:
             self._tree.hold()
             self._held = True
 
-    def _apart(self) -> Graph:
+    def _apart(self) -> FactorGraph:
         """The graph with rows of its own, for equations that leave it as it is."""
         graph = copy.copy(self._graph)
         graph.var, graph.fac = graph.var.copy(), graph.fac.copy()
         return graph
 
-    def _system(self, graph: Graph) -> System:
+    def _system(self, graph: FactorGraph) -> System:
         """All normal equations at the estimate, apart from the tree."""
         options = self._options
         system = System(graph, Incremental(Elimination(options), options))

@@ -10,7 +10,7 @@ import numpy as np
 
 from factorbus.solver.graph import pages
 from factorbus.solver.graph.arenas import Arenas, lines
-from factorbus.solver.graph.factor_graph import Graph, grown, roomy
+from factorbus.solver.graph.factor_graph import FactorGraph, roomy, with_room
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
@@ -33,7 +33,7 @@ class CliqueTree(Arenas):
     ARENAS = records.Tree._fields
     NOT_KEPT = ("_graph", "_rest", "settings", "marked", "array_table")
 
-    def __init__(self, graph: Graph, options: Options) -> None:
+    def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._rest = graph, options.tuning.relinearize_cooldown_steps
         self.settings: F64 = settings_of(options)
         self.clear()
@@ -143,12 +143,12 @@ class CliqueTree(Arenas):
         self._make_room_for_graph()
         state = self.state
         if (need := int(state[tl.S_NEED_CLIQUES])) > len(self.clique):
-            self.clique = grown(self.clique, need)
-            self.motions = grown(self.motions, len(self.clique) * tl.M_WIDTH)
+            self.clique = with_room(self.clique, need)
+            self.motions = with_room(self.motions, len(self.clique) * tl.M_WIDTH)
         if len(self.clique) > self.marked.size:
             self.marked = np.empty(len(self.clique), np.int64)
         if (need := int(state[tl.S_NEED_LISTS])) > self.lists.size:
-            self.lists = grown(self.lists, need)
+            self.lists = with_room(self.lists, need)
         if (need := int(state[tl.S_NEED_NUMBERS])) > self.numbers.size:
             pages.enlarge(self, "numbers", roomy(need, self.numbers.size))
         state[tl.S_NEED_CLIQUES : tl.S_NEED_NUMBERS + 1] = 0
@@ -159,10 +159,10 @@ class CliqueTree(Arenas):
         variables, factors = counts[at.VARIABLES], counts[at.FACTORS]
         if variables > len(self.node):
             self.node, self.turns, self.pending, self.changed, self.moved = (
-                grown(array, variables) for array in (self.node, self.turns, self.pending, self.changed, self.moved)
+                with_room(array, variables) for array in (self.node, self.turns, self.pending, self.changed, self.moved)
             )
         if factors > len(self.link):
-            self.link, self.stiff = grown(self.link, factors), grown(self.stiff, factors)
+            self.link, self.stiff = with_room(self.link, factors), with_room(self.stiff, factors)
         if counts[at.VALUES] > self.lin.shape[1]:
             self.lin = _widened(self.lin, counts[at.VALUES])
         if counts[at.SCALARS] > self.scalars.shape[1]:

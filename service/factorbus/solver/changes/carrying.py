@@ -5,7 +5,7 @@ A pose that was placed moved by M = x' x⁻¹, and what hangs on it moves by the
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import poses_apart
@@ -15,7 +15,7 @@ _POSES = (at.SE2, at.SE3)
 _FLAT = (at.SE2, at.POINT2)
 
 
-def carry_along(graph: Graph, values: F64, placed: np.ndarray, stays: np.ndarray, kept: np.ndarray) -> F64:
+def carry_along(graph: FactorGraph, values: F64, placed: np.ndarray, stays: np.ndarray, kept: np.ndarray) -> F64:
     """`values` with all that is neither placed nor fixed where it was to what it hangs on, however indirectly.
 
     values: as in the graph, with what is placed where it is to be.  placed, stays (n,); kept (m,): of the factors.
@@ -37,7 +37,7 @@ def carry_along(graph: Graph, values: F64, placed: np.ndarray, stays: np.ndarray
         known[to] = True
 
 
-def _move(graph: Graph, values: F64, kind: I64, on: I64, to: I64, d: int) -> None:
+def _move(graph: FactorGraph, values: F64, kind: I64, on: I64, to: I64, d: int) -> None:
     """Each of `to` by what its one of `on` moved by; all in one space."""
     turn, shift = _motions(graph, values, kind, on, d)
     start = graph.var[to, at.V_AT]
@@ -55,7 +55,7 @@ def _move(graph: Graph, values: F64, kind: I64, on: I64, to: I64, d: int) -> Non
         values[start[features, None] + 3 + np.arange(2)] = turned
 
 
-def _motions(graph: Graph, values: F64, kind: I64, on: I64, d: int) -> tuple[F64, F64]:
+def _motions(graph: FactorGraph, values: F64, kind: I64, on: I64, d: int) -> tuple[F64, F64]:
     """Rotation (n, d, d) and translation (n, d) of M, by which each has moved; of a point without a rotation."""
     start, size = graph.var[on, at.V_AT], 3 if d == 2 else 7
     turn = np.tile(np.eye(d), (on.size, 1, 1))

@@ -8,7 +8,7 @@ measured of it.  What goes is the tie to the anchor and the first guess of the d
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph, table_size
+from factorbus.solver.graph.factor_graph import FactorGraph, table_size
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -26,7 +26,7 @@ _PIXEL_BLOCK = np.array([15, 16, 18])
 _GUESS, _SURER = 14 + 20, 10.0
 
 
-def find_convertible(graph: Graph, below: float) -> I64:
+def find_convertible(graph: FactorGraph, below: float) -> I64:
     """The variables, ascending, that are features whose linearity index (3.19) is below this.
 
     One whose first guess of the depth still says something is left: as a point it would lose that, and a map its scale.
@@ -44,7 +44,7 @@ def find_convertible(graph: Graph, below: float) -> I64:
     return np.flatnonzero(found < below)
 
 
-def pick_features(graph: Graph, keys: I64) -> I64:
+def pick_features(graph: FactorGraph, keys: I64) -> I64:
     """These features as variables.  Raises UnknownVariable; KindMismatch for what is none, or has to stay one."""
     picked = np.array([graph.find(key) for key in keys.tolist()], np.int64)
     for key, v in zip(keys.tolist(), picked.tolist(), strict=True):
@@ -57,16 +57,16 @@ def pick_features(graph: Graph, keys: I64) -> I64:
     return picked
 
 
-def is_held(graph: Graph) -> np.ndarray:
+def is_held(graph: FactorGraph) -> np.ndarray:
     """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
     fac, held = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
     held[fac[LINEAR[fac[:, at.F_KIND]], at.F_I : at.F_J + 1]] = True
     return held[:-1]
 
 
-def with_points(graph: Graph, features: I64) -> Graph:
+def with_points(graph: FactorGraph, features: I64) -> FactorGraph:
     """A graph in which these features are points, under their keys; all else is the same, factor ids included."""
-    made = Graph()
+    made = FactorGraph()
     variables, factors = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
     var, fac = graph.var[:variables].copy(), graph.fac[:factors].copy()
     turned = np.zeros(variables, bool)
@@ -91,7 +91,7 @@ def with_points(graph: Graph, features: I64) -> Graph:
     return made
 
 
-def _values(graph: Graph, var: I64, turned: I64) -> F64:
+def _values(graph: FactorGraph, var: I64, turned: I64) -> F64:
     """The values, packed anew; V_AT of `var` follows."""
     pieces, at_new = [], 0
     for row, is_turned in zip(var, turned, strict=True):
@@ -109,7 +109,7 @@ def _point(y: F64) -> F64:
     return y[:3] + m / y[5]
 
 
-def _payload(graph: Graph, fac: I64, turned: I64) -> F64:
+def _payload(graph: FactorGraph, fac: I64, turned: I64) -> F64:
     """The payloads, packed anew; F_KIND and F_AT of `fac` follow."""
     pieces, at_new = [], 0
     for row in fac:

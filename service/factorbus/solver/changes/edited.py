@@ -6,7 +6,7 @@ Nothing of the old graph is touched, so a change that turns out to be impossible
 import numpy as np
 
 from factorbus.solver.changes.requested import Edits
-from factorbus.solver.graph.factor_graph import Graph, table_size
+from factorbus.solver.graph.factor_graph import FactorGraph, table_size
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.graph.key_table import enter_keys
@@ -19,10 +19,10 @@ _MEASURED = np.array([FACTOR_KIND_OF_CODE[code].size for code in sorted(FACTOR_K
 _TRIANGLE = np.array([FACTOR_KIND_OF_CODE[code].triangle for code in sorted(FACTOR_KIND_OF_CODE)], np.int64)
 
 
-def edited(graph: Graph, edits: Edits) -> Graph:
+def edited(graph: FactorGraph, edits: Edits) -> FactorGraph:
     """`graph` with `edits` made; its factors keep their ids."""
     stays, kept = np.flatnonzero(edits.stays), np.flatnonzero(edits.kept)
-    made = Graph()
+    made = FactorGraph()
     made.keys, made.var, made.fac = graph.keys[stays], graph.var[stays], graph.fac[kept]
     made.stamps = graph.stamps[stays]
     _pack_values(edits.values, made)
@@ -38,7 +38,7 @@ def edited(graph: Graph, edits: Edits) -> Graph:
     return made
 
 
-def _pack_values(values: F64, made: Graph) -> None:
+def _pack_values(values: F64, made: FactorGraph) -> None:
     """The values one after the other; V_AT follows."""
     sizes = _SIZE[made.var[:, at.V_KIND]]
     start = _starts(sizes)
@@ -47,7 +47,7 @@ def _pack_values(values: F64, made: Graph) -> None:
     made.var[:, at.V_AT] = start
 
 
-def _number_columns(made: Graph, free: np.ndarray) -> int:
+def _number_columns(made: FactorGraph, free: np.ndarray) -> int:
     """Block columns and scalars for the free variables, in their order; gives how many."""
     var, dims = made.var, _DIM[made.var[:, at.V_KIND]]
     var[:, at.V_COLUMN] = np.where(free, np.cumsum(free) - 1, -1)
@@ -59,7 +59,7 @@ def _number_columns(made: Graph, free: np.ndarray) -> int:
     return columns
 
 
-def _pack_payload(graph: Graph, made: Graph, loss: I64, scale: F64, weight: F64) -> None:
+def _pack_payload(graph: FactorGraph, made: FactorGraph, loss: I64, scale: F64, weight: F64) -> None:
     """Measurements, information matrices times `weight`, and scales; F_AT and F_FLAGS follow."""
     fac = made.fac
     measured, triangle = _MEASURED[fac[:, at.F_KIND]], _TRIANGLE[fac[:, at.F_KIND]]
@@ -74,7 +74,7 @@ def _pack_payload(graph: Graph, made: Graph, loss: I64, scale: F64, weight: F64)
     fac[:, at.F_AT], fac[:, at.F_FLAGS] = start, loss << at.LOSS_SHIFT
 
 
-def _renumber_ends(made: Graph, edits: Edits) -> None:
+def _renumber_ends(made: FactorGraph, edits: Edits) -> None:
     """The variables have other indices; and no factor has a place in any Λ yet."""
     index = np.cumsum(edits.stays) - 1
     for end in (at.F_I, at.F_J):

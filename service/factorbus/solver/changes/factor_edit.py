@@ -15,7 +15,7 @@ import numpy as np
 
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.changes.requested import Edits
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -58,7 +58,7 @@ class FactorEdit:
     that failed.
     """
 
-    def __init__(self, graph: Graph, tree: CliqueTree, edits: Edits) -> None:
+    def __init__(self, graph: FactorGraph, tree: CliqueTree, edits: Edits) -> None:
         self._graph, self._tree, self._edits = graph, tree, edits
         self.gone: I64 = np.flatnonzero(~edits.kept)
         self.renewed: I64 = np.flatnonzero(edits.kept & edits.touched)

@@ -8,7 +8,7 @@ from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.changes.factor_edit import FactorEdit
 from factorbus.solver.changes.requested import Edits
 from factorbus.solver.errors import SolverError
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.model.bounds import find_escaped
 from factorbus.solver.report import StepReport
@@ -16,7 +16,9 @@ from factorbus.solver.stepper import Stepper
 from factorbus.wording import counted
 
 
-def try_in_place(graph: Graph, steps: Stepper, edits: Edits, stage: Callable[[], int]) -> tuple[int, StepReport] | None:
+def try_in_place(
+    graph: FactorGraph, steps: Stepper, edits: Edits, stage: Callable[[], int]
+) -> tuple[int, StepReport] | None:
     """Make `edits`, add what `stage` brings, and step: the id of the first new factor, and the report.
 
     None: this is no change for a step, or one that failed, or in another mode than "bayes-tree"; then everything is as
@@ -54,7 +56,7 @@ def _take_back(steps: TreeSteps, edit: FactorEdit, count: int) -> None:
     steps.rebase(-count)
 
 
-def _is_sound(graph: Graph, steps: TreeSteps, report: StepReport) -> bool:
+def _is_sound(graph: FactorGraph, steps: TreeSteps, report: StepReport) -> bool:
     """Whether everything that the step moved, and χ², is within bounds."""
     escaped = find_escaped(steps.changed(), graph.array_table) >= 0
     return not escaped and bool(np.isfinite(report.chi2) and np.isfinite(report.chi2_before))

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorbus.pieces import MOST, as_pieces, cut
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.joints import find_joints
 from factorbus.solver.graph.quadratic import Quadratic, kind_of, quadratic
@@ -20,7 +20,7 @@ from factorbus.solver.kernels.model import layout as at
 _NOTHING = 1e-13
 
 
-def marginals(graph: Graph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGroup], list[int]]:
+def marginals(graph: FactorGraph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGroup], list[int]]:
     """(the linear factors that take the place of those on the variables `gone`, the rows of all that these replace).
 
     kept (m,): the factors that are there.  Raises TooConnected, Underconstrained.
@@ -37,7 +37,7 @@ def marginals(graph: Graph, gone: I64, kept: np.ndarray) -> tuple[list[FactorGro
     return made, used
 
 
-def _pieces(graph: Graph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], list[int]]]:
+def _pieces(graph: FactorGraph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], list[int]]]:
     """(free variables, factors) of each piece of `gone` that hangs together; what is fixed joins nothing.
 
     What is known of many variables together goes whole where one of them goes.
@@ -75,7 +75,7 @@ def _pieces(graph: Graph, gone: I64, kept: np.ndarray) -> list[tuple[list[int], 
     return [(variables.get(head, []), sorted(factors.get(head, []))) for head in heads]
 
 
-def _check_border(graph: Graph, part: list[int], rows: list[int], gone: I64) -> None:
+def _check_border(graph: FactorGraph, part: list[int], rows: list[int], gone: I64) -> None:
     """Before anything is computed of it.  Raises TooConnected."""
     ends = np.unique(graph.fac[rows, at.F_I : at.F_J + 1])
     ends = np.setdiff1d(ends[ends >= 0], gone)
@@ -84,7 +84,7 @@ def _check_border(graph: Graph, part: list[int], rows: list[int], gone: I64) -> 
         raise errors.TooConnected(int(graph.keys[part[0]]), len(part), graph.keys[border].tolist(), MOST)
 
 
-def _reduced(graph: Graph, whole: Quadratic, count: int) -> tuple[F64, F64]:
+def _reduced(graph: FactorGraph, whole: Quadratic, count: int) -> tuple[F64, F64]:
     """Λ and η of the border once the first `count` variables have taken theirs.  (11.4)"""
     if not count:
         return whole.information, whole.eta
@@ -101,7 +101,7 @@ def _reduced(graph: Graph, whole: Quadratic, count: int) -> tuple[F64, F64]:
     return whole.information[cut:, cut:] - across.T @ across, whole.eta[cut:] - across.T @ along
 
 
-def _as_factors(graph: Graph, border: list[int], information: F64, eta: F64) -> list[FactorGroup]:
+def _as_factors(graph: FactorGraph, border: list[int], information: F64, eta: F64) -> list[FactorGroup]:
     """Linear factors on the border with these Λ and η."""
     kinds, keys, y = [kind_of(graph, v).name for v in border], graph.keys[border], [_value(graph, v) for v in border]
     if len(border) > 2:
@@ -135,6 +135,6 @@ def _root(information: F64, eta: F64) -> tuple[F64, F64]:
     return np.triu(R), Q.T @ along
 
 
-def _value(graph: Graph, v: int) -> F64:
+def _value(graph: FactorGraph, v: int) -> F64:
     start = int(graph.var[v, at.V_AT])
     return graph.values[start : start + kind_of(graph, v).size].copy()

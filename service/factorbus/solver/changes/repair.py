@@ -20,7 +20,7 @@ from factorbus.solver import errors
 from factorbus.solver.changes.edited import edited
 from factorbus.solver.changes.requested import unchanged
 from factorbus.solver.covariance.gates import threshold
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import Group
 from factorbus.solver.graph.joints import find_joints
@@ -61,7 +61,7 @@ class Repair:
     groups: list[Group]
 
 
-def repair(graph: Graph, factors: I64 | None = None, probability: float = 0.99) -> Repair:
+def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 0.99) -> Repair:
     """Find what is false among `factors` (ids); None: among all that close loops.  `graph` stays as it is.
 
     probability: with which a right measurement is within c².  Raises UnknownFactor, BadOption.
@@ -85,7 +85,7 @@ def repair(graph: Graph, factors: I64 | None = None, probability: float = 0.99) 
     return Repair(ids, distance[false], rows.size, before, after, rounds, repaired.variables())
 
 
-def find_loops(graph: Graph) -> I64:
+def find_loops(graph: FactorGraph) -> I64:
     """Rows of the factors between variables that factors before them, or being fixed, join already.
 
     Pieces of what is known of many variables together join, and are no suspects.
@@ -115,7 +115,7 @@ def _root(above: list[int], v: int) -> int:
     return v
 
 
-def _rows(graph: Graph, ids: I64) -> I64:
+def _rows(graph: FactorGraph, ids: I64) -> I64:
     ids = np.unique(ids)
     rows = graph.rows_of(ids)
     if (missing := np.flatnonzero(rows < 0)).size:
@@ -128,7 +128,7 @@ def _rows(graph: Graph, ids: I64) -> I64:
     return rows
 
 
-def _beginnings(graph: Graph, rows: I64) -> Iterable[F64]:
+def _beginnings(graph: FactorGraph, rows: I64) -> Iterable[F64]:
     """The present values, and those that the trusted factors compose if they reach everything."""
     yield graph.values
     trusted = np.ones(int(graph.counts[at.FACTORS]), bool)
@@ -143,7 +143,7 @@ def _beginnings(graph: Graph, rows: I64) -> Iterable[F64]:
 class _Problem:
     """The graph with its suspects weighed, none of them with a loss of its own."""
 
-    def __init__(self, graph: Graph, rows: I64, probability: float) -> None:
+    def __init__(self, graph: FactorGraph, rows: I64, probability: float) -> None:
         edits = unchanged(graph)
         edits.loss[rows] = at.NO_LOSS
         self.graph, self.rows = edited(graph, edits), rows

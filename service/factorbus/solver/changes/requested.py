@@ -26,7 +26,7 @@ from factorbus.solver import errors
 from factorbus.solver.changes.carrying import carry_along
 from factorbus.solver.changes.marginal import marginals
 from factorbus.solver.graph.admission import out_of_bounds
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSSES
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.joints import check_kept
@@ -97,7 +97,7 @@ class Edits:
     made: set[str] = field(default_factory=set)
 
 
-def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
+def collect(graph: FactorGraph, changes: Sequence[ChangeLike]) -> Edits:
     """`changes` in their order.
 
     Raises UnknownKind, UnknownFactor, NotInMap, NamedTwice, InUse, BadLoss, BadWeight, BadShape, KindMismatch,
@@ -126,7 +126,7 @@ def collect(graph: Graph, changes: Sequence[ChangeLike]) -> Edits:
     return edits
 
 
-def unchanged(graph: Graph) -> Edits:
+def unchanged(graph: FactorGraph) -> Edits:
     """Everything as it is."""
     variables, factors = int(graph.counts[at.VARIABLES]), int(graph.counts[at.FACTORS])
     fac, var = graph.fac[:factors], graph.var[:variables]
@@ -147,11 +147,11 @@ def unchanged(graph: Graph) -> Edits:
     )
 
 
-def _remove_factors(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _remove_factors(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     edits.kept[_factors(graph, edits, change)] = False
 
 
-def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _remove_variables(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     gone = _variables(graph, edits, change)
     edits.stays[gone] = False
     fac = graph.fac[: edits.kept.size]
@@ -164,7 +164,7 @@ def _remove_variables(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.kept &= left
 
 
-def _set_loss(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _set_loss(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     rows = _factors(graph, edits, change)
     code = at.NO_LOSS
     if change.loss:
@@ -179,7 +179,7 @@ def _set_loss(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.touched[rows] = True
 
 
-def _weigh(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _weigh(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     rows = _factors(graph, edits, change)
     weight = _numbers("weigh", "weight", change.weight, rows.size)
     least, most = _WEIGHTS
@@ -190,7 +190,7 @@ def _weigh(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.touched[rows] = True
 
 
-def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
+def _check_weighed(graph: FactorGraph, edits: Edits, rows: I64) -> None:
     """Is Ω of these factors still within its bounds?  Raises BadWeight."""
     fac = graph.fac[rows]
     for code in np.unique(fac[:, at.F_KIND]).tolist():
@@ -205,15 +205,15 @@ def _check_weighed(graph: Graph, edits: Edits, rows: I64) -> None:
             raise errors.BadWeight(_id(graph, of, bad), seen, wanted)
 
 
-def _fix(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _fix(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     edits.free[_variables(graph, edits, change)] = False
 
 
-def _free(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _free(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     edits.free[_variables(graph, edits, change)] = True
 
 
-def _place(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _place(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     picked, kind = _variables(graph, edits, change), VARIABLE_KINDS.get(change.kind)
     if kind is None:
         raise errors.UnknownKind("variable", change.kind, tuple(VARIABLE_KINDS))
@@ -229,7 +229,7 @@ def _place(graph: Graph, edits: Edits, change: ChangeLike) -> None:
     edits.values[graph.var[picked, at.V_AT, None] + np.arange(kind.size)] = _checked(kind.name, picked, values, graph)
 
 
-def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
+def _checked(kind: str, picked: I64, values: F64, graph: FactorGraph) -> F64:
     """Values as variables keep them.  Raises NotFinite, OutOfBounds, BadQuaternion."""
     keys, values = graph.keys[picked], values.copy()
     for row in np.flatnonzero(~(np.abs(values) <= MOST_NUMBER).all(axis=1)).tolist():
@@ -245,7 +245,7 @@ def _checked(kind: str, picked: I64, values: F64, graph: Graph) -> F64:
     return values
 
 
-def _marginalize(graph: Graph, edits: Edits, change: ChangeLike) -> None:
+def _marginalize(graph: FactorGraph, edits: Edits, change: ChangeLike) -> None:
     gone = np.unique(_variables(graph, edits, change))
     if not edits.made <= _BEFORE_MARGINALIZE:
         raise errors.BadOrder("marginalize", "before any loss, weigh, fix, free, place or marginalize")
@@ -270,7 +270,7 @@ _MAKE = {
 }
 
 
-def _factors(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
+def _factors(graph: FactorGraph, edits: Edits, change: ChangeLike) -> I64:
     """Rows of the factors that a change names.  Raises UnknownFactor."""
     ids = _NONE if change.factors is None else change.factors
     rows = graph.rows_of(ids)
@@ -282,7 +282,7 @@ def _factors(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
     return rows
 
 
-def _variables(graph: Graph, edits: Edits, change: ChangeLike) -> I64:
+def _variables(graph: FactorGraph, edits: Edits, change: ChangeLike) -> I64:
     """Indices of the variables that a change names.  Raises NotInMap."""
     keys = _NONE if change.keys is None else change.keys
     found = np.array([graph.find(key) for key in keys.tolist()], np.int64)
@@ -307,5 +307,5 @@ def _numbers(change: str, name: str, given: F64 | None, count: int) -> F64:
     return given
 
 
-def _id(graph: Graph, rows: I64, bad: I64) -> int:
+def _id(graph: FactorGraph, rows: I64, bad: I64) -> int:
     return int(graph.ids_of(rows[bad[:1]])[0])

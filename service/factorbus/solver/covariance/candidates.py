@@ -11,7 +11,7 @@ from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.kernels.innovation import distances_and_gains, predicted_covariances
 from factorbus.solver.covariance.square_root import LARGEST
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.groups import FactorsLike
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -63,7 +63,7 @@ def evaluate_candidates(blocks: CovarianceBlocks, groups: Sequence[FactorsLike])
 
 
 @contextmanager
-def admitted(graph: Graph, groups: Sequence[FactorsLike]) -> Iterator[None]:
+def admitted(graph: FactorGraph, groups: Sequence[FactorsLike]) -> Iterator[None]:
     """`groups` are the last factors of `graph` for a while.  Raises as `evaluate_candidates`."""
     mark = graph.mark()
     try:
@@ -119,7 +119,7 @@ def _diagonal(blocks: CovarianceBlocks, ends: I64, hub: int) -> tuple[F64, I64]:
     return diagonal, np.where(ends < 0, -1, which.reshape(ends.shape))
 
 
-def linearized(graph: Graph, first: int, last: int) -> Linear:
+def linearized(graph: FactorGraph, first: int, last: int) -> Linear:
     """The factors first .. last−1 at the estimate."""
     r, A, B, W = _room(last - first)
     evaluate_factors(np.arange(first, last), graph.array_table, graph.values, r, A, B, W)

@@ -5,7 +5,7 @@ import numpy as np
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.square_root import DIMS
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
@@ -13,7 +13,7 @@ from factorbus.solver.kernels.model import layout as at
 class Live:
     """What the last step left.  For the thread that steps."""
 
-    def __init__(self, graph: Graph, tree: CliqueTree) -> None:
+    def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
 
     def joint(self, variables: I64) -> F64:

@@ -11,7 +11,7 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import evaluate_candidates
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KINDS
 from factorbus.solver.graph.groups import FactorGroup
 from factorbus.solver.graph.variables import SE2, SE3, VARIABLE_KIND_OF_CODE, VARIABLE_KINDS
@@ -70,7 +70,7 @@ def _of_kind(blocks: CovarianceBlocks, here: str, there: str, rows: I64, first: 
     return Relative(there, rows, values, covariance)
 
 
-def _values(graph: Graph, kind: str, variables: I64) -> F64:
+def _values(graph: FactorGraph, kind: str, variables: I64) -> F64:
     return graph.values[graph.var[variables, at.V_AT, None] + np.arange(VARIABLE_KINDS[kind].size)]
 
 

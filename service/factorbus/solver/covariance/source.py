@@ -12,7 +12,7 @@ from factorbus.solver.covariance.square_root import (
     viewed_square_root,
 )
 from factorbus.solver.covariance.upkeep import Upkeep
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.stepper import Stepper
 
@@ -20,7 +20,7 @@ from factorbus.solver.stepper import Stepper
 class CovarianceSource:
     """R of a graph as of the last step, for covariances."""
 
-    def __init__(self, graph: Graph, stepper: Stepper) -> None:
+    def __init__(self, graph: FactorGraph, stepper: Stepper) -> None:
         self._graph = graph
         self._tree = stepper.tree if isinstance(stepper, TreeSteps) else None
         self._live = Live(graph, self._tree) if self._tree else None

@@ -9,7 +9,7 @@ from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.covariance.kernels.recursion import list_cliques
 from factorbus.solver.covariance.kernels.rows import copy_rows, size_of_rows
 from factorbus.solver.graph.arenas import Arenas
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KINDS
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import Tree
@@ -40,7 +40,7 @@ class SquareRoot:
     order (c,): the cliques, depth first from the roots; none in a view   stamp: of the last elimination
     """
 
-    graph: Graph
+    graph: FactorGraph
     tree: CliqueRows | CliqueTree
     dims: I64
     scalar: I64
@@ -53,19 +53,19 @@ class SquareRoot:
         return len(self.dims)
 
 
-def copied_square_root(graph: Graph, tree: CliqueTree) -> SquareRoot:
+def copied_square_root(graph: FactorGraph, tree: CliqueTree) -> SquareRoot:
     """A copy of what `tree` has of `graph`, as of its last step."""
     return _copied(graph.copied(), tree)
 
 
-def viewed_square_root(graph: Graph, tree: CliqueTree) -> SquareRoot:
+def viewed_square_root(graph: FactorGraph, tree: CliqueTree) -> SquareRoot:
     """The same in place, until the next step: for what goes up from a few variables."""
     var = graph.var[: graph.counts[at.VARIABLES]]
     scalar = np.ascontiguousarray(var[:, at.V_SCALAR])
     return SquareRoot(graph, tree, variable_dims(var), scalar, np.empty(0, np.int64), int(tree.state[tl.S_STAMP]))
 
 
-def computed_square_root(graph: Graph) -> SquareRoot:
+def computed_square_root(graph: FactorGraph) -> SquareRoot:
     """The same for a graph that is solved in another way: factorized here at its values.  Raises Underconstrained."""
     copy = graph.copied()
     values = copy.values.copy()
@@ -85,7 +85,7 @@ def variable_dims(var: I64) -> I64:
     return DIMS[var[:, at.V_KIND]]
 
 
-def _copied(graph: Graph, tree: CliqueTree) -> SquareRoot:
+def _copied(graph: FactorGraph, tree: CliqueTree) -> SquareRoot:
     count, state = int(graph.counts[at.VARIABLES]), tree.state
     node, clique = tree.node[:count].copy(), tree.clique[: state[tl.S_CLIQUES]].copy()
     order = np.empty(int(state[tl.S_ALIVE]), np.int64)

@@ -13,7 +13,7 @@ from factorbus.solver.covariance.kernels.downdate import DONE, downdate_blocks, 
 from factorbus.solver.covariance.kernels.paths import joint_block
 from factorbus.solver.covariance.kernels.recursion import diagonal_blocks, list_root_cliques
 from factorbus.solver.covariance.square_root import DIMS, LARGEST
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.graph.joints import negative_rows
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -35,7 +35,7 @@ _SIZES = _RESIDUAL.tolist()
 class Upkeep:
     """Diagonal blocks of a map, as of the last `update`.  For the thread that steps."""
 
-    def __init__(self, graph: Graph, tree: CliqueTree) -> None:
+    def __init__(self, graph: FactorGraph, tree: CliqueTree) -> None:
         self._graph, self._tree = graph, tree
         self._count, self._factors, self._step, self._age = 0, 0, -1, 0
         self._width = 1

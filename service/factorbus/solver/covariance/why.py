@@ -10,7 +10,7 @@ from factorbus.solver import errors
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.candidates import Linear, evaluate_rows, linearized
 from factorbus.solver.graph import observations
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
 from factorbus.solver.kernels.bayes_tree import layout as tl
@@ -173,7 +173,7 @@ def _account(blocks: CovarianceBlocks, index: int, linear: Linear, T: F64) -> Fa
     )  # fmt: skip
 
 
-def _plain(graph: Graph, row: int, dim: int) -> tuple[F64, float]:
+def _plain(graph: FactorGraph, row: int, dim: int) -> tuple[F64, float]:
     """(r, rᵀ Ω r) of the factor in `row`, whatever its loss."""
     plain = copy.copy(graph)
     plain.fac = graph.fac[: row + 1].copy()
@@ -181,7 +181,7 @@ def _plain(graph: Graph, row: int, dim: int) -> tuple[F64, float]:
     return linearized(plain, row, row + 1).r[0, :dim].copy(), _chi2(plain, row)
 
 
-def _chi2(graph: Graph, row: int) -> float:
+def _chi2(graph: FactorGraph, row: int) -> float:
     return float(sum_chi2(row, row + 1, graph.var, graph.fac, graph.values, graph.payload))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from factorbus.solver import errors
 from factorbus.solver.graph import observations
 from factorbus.solver.graph.columns import Columns, floats_at, ints_at, limit_lenses, locate_columns
-from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, LOSS_OF_CODE, FactorKind
 from factorbus.solver.graph.groups import BatchLike
 from factorbus.solver.graph.joints import check_joints
@@ -31,7 +31,7 @@ from factorbus.solver.kernels.model.bounds import (
 from factorbus.solver.kernels.model.kinds import LINEAR, LINEAR_OF_ONE
 
 
-def admit(graph: Graph, batch: BatchLike | Columns, whole: bool = True) -> int:
+def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) -> int:
     """Append `batch` to `graph` and give values to the variables that come without; gives the id of its first factor.
 
     whole: a linear factor of one variable may have a negative definite Ω where those that came together make a form
@@ -66,7 +66,7 @@ def admit(graph: Graph, batch: BatchLike | Columns, whole: bool = True) -> int:
     return mark[at.FACTORS] + graph.id_shift
 
 
-def _finish(graph: Graph, groups: I64, mark: Mark, rest: int) -> None:
+def _finish(graph: FactorGraph, groups: I64, mark: Mark, rest: int) -> None:
     """What the kernel leaves to be done for groups that are in order."""
     if rest & gt.UNREACHED:
         _compose(graph, mark[at.VARIABLES], mark[at.FACTORS], _list_given(groups))
@@ -83,7 +83,7 @@ def _list_given(groups: I64) -> I64:
     return np.repeat((groups[:, gt.G_NUMBERS] != gt.NOWHERE).astype(np.int64), groups[:, gt.G_COUNT])
 
 
-def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
+def _compose(graph: FactorGraph, first: int, first_factor: int, reached: I64) -> None:
     missing = _find_missing(graph, first, first_factor, reached)
     if missing >= 0 and place_by_bearings(graph, first, first_factor, reached):
         missing = _find_missing(graph, first, first_factor, reached)
@@ -94,7 +94,7 @@ def _compose(graph: Graph, first: int, first_factor: int, reached: I64) -> None:
         raise value_out_of_bounds(graph, outside)
 
 
-def value_out_of_bounds(graph: Graph, v: int) -> errors.SolverError:
+def value_out_of_bounds(graph: FactorGraph, v: int) -> errors.SolverError:
     """The error that names the variable with index v, whose value is NaN, infinite or too large."""
     kind, start = VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])], int(graph.var[v, at.V_AT])
     where = f"the value of {kind} {errors.printed(int(graph.keys[v]))}"
@@ -109,12 +109,12 @@ def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER) -> errors
     return errors.OutOfBounds(where, float(numbers[bad[0]]), -most, most)
 
 
-def _find_missing(graph: Graph, first: int, first_factor: int, reached: I64) -> int:
+def _find_missing(graph: FactorGraph, first: int, first_factor: int, reached: I64) -> int:
     """Compose values for those that are not `reached` yet; gives one that nothing leads to, or −1."""
     return int(reach(True, first, first_factor, int(graph.counts[at.FACTORS]), graph.array_table, reached))
 
 
-def _find_bad_row(graph: Graph, raw: bytes, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
+def _find_bad_row(graph: FactorGraph, raw: bytes, group: I64, n: int, fault: int, whole: bool) -> errors.SolverError:
     """What is wrong with the n-th row of a group."""
     code, keys, numbers = (int(group[column]) for column in (gt.G_KIND, gt.G_KEYS, gt.G_NUMBERS))
     if not group[gt.G_FACTORS]:
@@ -144,7 +144,7 @@ def _bad_variable(kind: str, wrong: int, key: int, value: F64 | None) -> errors.
 
 
 def _bad_factor(
-    graph: Graph, kind: FactorKind, wrong: int, ends: I64, measured: F64, information: F64
+    graph: FactorGraph, kind: FactorKind, wrong: int, ends: I64, measured: F64, information: F64
 ) -> errors.SolverError:
     keys = [int(key) for key in ends]
     where = f"{kind} ({', '.join(map(errors.printed, keys))})"

@@ -33,7 +33,7 @@ _MUCH = 4096  # rows
 _NO_KEYS: I64 = np.empty(0, np.int64)
 
 
-class Graph(Arenas):
+class FactorGraph(Arenas):
     """Variables and factors, and the index of variables by key.  The arrays are public: kernels work on them."""
 
     ARENAS = records.Graph._fields
@@ -75,10 +75,10 @@ class Graph(Arenas):
             # Somebody may have an estimate of what is gone, its keys and stamps.
             self.keys, self.stamps = self.keys.copy(), self.stamps.copy()
 
-    def copied(self) -> "Graph":
+    def copied(self) -> "FactorGraph":
         """The same graph with arrays of its own, as large as what is in use."""
         variables, factors, values, payload, columns, *_ = self.counts.tolist()
-        other = Graph()
+        other = FactorGraph()
         other.keys, other.var = self.keys[:variables].copy(), self.var[:variables].copy()
         other.stamps = self.stamps[:variables].copy()
         other.dims, other.table, other.counts = self.dims[:columns].copy(), self.table.copy(), self.counts.copy()
@@ -103,9 +103,9 @@ class Graph(Arenas):
         counts = self.counts.tolist()
         if (need := counts[at.VARIABLES] + more) > self.keys.size:
             together = self.keys, self.var, self.dims, self.stamps
-            self.keys, self.var, self.dims, self.stamps = (grown(array, need) for array in together)
+            self.keys, self.var, self.dims, self.stamps = (with_room(array, need) for array in together)
         if (need := counts[at.VALUES] + numbers) > self.values.size:
-            self.values = grown(self.values, need)
+            self.values = with_room(self.values, need)
         if 2 * (counts[at.VARIABLES] + more) > self.table.size:
             self.table = np.zeros(table_size(counts[at.VARIABLES] + more), np.int64)
             enter_keys(counts[at.VARIABLES], self.table, self.keys)
@@ -114,11 +114,11 @@ class Graph(Arenas):
         """Make room for `more` factors with so many numbers together (measurement, information, scale of a loss)."""
         counts = self.counts.tolist()
         if (need := counts[at.FACTORS] + more) > len(self.fac):
-            self.fac = grown(self.fac, need)
+            self.fac = with_room(self.fac, need)
         if (need := counts[at.PAYLOAD] + numbers) > self.payload.size:
-            self.payload = grown(self.payload, need)
+            self.payload = with_room(self.payload, need)
 
-    def take(self, other: "Graph") -> None:
+    def take(self, other: "FactorGraph") -> None:
         """Become `other`."""
         for name, array in other.__getstate__().items():
             setattr(self, name, array)
@@ -244,7 +244,7 @@ class Graph(Arenas):
         return f"{kind} ({', '.join(printed(key) for key in ends)})"
 
 
-def grown(array: np.ndarray, need: int) -> np.ndarray:
+def with_room(array: np.ndarray, need: int) -> np.ndarray:
     """A copy with room for at least `need` rows, and more for the next ones; the new room is zero."""
     larger = lines((roomy(need, len(array)), *array.shape[1:]), array.dtype)
     larger[: len(array)] = array

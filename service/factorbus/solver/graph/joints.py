@@ -16,7 +16,7 @@ import numpy as np
 
 from factorbus.pieces import MOST
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FACTOR_KINDS
 from factorbus.solver.graph.quadratic import quadratic
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -47,7 +47,7 @@ class Joint:
     apart: bool = False
 
 
-def negative_rows(graph: Graph, first: int = 0) -> I64:
+def negative_rows(graph: FactorGraph, first: int = 0) -> I64:
     """Rows from `first` on of the factors with a negative definite Ω."""
     fac = graph.fac[first : graph.counts[at.FACTORS]]
     kind = fac[:, at.F_KIND]
@@ -55,7 +55,7 @@ def negative_rows(graph: Graph, first: int = 0) -> I64:
     return first + rows[graph.payload[fac[rows, at.F_AT] + _SIZE[kind[rows]]] < 0.0]
 
 
-def find_joints(graph: Graph, kept: np.ndarray | None = None) -> list[Joint]:
+def find_joints(graph: FactorGraph, kept: np.ndarray | None = None) -> list[Joint]:
     """The forms that are there in pieces.  kept (m,): factors that count."""
     of, negative = _linear(graph)
     if kept is not None:
@@ -71,13 +71,13 @@ def find_joints(graph: Graph, kept: np.ndarray | None = None) -> list[Joint]:
     return joints
 
 
-def find_apart(graph: Graph) -> list[list[int]]:
+def find_apart(graph: FactorGraph) -> list[list[int]]:
     """The rows of each form that is told apart by the order of its pieces."""
     of, negative = _linear(graph)
     return [joint.rows for joint in _told_apart(graph, of, negative)]
 
 
-def check_kept(graph: Graph, kept: np.ndarray, all_or_none: bool = False) -> None:
+def check_kept(graph: FactorGraph, kept: np.ndarray, all_or_none: bool = False) -> None:
     """No form loses a piece of negative weight, or its number, and keeps others; with `all_or_none` none at all.
 
     Raises Apart.
@@ -94,7 +94,7 @@ def check_kept(graph: Graph, kept: np.ndarray, all_or_none: bool = False) -> Non
             raise errors.Apart(keys, graph.ids_of(rows).tolist(), "some would go and others stay")
 
 
-def check_joints(graph: Graph, first: int = 0) -> None:
+def check_joints(graph: FactorGraph, first: int = 0) -> None:
     """Every form that has a factor from row `first` on is one.  Raises Apart."""
     of, negative = _linear(graph, first)
     if (bad := np.flatnonzero(negative & ~of)).size:
@@ -130,7 +130,7 @@ def _is_semidefinite(share: F64) -> bool:
     return True
 
 
-def _linear(graph: Graph, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def _linear(graph: FactorGraph, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Of the factors from row `first` on, which are linear ones without a loss, and which are of negative weight."""
     fac = graph.fac[first : graph.counts[at.FACTORS]]
     negative = np.zeros(len(fac), bool)
@@ -138,7 +138,7 @@ def _linear(graph: Graph, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return LINEAR[fac[:, at.F_KIND]] & ((fac[:, at.F_FLAGS] >> at.LOSS_SHIFT) == at.NO_LOSS), negative
 
 
-def _told_apart(graph: Graph, of: np.ndarray, negative: np.ndarray, first: int = 0) -> Iterator[Joint]:
+def _told_apart(graph: FactorGraph, of: np.ndarray, negative: np.ndarray, first: int = 0) -> Iterator[Joint]:
     """The forms that begin with a number, among the linear factors `of` (m,) from row `first` on."""
     fac, count = graph.fac[first : first + of.size], of.size
     inside = np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
@@ -161,7 +161,7 @@ def _told_apart(graph: Graph, of: np.ndarray, negative: np.ndarray, first: int =
         inside[variables] = False
 
 
-def _is_number(graph: Graph, f: int) -> bool:
+def _is_number(graph: FactorGraph, f: int) -> bool:
     """Whether a linear factor says nothing of its variable: H = 0."""
     kind, start = graph.fac[f, at.F_KIND], graph.fac[f, at.F_AT]
     begin = start + _H[kind]

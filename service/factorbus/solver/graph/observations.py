@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import LENS_AT, FactorKind
 from factorbus.solver.kernels.graph.admit_observations import find_lost
 from factorbus.solver.kernels.jit.compile import F64
@@ -40,7 +40,7 @@ def with_limits(kind: FactorKind, measured: F64) -> F64:
     return measured
 
 
-def check(graph: Graph, first_factor: int) -> None:
+def check(graph: FactorGraph, first_factor: int) -> None:
     """Are all sights from factor `first_factor` on possible where their ends are?  Raises BadSight."""
     last = int(graph.counts[at.FACTORS])
     row, status = find_lost(True, first_factor, last, graph.var, graph.fac, graph.values, graph.payload)
@@ -50,7 +50,7 @@ def check(graph: Graph, first_factor: int) -> None:
         raise errors.BadSight(graph.describe(graph.fac[row]), pixel, REASONS[int(status)])
 
 
-def inactive(graph: Graph) -> list[tuple[int, str, str]]:
+def inactive(graph: FactorGraph) -> list[tuple[int, str, str]]:
     """(id, the factor, why) of every sight that has no pixel at the present values."""
     found, row, last = [], -1, int(graph.counts[at.FACTORS])
     while True:
@@ -60,7 +60,7 @@ def inactive(graph: Graph) -> list[tuple[int, str, str]]:
         found.append((int(graph.ids_of(np.array([row]))[0]), graph.describe(graph.fac[row]), REASONS[int(status)]))
 
 
-def why_inactive(graph: Graph, factor: int) -> str:
+def why_inactive(graph: FactorGraph, factor: int) -> str:
     """Why the sight `factor` has no pixel at the present values; empty: it has one, or is no sight."""
     row, status = find_lost(False, factor, factor + 1, graph.var, graph.fac, graph.values, graph.payload)
     return REASONS[int(status)] if row >= 0 else ""

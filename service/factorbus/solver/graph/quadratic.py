@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE, FactorKind
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE, VariableKind
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -27,7 +27,7 @@ class Quadratic:
     plus: F64
 
 
-def quadratic(graph: Graph, rows: Iterable[int], first: list[int]) -> Quadratic:
+def quadratic(graph: FactorGraph, rows: Iterable[int], first: list[int]) -> Quadratic:
     """Of the factors `rows`; the variables `first` come first, behind them the others on these factors, ascending."""
     rows = list(rows)
     ends = {v for v in graph.fac[rows, at.F_I : at.F_J + 1].ravel().tolist() if v >= 0} - set(first)
@@ -54,14 +54,14 @@ def quadratic(graph: Graph, rows: Iterable[int], first: list[int]) -> Quadratic:
     return Quadratic(variables, starts, information, eta, plus)
 
 
-def _by_kind(graph: Graph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
+def _by_kind(graph: FactorGraph, rows: list[int]) -> Iterator[tuple[FactorKind, I64]]:
     picked = np.array(rows, np.int64)
     codes = graph.fac[picked, at.F_KIND]
     for code in np.unique(codes).tolist():
         yield FACTOR_KIND_OF_CODE[code], picked[codes == code]
 
 
-def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:
+def _evaluated(graph: FactorGraph, kind: FactorKind, rows: I64) -> tuple[list[F64], F64, F64]:
     """Of factors of one kind the Jacobian of each end (n, dim, d), Ω (n, dim, dim) and r (n, dim)."""
     n = rows.size
     r, A, B, W = np.zeros((n, at.R_SIZE)), *(np.zeros((n, 6, 6)) for _ in range(3))
@@ -71,6 +71,6 @@ def _evaluated(graph: Graph, kind: FactorKind, rows: I64) -> tuple[list[F64], F6
     return blocks, W[:, :d, :d], r[:, :d]
 
 
-def kind_of(graph: Graph, v: int) -> VariableKind:
+def kind_of(graph: FactorGraph, v: int) -> VariableKind:
     """The kind of the variable with this index."""
     return VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])]

@@ -13,7 +13,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 
@@ -21,7 +21,7 @@ _BASELINES = 10.0
 _LEAST_BASELINE = 1e-9  # metres: poses closer than that are one place, which says nothing of the distance
 
 
-def place_by_bearings(graph: Graph, first: int, first_factor: int, reached: I64) -> bool:
+def place_by_bearings(graph: FactorGraph, first: int, first_factor: int, reached: I64) -> bool:
     """Give a value to each new point that is not `reached` and that bearings of placed poses see from two places.
 
     in/out  reached: an entry for each variable from `first` on, 1: it has a value
@@ -44,7 +44,7 @@ def place_by_bearings(graph: Graph, first: int, first_factor: int, reached: I64)
     return placed
 
 
-def _ray(graph: Graph, pose: int, payload: int) -> tuple[F64, F64]:
+def _ray(graph: FactorGraph, pose: int, payload: int) -> tuple[F64, F64]:
     """(where it starts, its direction of unit length), in the map."""
     begin, kind = int(graph.var[pose, at.V_AT]), int(graph.var[pose, at.V_KIND])
     x = graph.values[begin : begin + 7]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver.graph.arenas import Arenas
-from factorbus.solver.graph.factor_graph import Graph, grown
+from factorbus.solver.graph.factor_graph import FactorGraph, with_room
 from factorbus.solver.kernels.inc_l import block_rows as br
 from factorbus.solver.kernels.inc_l.block_rows import (
     append_rows,
@@ -73,7 +73,7 @@ class BlockFactor(Arenas):
         )
         self.d[: symbolic.size] = d
 
-    def append(self, graph: Graph, v0: int) -> None:
+    def append(self, graph: FactorGraph, v0: int) -> None:
         """Append rows without information for the free variables from index `v0` on."""
         v1 = int(graph.counts[at.VARIABLES])
         if v0 == v1:
@@ -82,7 +82,7 @@ class BlockFactor(Arenas):
         self._make_room((v1 - v0) * _NEW_INDEX, (v1 - v0) * _NEW_NUMBERS)
         append_rows(v0, v1, graph.array_table, self.array_table)
 
-    def reach(self, graph: Graph, f0: int) -> Reach:
+    def reach(self, graph: FactorGraph, f0: int) -> Reach:
         """What the factors from id `f0` on reach; their variables have rows."""
         seen = np.zeros(1, np.int64)
         f1 = int(graph.counts[at.FACTORS])
@@ -90,7 +90,7 @@ class BlockFactor(Arenas):
         rows = self._found[:count]
         return Reach(rows, int(seen[0]), int(self.counts[br.POSITIONS] - rows[0]) if count else 0)
 
-    def omega_update(self, graph: Graph, f0: int, reach: Reach) -> bool:
+    def omega_update(self, graph: FactorGraph, f0: int, reach: Reach) -> bool:
         """R₂₂ := chol(R₂₂ᵀR₂₂ + Ω) for the factors from id `f0` on, linearized at the graph's values; d with it.
 
         False: a pivot failed, and R is of no use any more.
@@ -133,10 +133,10 @@ class BlockFactor(Arenas):
         """Room for `more` positions, `scalars` in all."""
         need = int(self.counts[br.POSITIONS]) + more
         if need > len(self.rec):
-            self.rec, self.place, self._mark = (grown(a, need) for a in (self.rec, self.place, self._mark))
+            self.rec, self.place, self._mark = (with_room(a, need) for a in (self.rec, self.place, self._mark))
             self._found = np.empty(len(self.rec), np.int64)
         if scalars > self.d.size:
-            self.d = grown(self.d, scalars)
+            self.d = with_room(self.d, scalars)
 
     def _make_room_to_grow(self, reach: Reach) -> None:
         """Room for every reached row to be joined with all reached ones behind it, half as much again to grow."""

@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.block_factor import BlockFactor
 from factorbus.solver.inc_l.strategy import Plan, choose
 from factorbus.solver.kernels.jit.compile import F64
@@ -51,7 +51,7 @@ class Incremental:
         """Bytes of R, in fronts and in block rows."""
         return self.elimination.memory_bytes() + self.rows.memory_bytes()
 
-    def apply(self, graph: Graph, blocks: HessianBlocks, since: Mark, watch: Stopwatch) -> Plan:
+    def apply(self, graph: FactorGraph, blocks: HessianBlocks, since: Mark, watch: Stopwatch) -> Plan:
         """R and d follow what came after `since`, which Λ and η hold already; or R is given up."""
         if not self.have_r:
             return Plan("full", "the linearization point has moved, or nothing was factorized yet")
@@ -74,7 +74,7 @@ class Incremental:
             return Plan("full", f"a pivot failed in the {plan.strategy} update")
         return plan
 
-    def factorize(self, graph: Graph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
+    def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """R of Λ with its diagonal times 1 + damping, the one that is there if it is that; −1 or the failed column."""
         if damping == 0.0 and self.have_r:
             self._solves = self._have

@@ -13,7 +13,7 @@ import numpy as np
 
 from factorbus.solver import errors
 from factorbus.solver.graph import observations
-from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.inc_l.incremental import Incremental, Where
 from factorbus.solver.inc_l.strategy import Plan
 from factorbus.solver.kernels.graph.local_init import settle_new
@@ -64,7 +64,7 @@ class IncrementalSteps:
 
     NOT_KEPT = ("_graph", "_options", "_mode")
 
-    def __init__(self, graph: Graph, options: Options) -> None:
+    def __init__(self, graph: FactorGraph, options: Options) -> None:
         self._graph, self._options = graph, options
         self._mode = mode_named(options.mode)
         self._system = System(graph, Incremental(Elimination(options), options))

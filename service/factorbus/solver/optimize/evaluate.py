@@ -6,7 +6,7 @@ import numpy as np
 
 from factorbus.solver.errors import UnknownVariable
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import Addition, FactorsLike, VariablesLike
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.chi2 import sum_chi2
@@ -20,7 +20,7 @@ def chi2_at(
     variables: of the graph, with values.  values: of some of them; the others, and fixed ones, stay where they are.
     Raises the errors of `admission.admit`, and UnknownVariable for a key in `values` that the graph does not have.
     """
-    graph = Graph()
+    graph = FactorGraph()
     admit(graph, Addition(tuple(variables), tuple(factors)))
     for group in values:
         for key, row in zip(group.keys.tolist(), np.asarray(group.values), strict=True):

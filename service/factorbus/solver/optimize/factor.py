@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.report import Stopwatch
 from factorbus.solver.sparse.blocks import HessianBlocks
@@ -11,7 +11,7 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 class Factor(Protocol):
     """R and d, and solving with them: `inc_l.incremental.Incremental`, which says what each of these does."""
 
-    def factorize(self, graph: Graph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int: ...
+    def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int: ...
     def decrease(self, eta: F64, watch: Stopwatch) -> float: ...
     def step(self, watch: Stopwatch) -> F64: ...
     def turned(self) -> None: ...

@@ -5,7 +5,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.retract import differing, move
@@ -26,7 +26,7 @@ class System(Generic[R]):
 
     NOT_KEPT = ("_before", "_kept", "_moved", "_suspects", "_trial", "_watch", "graph")
 
-    def __init__(self, graph: Graph, factor: R) -> None:
+    def __init__(self, graph: FactorGraph, factor: R) -> None:
         self.graph = graph
         self.blocks = HessianBlocks()
         self.factor = factor

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph, Mark
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.kernels.graph.initialize import join, reach
 from factorbus.solver.kernels.graph.observability import mark_held
 from factorbus.solver.kernels.jit.compile import F64, I64
@@ -21,7 +21,7 @@ _LOOSE = 1e12
 _NONE = np.empty(0, np.int64)
 
 
-def find_unheld(graph: Graph, since: Mark) -> I64:
+def find_unheld(graph: FactorGraph, since: Mark) -> I64:
     """The free variables after `since` that neither a chain of factors holds, nor several on what is held."""
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     if first == last:
@@ -37,7 +37,7 @@ def find_unheld(graph: Graph, since: Mark) -> I64:
     return first + np.flatnonzero(held == 0)
 
 
-def find_unanchored(graph: Graph, since: Mark) -> int:
+def find_unanchored(graph: FactorGraph, since: Mark) -> int:
     """A variable after `since` that no factors join, however indirectly, to one that is fixed or has a prior; or −1."""
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
@@ -48,7 +48,7 @@ def find_unanchored(graph: Graph, since: Mark) -> int:
     return int(join(first, last, *factors, graph.fac, anchored, np.empty(last - first + 1, np.int64)))
 
 
-def find_loose(graph: Graph, blocks: HessianBlocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
+def find_loose(graph: FactorGraph, blocks: HessianBlocks, suspects: I64, solve: Callable[[F64], F64]) -> int:
     """The suspect that Λ leaves free to move, or −1.
 
     `solve` gives Λ⁻¹ b.  With D = diag Λ and signs s on the suspects, y = D½ Λ⁻¹ D½ s is of the size of the inverse of

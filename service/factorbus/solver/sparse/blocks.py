@@ -7,7 +7,7 @@ is not accepted costs nothing to undo.
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph, Mark, grown, table_size
+from factorbus.solver.graph.factor_graph import FactorGraph, Mark, table_size, with_room
 from factorbus.solver.kernels.graph.block_pattern import connect_blocks, enter_blocks, remove_blocks
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -43,7 +43,7 @@ class HessianBlocks:
         """Where each block starts in `data`."""
         return self.pattern[2, : self.fill[0]]
 
-    def extend(self, graph: Graph, since: Mark) -> float:
+    def extend(self, graph: FactorGraph, since: Mark) -> float:
         """Add the variables and factors after `since`, linearized at the present values; gives the factors' χ²."""
         v0, v1 = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
         f0, f1 = since[at.FACTORS], int(graph.counts[at.FACTORS])
@@ -51,12 +51,12 @@ class HessianBlocks:
         numbers = int(self.fill[1])
         connect_blocks(v0, v1, f0, f1, graph.array_table, self.table, self.pattern, self.fill)
         if (need := int(self.fill[1])) > self.data.size:
-            self.data = grown(self.data, need)
+            self.data = with_room(self.data, need)
         self.data[numbers:need] = 0.0
         self.eta[since[at.SCALARS] : int(graph.counts[at.SCALARS])] = 0.0
         return float(linearize(f0, f1, graph.var, graph.fac, graph.values, graph.payload, self.data, self.eta))
 
-    def relinearize(self, graph: Graph, values: F64) -> float:
+    def relinearize(self, graph: FactorGraph, values: F64) -> float:
         """Build all anew at `values` in the spare copy; gives χ² there."""
         if self._spare_data.size != self.data.size or self._spare_eta.size != self.eta.size:
             self._spare_data, self._spare_eta = np.empty_like(self.data), np.empty_like(self.eta)
@@ -75,7 +75,7 @@ class HessianBlocks:
         """Exchange the present and the spare η."""
         self.eta, self._spare_eta = self._spare_eta, self.eta
 
-    def forget(self, graph: Graph, fill: tuple[int, int]) -> None:
+    def forget(self, graph: FactorGraph, fill: tuple[int, int]) -> None:
         """Go back to the pattern that had `fill`; `graph` is back at that moment already.
 
         The numbers are summed anew.  They get the bits they had: factors are always added in the order of their ids.
@@ -96,4 +96,4 @@ class HessianBlocks:
             self.table = np.zeros(table_size(need), np.int64)
             enter_blocks(int(self.fill[0]), self.table, self.pattern)
         if scalars > self.eta.size:
-            self.eta = grown(self.eta, scalars)
+            self.eta = with_room(self.eta, scalars)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import POSE, SEES_LANDMARK
@@ -29,7 +29,7 @@ class Elimination:
         self._pattern = (0, 0)
         self.symbolic: Symbolic | None = None
 
-    def factorize(self, graph: Graph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
+    def factorize(self, graph: FactorGraph, blocks: HessianBlocks, damping: float, watch: Stopwatch) -> int:
         """Factorize Λ with its diagonal times 1 + damping; gives −1, or the block column whose pivot failed."""
         symbolic = self._analysis(graph, blocks, watch)
         if self._options.backend == "cholmod":
@@ -63,7 +63,7 @@ class Elimination:
             raise ValueError("there is no factor: the pattern has changed since")
         return symbolic, self._cholesky.arena
 
-    def _analysis(self, graph: Graph, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
+    def _analysis(self, graph: FactorGraph, blocks: HessianBlocks, watch: Stopwatch) -> Symbolic:
         pattern = (int(graph.counts[at.COLUMNS]), int(blocks.fill[0]))
         if self.symbolic is None or pattern != self._pattern:
             dims = graph.dims[: pattern[0]]
@@ -83,7 +83,7 @@ class Elimination:
         self.symbolic = None
 
 
-def constraint(graph: Graph, recent_poses: int = 1) -> I64:
+def constraint(graph: FactorGraph, recent_poses: int = 1) -> I64:
     """Groups (columns,) of the ordering: the last free pose last, the landmarks seen from it, or from
     the `constrain_recent_poses` last ones, right before it.
 

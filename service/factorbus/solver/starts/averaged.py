@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.carried import carry, tied
@@ -44,7 +44,7 @@ class Nodes:
     fixed: np.ndarray
 
 
-def averaged(graph: Graph) -> list[F64]:
+def averaged(graph: FactorGraph) -> list[F64]:
     """Values for a graph, laid out as its own, from averaged rotations: none if it has no poses or nothing holds them.
 
     Two if it has points whose places are measured: rotations by themselves, and together with places.  The values that
@@ -64,7 +64,7 @@ def averaged(graph: Graph) -> list[F64]:
 class _Averaging:
     """One space of a graph: what its factors say, and what it is before anything is averaged."""
 
-    def __init__(self, graph: Graph, space: PoseSpace) -> None:
+    def __init__(self, graph: FactorGraph, space: PoseSpace) -> None:
         self._graph, self._space, self._nodes = graph, space, _nodes(graph, space)
         relations, self._directions = relations_of(graph, space)
         self.has_places = bool((self._nodes.point[relations.b] & (relations.a != MAP)).any())
@@ -110,7 +110,7 @@ class _Averaging:
         return R, _place(relations, nodes, R, np.ones(label.size, bool))
 
 
-def _nodes(graph: Graph, space: PoseSpace) -> Nodes:
+def _nodes(graph: FactorGraph, space: PoseSpace) -> Nodes:
     count, d = int(graph.counts[at.VARIABLES]), space.dim
     var, size = graph.var[:count], 3 if d == 2 else 7
     R, t = np.tile(np.eye(d), (count + 1, 1, 1)), np.zeros((count + 1, d))
@@ -167,7 +167,7 @@ def _place(relations: Relations, nodes: Nodes, R: F64, inside: np.ndarray) -> F6
     return solve_positions(used, R, nodes.t, known)
 
 
-def _write(graph: Graph, space: PoseSpace, nodes: Nodes, R: F64, t: F64, values: F64) -> None:
+def _write(graph: FactorGraph, space: PoseSpace, nodes: Nodes, R: F64, t: F64, values: F64) -> None:
     """The free poses and points as variables have them."""
     d, start = space.dim, graph.var[: graph.counts[at.VARIABLES], at.V_AT]
     for of in (nodes.pose & ~nodes.fixed, nodes.point & ~nodes.fixed):

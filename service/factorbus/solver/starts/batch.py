@@ -8,7 +8,7 @@ import numpy as np
 
 from factorbus.solver.errors import NotFinite
 from factorbus.solver.graph.admission import admit
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.groups import Addition, FactorsLike, Group, VariablesLike
 from factorbus.solver.kernels.graph.initialize import reach
 from factorbus.solver.kernels.jit.compile import F64
@@ -39,7 +39,7 @@ def solve_batch(variables: Sequence[VariablesLike], factors: Sequence[FactorsLik
     These are the values given, those that the factors compose from the first to the last, and those that averaged
     rotations lead to.  Variables without values are composed.  Raises SolverError.
     """
-    graph = Graph()
+    graph = FactorGraph()
     admit(graph, Addition(tuple(variables), tuple(factors)))
     given = any(group.values is not None and not group.fixed and len(group.keys) for group in variables)
     descents = Descents(graph)
@@ -71,7 +71,7 @@ def _is_beside(descent: Descent, lower: Descent) -> bool:
     return descent.start == lower.start or are_close(descent.values, lower.values)
 
 
-def _composed(graph: Graph) -> F64:
+def _composed(graph: FactorGraph) -> F64:
     """Each variable from the first factor that reaches it; what none reaches stays where it is."""
     composed = copy(graph)
     composed.values = graph.values.copy()

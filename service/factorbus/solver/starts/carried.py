@@ -4,7 +4,7 @@ MATH §12.3."""
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.starts.relations import PoseSpace, Relations
@@ -14,7 +14,7 @@ from factorbus.solver.starts.rotation_matrices import turned_rays
 _WEAK = 1e-4
 
 
-def tied(graph: Graph, space: PoseSpace, relations: Relations, R: F64, t: F64) -> Relations:
+def tied(graph: FactorGraph, space: PoseSpace, relations: Relations, R: F64, t: F64) -> Relations:
     """`relations`, and for each point whose place no factor measures: as the pose that saw it first sees it now.
 
     R (N, d, d), t (N, d): as they are.
@@ -42,7 +42,7 @@ def tied(graph: Graph, space: PoseSpace, relations: Relations, R: F64, t: F64) -
     return relations.joined(ties)
 
 
-def carry(graph: Graph, space: PoseSpace, before: tuple[F64, F64], after: tuple[F64, F64], values: F64) -> None:
+def carry(graph: FactorGraph, space: PoseSpace, before: tuple[F64, F64], after: tuple[F64, F64], values: F64) -> None:
     """Features of inverse depth go along with the pose that saw them first.
 
     before, after: rotations (N, d, d) and places (N, d) of all nodes as they are, and as they are in `values`.
@@ -64,7 +64,7 @@ def carry(graph: Graph, space: PoseSpace, before: tuple[F64, F64], after: tuple[
     values[start[:, None] + 3 + np.arange(2)] = turned_rays(angles, turn)
 
 
-def _first_seen(graph: Graph, wanted: np.ndarray, pose: np.ndarray) -> tuple[I64, I64, I64]:
+def _first_seen(graph: FactorGraph, wanted: np.ndarray, pose: np.ndarray) -> tuple[I64, I64, I64]:
     """(nodes that are wanted, the first pose that a factor joins each to, the row of that factor)."""
     fac = graph.fac[: graph.counts[at.FACTORS]]
     i, j = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1

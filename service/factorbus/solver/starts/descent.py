@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver import errors
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.inc_l.incremental import Incremental
 from factorbus.solver.kernels.jit.compile import F64
 from factorbus.solver.kernels.model import layout as at
@@ -60,7 +60,7 @@ class Descent:
 class Descents:
     """The problem that all starts have in common.  Raises Underconstrained: nothing joins a variable to the map."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: FactorGraph) -> None:
         options = Options(mode="all-batch")
         self._rule = options.tuning.converge_tolerance, 1e-8 * options.tuning.chi2_epsilon
         self.graph, none = graph, (0,) * at.COUNTS

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorbus.solver.graph.factor_graph import Graph
+from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.factors import FACTOR_KIND_OF_CODE
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -98,12 +98,12 @@ class Directions:
         return Directions(*(getattr(self, name)[chosen] for name in self.__slots__))
 
 
-def relations_of(graph: Graph, space: PoseSpace) -> tuple[Relations, Directions]:
+def relations_of(graph: FactorGraph, space: PoseSpace) -> tuple[Relations, Directions]:
     """All that the factors of a graph say of poses and points in one space."""
     return Relations(*map(np.concatenate, zip(*_parts(graph, space), strict=True))), _directions(graph, space)
 
 
-def _parts(graph: Graph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
+def _parts(graph: FactorGraph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
     parts = [_poses(graph, space, space.between), _poses(graph, space, space.prior)]
     parts += [_points(graph, space, space.landmark), _points(graph, space, space.prior_point)]
     parts += [_positions(graph, space), _linear_pairs(graph, space), _linear(graph, space), _bearings(graph, space)]
@@ -112,7 +112,7 @@ def _parts(graph: Graph, space: PoseSpace) -> list[tuple[np.ndarray, ...]]:
     return parts
 
 
-def _rows(graph: Graph, kind: int) -> tuple[I64, I64, F64, F64]:
+def _rows(graph: FactorGraph, kind: int) -> tuple[I64, I64, F64, F64]:
     """(rows, fac of them, measured, information matrices) of the factors of one kind."""
     declared = FACTOR_KIND_OF_CODE[kind]
     fac = graph.fac[: graph.counts[at.FACTORS]]
@@ -125,7 +125,7 @@ def _rows(graph: Graph, kind: int) -> tuple[I64, I64, F64, F64]:
     return rows, picked, numbers[:, : declared.size], information
 
 
-def _losses(graph: Graph, kind: int, fac: I64) -> tuple[I64, F64]:
+def _losses(graph: FactorGraph, kind: int, fac: I64) -> tuple[I64, F64]:
     """The codes of the losses, and their scales."""
     declared, loss = FACTOR_KIND_OF_CODE[kind], fac[:, at.F_FLAGS] >> at.LOSS_SHIFT
     scale, robust = np.ones(len(fac)), np.flatnonzero(loss != at.NO_LOSS)
@@ -134,7 +134,7 @@ def _losses(graph: Graph, kind: int, fac: I64) -> tuple[I64, F64]:
 
 
 def _made(
-    graph: Graph, kind: int, rows: I64, fac: I64, a: I64, b: I64, t: F64, hold: F64, **more: np.ndarray
+    graph: FactorGraph, kind: int, rows: I64, fac: I64, a: I64, b: I64, t: F64, hold: F64, **more: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """A part of `Relations`; what is not given is nothing."""
     m, d = t.shape
@@ -154,7 +154,7 @@ def poses_apart(numbers: F64) -> tuple[F64, F64]:
     return matrices_of_quaternions(numbers[:, 3:]), numbers[:, :3]
 
 
-def _poses(graph: Graph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
+def _poses(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, kind)
     (R, t), d = poses_apart(measured), space.dim
     b = fac[:, at.F_J] + 1 if kind == space.between else fac[:, at.F_I] + 1
@@ -173,7 +173,7 @@ def _turn(information: F64, d: int) -> F64:
     return np.maximum(mean, 1e-12 * np.trace(information[:, d:, d:], axis1=1, axis2=2)) * (1.0 if d == 2 else 0.25)
 
 
-def _points(graph: Graph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
+def _points(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, kind)
     seen = kind == space.landmark
     a = fac[:, at.F_I] + 1 if seen else np.zeros(rows.size, np.int64)
@@ -181,7 +181,7 @@ def _points(graph: Graph, space: PoseSpace, kind: int) -> tuple[np.ndarray, ...]
     return _made(graph, kind, rows, fac, a, b, measured, information)
 
 
-def _bearing_ranges(graph: Graph) -> tuple[np.ndarray, ...]:
+def _bearing_ranges(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, at.BEARING_RANGE_SE2)
     bearing, distance = measured.T
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
@@ -191,7 +191,7 @@ def _bearing_ranges(graph: Graph) -> tuple[np.ndarray, ...]:
     return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, hold)
 
 
-def _bearings(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
+def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """Points on a line: at the distance that they have now, and free to move along it."""
     rows, fac, measured, information = _rows(graph, space.bearing)
     u = np.stack([np.cos(measured[:, 0]), np.sin(measured[:, 0])], axis=1) if space.dim == 2 else measured
@@ -205,19 +205,19 @@ def _bearings(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     return _made(graph, space.bearing, rows, fac, a, b, distance[:, None] * u, hold)
 
 
-def _value(graph: Graph, variables: I64, numbers: int) -> F64:
+def _value(graph: FactorGraph, variables: I64, numbers: int) -> F64:
     """The first so many numbers of the present values."""
     return graph.values[graph.var[variables, at.V_AT, None] + np.arange(numbers)]
 
 
-def _positions(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
+def _positions(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, space.position)
     d, a = space.dim, np.zeros(rows.size, np.int64)
     b, lever = fac[:, at.F_I] + 1, measured[:, d:]
     return _made(graph, space.position, rows, fac, a, b, measured[:, :d], information, lever=lever)
 
 
-def _headings(graph: Graph) -> tuple[np.ndarray, ...]:
+def _headings(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, at.HEADING_SE2)
     R, a = matrices_of_angles(measured[:, 0]), np.zeros(rows.size, np.int64)
     nothing = np.zeros((rows.size, 2))
@@ -226,7 +226,7 @@ def _headings(graph: Graph) -> tuple[np.ndarray, ...]:
     return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, hold, R=R, turn=turn)
 
 
-def _linear_pairs(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
+def _linear_pairs(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """Two poses together: as they are to each other where the factor was linearized."""
     rows, fac, measured, information = _rows(graph, space.linear_pair)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
@@ -241,7 +241,7 @@ def _linear_pairs(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     return _made(graph, space.linear_pair, rows, fac, a, b, t, hold, R=back @ Rb, turn=turn)
 
 
-def _linear(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
+def _linear(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     """A pose by itself: where the factor was linearized, if it says something of all of the pose."""
     rows, fac, measured, information = _rows(graph, space.linear)
     d, size, dim = space.dim, 3 if space.dim == 2 else 7, 3 if space.dim == 2 else 6
@@ -255,7 +255,7 @@ def _linear(graph: Graph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     return _made(graph, space.linear, rows, fac, a, b, t, hold, R=R, turn=weight[:, d:].mean(axis=1))
 
 
-def _directions(graph: Graph, space: PoseSpace) -> Directions:
+def _directions(graph: FactorGraph, space: PoseSpace) -> Directions:
     if space.dim == 2:
         return Directions(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
     _, fac, measured, information = _rows(graph, at.ATTITUDE_SE3)
