@@ -271,12 +271,12 @@ def test_a_full_disk_is_told_apart_from_the_network(site: Site) -> None:
 _LIMITED = """
 import resource, sys
 from pathlib import Path
-from factorbus.datasets import Dataset, DatasetProblem, Source, fetch
+from factorbus.datasets import Dataset, DatasetProblem, Source, fetch_dataset
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 cache, base, source, made = sys.argv[1:]
 lane = Dataset("lane", "", "", "2D", 2, 0, 1, 0, 0, 0.0, made, Source("isam", ("l.txt",), (source,), "a/b", "c"))
 try:
-    fetch(lane, Path(cache), base=base)
+    fetch_dataset(lane, Path(cache), base=base)
 except DatasetProblem as problem:
     print(problem.code)
 """
