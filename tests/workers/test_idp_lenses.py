@@ -1,6 +1,9 @@
 """Lenses: against OpenCV's numbers, against their own definitions, there and back, and up to where they end."""
 
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -168,3 +171,27 @@ def test_whatever_comes_in_what_is_good_can_be_undone(name: str, ray: tuple, pix
             again = lenses.pixels(camera, found.values)
             assert again.status[0] in (at.GOOD, at.OUTSIDE_IMAGE)
             np.testing.assert_allclose(again.values[0], pixel, rtol=0, atol=1e-8 * (1 + max(map(abs, pixel))))
+
+
+_COMPILED_FIRST_BY_A_QUICK_KERNEL = """
+import re
+import numba, numpy as np
+from factorbus.solver.lenses.models import project_radtan
+
+@numba.njit(fastmath=True)
+def kernel(lens, x):
+    return project_radtan(lens, x, x, 1.0)[0]
+
+kernel(np.ones(16), 0.1)
+codes = project_radtan.inspect_llvm().values()
+print(len(codes), sum(len(re.findall(r"= f(?:add|sub|mul|div) (?!double)", code)) for code in codes))
+"""
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
+def test_lenses_are_exact_whatever_kernel_has_them_compiled_first() -> None:
+    """Else two workers that had compiled in another order would differ in the last bits of the same features."""
+    command = [sys.executable, "-P", "-c", _COMPILED_FIRST_BY_A_QUICK_KERNEL]
+    environment = os.environ | {"FACTORBUS_STOCK_NUMBA": "1"}  # a kernel that is not ours
+    made = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200, check=True)
+    assert made.stdout == "1 0\n"

@@ -100,8 +100,9 @@ _lowering: Any = None if STOCK else import_module(".lowering", __package__)
 
 # Sums may be reordered and multiply-adds fused.  Not "nnan" or "ninf": the test of a pivot must see a NaN.
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
-_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-_QUICK_FLAGS: dict[str, Any] = {"nogil": False, "error_model": "numpy"}
+# Without "fastmath" a function would take it over from the kernel that has it compiled first.
+_EXACT_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+_QUICK_FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "nogil": False}
 _FLAGS: dict[str, Any] = {**_EXACT_FLAGS, "fastmath": _FASTMATH}
 # Of numba's variables, those that leave the code as it is: no kernel is parallel.
 _NO_MATTER = {"NUMBA_NUM_THREADS", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING"}
