@@ -24,6 +24,7 @@ TWINS = (
     {"proto/problems", "solver/errors"},  # an error of the solver travels as the problem of that name and code
     {"proto/kinds", "solver/graph/factors"},  # a kind as the wire has it, and with its code in kernels
     {"proto/kinds", "solver/graph/variables"},
+    {"service/config", "workers/config"},  # BadConfig, of two programs
     {"idp/classical", "idp/independent", "idp/minimal"},  # three ways to the same covariance
 )
 STARTS = {"main"}

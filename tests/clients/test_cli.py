@@ -111,7 +111,12 @@ def test_with_json_a_failure_is_one_document_too(tmp_path: Path) -> None:
     assert ran.returncode == BAD_FILE
     problem = json.loads(ran.stdout)["problem"]
     assert problem["code"] == "bad_file"
-    assert problem["detail"] == {"file": "missing.g2o", "line": None}
+    assert problem["detail"] == {
+        "file": "missing.g2o",
+        "line": None,
+        "seen": "it cannot be read (No such file or directory)",
+        "wanted": "a readable g2o, TORO, iSAM or SLAM++ file",
+    }
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:

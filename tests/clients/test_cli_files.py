@@ -205,7 +205,12 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
     assert " 4/4 " in shown.err, "the bar ends where the drive does"
     assert (told["written"], told["poses"]) == (["o.g2o", "t.tum"], 4)
     assert main([*asked, "--strict"]) == BAD_FILE
-    assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {"file": "a.g2o", "line": 5}
+    assert json.loads(capsys.readouterr().out)["problem"]["detail"] == {
+        "file": "a.g2o",
+        "line": 5,
+        "seen": "ROBOTLASER1, no g2o record that is read",
+        "wanted": "nothing that would have to be left out (strict)",
+    }
     (folder / "a.txt").write_text(SLAMPP)
     chi2 = []
     for more in ([], ["--dialect", "slam++"]):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from factorbus.proto import codec
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES, VARIABLE_KINDS
-from factorbus.proto.limits import REQUEST_LIMITS, Limits
+from factorbus.proto.limits import REQUEST_LIMITS, MessageLimits
 from factorbus.proto.messages import Batch, Factors, Insert, Variables
 from factorbus.proto.problems import Problem, TooLarge
 from factorbus.service.core.events import Arrived, ParsedInsert
@@ -286,7 +286,7 @@ def test_left_to_the_codec(name: str) -> None:
 def test_the_limits_of_a_service_hold_for_both() -> None:
     message = codec.encode_insert(Insert(1, Batch((Variables("se2", np.arange(9), np.zeros((9, 3))),))))
     assert try_parse(message, REQUEST_LIMITS)
-    for limits in (Limits(len(message) - 1, 100, 100), Limits(1 << 20, 8, 100)):
+    for limits in (MessageLimits(len(message) - 1, 100, 100), MessageLimits(1 << 20, 8, 100)):
         assert try_parse(message, limits) is None
         with pytest.raises(TooLarge):
             codec.decode_insert(message, limits)

@@ -98,8 +98,8 @@ def solved(mode: str) -> Solver:
 @pytest.mark.parametrize("mode", ["inc-l", "all-batch"])
 def test_a_mode_without_a_tree_is_factorized_by_who_answers(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     solver, made = solved(mode), list[int]()
-    real = source_of.factored_anew
-    monkeypatch.setattr(source_of, "factored_anew", lambda graph: made.append(1) or real(graph))
+    real = source_of.computed_square_root
+    monkeypatch.setattr(source_of, "computed_square_root", lambda graph: made.append(1) or real(graph))
     question = parse("covariance", b"")
     copy = snapshot(solver, 1, 1, [question], {})
     assert not made, "the solver's thread has other work"

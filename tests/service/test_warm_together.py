@@ -63,7 +63,7 @@ def test_a_cold_start_compiles_in_other_processes_and_says_what(monkeypatch: pyt
     monkeypatch.setattr(together.subprocess, "Popen", compiling)
     monkeypatch.setattr(together, "core_count", lambda: 2)
     before, told = together.seconds_compiling(), []
-    together.warm(told.append)
+    together.warm_service(told.append)
     assert sorted(told) == sorted(f"kernel {process} {n}" for process in (1, 2) for n in range(20_000))
     assert {tuple(command[:4]) for command in asked} == {
         (sys.executable, "-P", "-m", "factorbus.service.operations.warm")

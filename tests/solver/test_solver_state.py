@@ -120,7 +120,9 @@ def test_a_state_with_other_arrays_is_refused() -> None:
     for changed in (lambda fac: fac[:, 0].copy(), lambda fac: fac.astype(np.int32), lambda fac: None):
         state = solver.dump()
         state["_graph"]["fac"] = changed(state["_graph"]["fac"])
-        with pytest.raises(ValueError, match=r"no state of a solver here: Graph\.fac is .*, wanted int64 in 2 dim"):
+        with pytest.raises(
+            ValueError, match=r"no state of a solver here: FactorGraph\.fac is .*, wanted int64 in 2 dim"
+        ):
             Solver().load(state)
 
 

@@ -22,7 +22,7 @@ from factorbus.proto.messages import JobDone
 from factorbus.proto.problems import Busy, Internal, Problem, ShuttingDown
 from factorbus.solver.errors import SolverError
 from factorbus.workers import jobs
-from factorbus.workers.config import BadWorkerConfig, WorkerConfig, checked_worker_config
+from factorbus.workers.config import BadConfig, WorkerConfig, checked_worker_config
 from factorbus.workers.heap import keep_freed_memory
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ _LOOK_S = 0.5
 def work(config: WorkerConfig, on_ready: Callable[[str], None], stop: threading.Event) -> None:
     """Take jobs until `stop` is set, then finish those begun and return.  Waits for the bus as long as it takes.
 
-    `on_ready` gets the worker's name once it can be found.  Raises BadWorkerConfig, BadName.
+    `on_ready` gets the worker's name once it can be found.  Raises BadConfig, BadName.
     """
     checked_worker_config(config)
     keep_freed_memory()
@@ -98,7 +98,7 @@ def _settings(config: WorkerConfig) -> zenoh.Config:
     except zenoh.ZError as error:
         # Not from `error`: a traceback would show the line of the file, and what secrets are on it.
         where = config.zenoh or "built in"
-        raise BadWorkerConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
+        raise BadConfig(f"Zenoh does not take this configuration ({where}): {redact.reason(error)}") from None
     return settings
 
 

@@ -9,7 +9,7 @@ from factorbus.proto.problems import Problem
 from factorbus.wording import counted
 
 
-class BadWorkerConfig(Problem):
+class BadConfig(Problem):
     """A setting that cannot have the value it was given."""
 
     code = "bad_config"
@@ -31,13 +31,13 @@ class WorkerConfig:
 
 
 def checked_worker_config(config: WorkerConfig) -> WorkerConfig:
-    """`config`, if it can work.  Raises BadWorkerConfig, BadEndpoint, BadName."""
+    """`config`, if it can work.  Raises BadConfig, BadEndpoint, BadName."""
     if not config.connect:
-        raise BadWorkerConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
+        raise BadConfig('there is nothing to connect to; give connect = ["tcp/HOST:7447"]')
     for endpoint in config.connect:
         checked_endpoint(endpoint)
     if not 1 <= config.slots <= 1024:
-        raise BadWorkerConfig(
+        raise BadConfig(
             f"slots is {config.slots}; wanted 1 to 1024 (this machine has {counted(os.cpu_count() or 1, 'core')})"
         )
     if config.name:

@@ -65,7 +65,7 @@ def recover(store: Store, map_solver: MapSolver) -> Recovered:
 
 
 def verify(store: Store, map_solver: MapSolver) -> Iterator[tuple[JournalRecord, bool]]:
-    """JournalRecord everything again from the beginning; gives each record, and whether it gave the same bits.
+    """Replay everything from the beginning; gives each record, and whether it gave the same bits.
 
     Raises JournalDamaged, JournalDiffers.
     """
@@ -84,7 +84,7 @@ class _History:
         self.solver_s = 0.0
 
     def again(self, record: JournalRecord, before: bytes, other: bool) -> bytes:
-        """JournalRecord `record` in again; gives the chain of digests after it.  Raises JournalDiffers.
+        """Apply `record` again; gives the chain of digests after it.  Raises JournalDiffers.
 
         before: the chain as the journal has it, so that one record with other bits does not hide whether the next ones
         have the same.  other: another build made the map, which a threshold may have taken another way: where

@@ -12,7 +12,7 @@ from factorbus.solver.kernels.jit.compile import I64
 
 # Of a usual step; those of a larger one are written to an array of their own.
 _ROOM = 48 << 10
-_NOTHING, _NO_GRAPH = np.empty(0, np.int64), FactorGraph()
+_NOTHING = np.empty(0, np.int64)
 
 
 class StepMessages:
@@ -64,7 +64,7 @@ class StepMessages:
         self, answers: Sequence[tuple[int, int]], epoch: int, revision: int, account: Mapping[str, Any]
     ) -> list[bytes]:
         """The answers alone."""
-        return self.write(answers, (epoch, revision, NO_DELTA), account, _NOTHING, _NO_GRAPH)[:-1]
+        return self.write(answers, (epoch, revision, NO_DELTA), account, _NOTHING, FactorGraph())[:-1]
 
     def write_delta(
         self, step: tuple[int, int, int], account: Mapping[str, Any], changed: I64, graph: FactorGraph

@@ -64,7 +64,7 @@ class TreeSteps:
 
     @property
     def tree(self) -> CliqueTree:
-        """For tests."""
+        """The clique tree, for covariances and for changes in place."""
         return self._tree
 
     @property

@@ -1,4 +1,4 @@
-"""Whether a step goes on, and what is left to do after it.  MATH §9.8."""
+"""Whether a step goes on, and what is left to do after it.  MATH §9.6."""
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import await_all

@@ -9,7 +9,7 @@ from factorbus.solver.kernels.jit.records import FloatRows, Floats, IntRows, Int
 class Tree(NamedTuple):
     """The arrays of a tree, each from the start of a cache line on; `layout` has their columns and entries.
 
-    settings (24,) float64   thresholds of a step, see P_WILDFIRE_THRESHOLD and so on
+    settings (23,) float64   thresholds of a step, see P_WILDFIRE_THRESHOLD and so on
     node    (n, 16) int64    one row per variable, by its index in the graph
     link    (m, 8) int64     one row per factor, by its id
     clique  (c, 24) int64    one row per clique
