@@ -56,15 +56,15 @@ class Process:
             if line.startswith(beginning):
                 return line.removeprefix(beginning).split()
 
-    def said(self, beginning: str, patience_s: float = COMPILING_S) -> str:
-        """What follows `beginning` on the line of its standard error that begins so, once it is there."""
+    def said(self, words: str, patience_s: float = COMPILING_S) -> str:
+        """What follows `words` on the line of its standard error that has them, once it is there."""
         end = time.monotonic() + patience_s
         while time.monotonic() < end and self._popen.poll() is None:
             for line in self._log.read_text().splitlines(keepends=True):
-                if line.startswith(beginning) and line.endswith("\n"):
-                    return line.removeprefix(beginning).strip()
+                if words in line and line.endswith("\n"):
+                    return line.partition(words)[2].strip()
             time.sleep(0.05)  # a file tells nobody that it has grown
-        raise AssertionError(f"no line {beginning!r}; {self._said()}")
+        raise AssertionError(f"no line with {words!r}; {self._said()}")
 
     def tell(self, line: str) -> None:
         """Write a line to its standard input."""

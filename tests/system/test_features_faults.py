@@ -95,7 +95,8 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
     try:
         with connect(endpoint, client="camera", timeout_s=60) as bus:
             fronts = [front(bus, q[0]) for q in questions]
-            while sum(workers.faults.values()) < FAULTS:
+            # Under load the first questions are answered before all workers have started.
+            while sum(workers.faults.values()) < FAULTS or len(helped - {"in-place"}) <= 2:
                 under_way = []
                 for (sighting, P, _, _), features in zip(questions, fronts, strict=True):
                     x = np.concatenate([sighting.state, np.zeros(sighting.width - 13)])
@@ -112,7 +113,6 @@ def test_no_feature_is_lost_doubled_or_out_of_order(spawn: Spawn, endpoint: str)
         workers.end()
     print(f"{asked} questions, {retried} with a shard done again; {workers.faults}; {len(helped)} workers took part")
     assert retried >= FAULTS // 10, "the faults did hit in mid-job"
-    assert len(helped - {"in-place"}) > 2
 
 
 def front(bus, sighting) -> Features:
