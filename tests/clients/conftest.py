@@ -1,4 +1,4 @@
-"""A service that fails when it is told to, for the tests of clients."""
+"""A service that fails when a test asks it to, for the tests of clients."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A batch goes in the same whatever sort of arrays it has, and of several problems the first is told."""
+"""A batch goes in the same whatever sort of arrays it has, and of several problems the first is reported."""
 
 import pickle
 from collections.abc import Callable

@@ -11,7 +11,7 @@ from factorbus.solver.kernels.jit import compile as _jit
 
 @_jit.part
 def larger(a, n):
-    """`a`, or a copy with room for n: what is given back may be what was given."""
+    """`a`, or a copy with room for n: the result may be the argument."""
     if a.size >= n:
         return a
     b = np.zeros(n)
@@ -26,7 +26,7 @@ def first_row(rows):
 
 @_jit.kernel("float64(float64[:,::1], int64)")
 def sum_of_first(rows, n):
-    """Of its own arrays none may go too soon, whoever has given them on."""
+    """Of its own arrays none may go too soon, whatever function has passed them on."""
     own = larger(first_row(rows).copy(), 0)
     for k in range(n):
         own = larger(first_row(np.ones((1, 1))) if k == 0 else own, k)
@@ -59,7 +59,7 @@ def test_arrays_live_as_long_as_they_are_used():
     before = sys.getrefcount(pair)
     for _ in range(10):
         last_row(pair)
-    assert sys.getrefcount(pair) == before, "a row that is given back is counted, and let go again"
+    assert sys.getrefcount(pair) == before, "a row that is returned is counted, and released again"
 
 
 @_jit.kernel("float64(float64[:,::1], int64[::1])")

@@ -131,7 +131,7 @@ class Applied(NamedTuple):
 
 
 class SingleInsertResult(NamedTuple):
-    """One insert was taken in by a step of its own: all that comes of it, at once."""
+    """One insert was applied in a step of its own: all that comes of it, at once."""
 
     outcome: Outcome
     stepped: Stepped

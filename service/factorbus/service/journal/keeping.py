@@ -8,7 +8,7 @@
 
 When the disk takes nothing: with commit, what was not written did not happen; it is refused, the solver goes back to
 what the journal has, and questions are answered from there.  Else it has been published, so it is kept here and tried
-again.  In any case nothing new is taken in until the disk takes something.
+again.  In any case nothing new is applied until the disk takes something.
 """
 
 import logging

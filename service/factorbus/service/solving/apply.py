@@ -247,7 +247,7 @@ class MapSolver(Holding):
         return self._told_of(staged, refused, self._account_of(report, started), (changed, graph))
 
     def _stage(self, insert: Arrived, held: tuple[int, int]) -> tuple[int, tuple[int, int]]:
-        """Hand one insert to the solver, which holds so many variables and factors; gives the id of its first factor,
+        """Hand one insert to the solver, which holds `held` variables and factors; gives the id of its first factor,
         and how many it holds then.  Raises Problem, SolverError: then nothing changed."""
         content = insert.content
         if self._broken:
@@ -261,7 +261,7 @@ class MapSolver(Holding):
         return self._solver.stage(content.batch), held
 
     def _check_room(self, held: tuple[int, int], variables: int, factors: int) -> tuple[int, int]:
-        """How many variables and factors the map has with so many more.  Raises TooLarge beyond its limits."""
+        """How many variables and factors the map has with these.  Raises TooLarge beyond its limits."""
         limits, with_them = self._limits, (held[0] + variables, held[1] + factors)
         if with_them[0] > limits.variables:
             raise TooLarge("the map with this insert", with_them[0], limits.variables, "variables")

@@ -22,9 +22,9 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.candidates import evaluate_factors
 from factorbus.solver.kernels.model.kinds import LINEAR_OF_ONE
 
-# The downdate is for loops of so many numbers in all, and so many new variables; with more all is computed anew.
+# The most numbers of loops in all for a downdate, and the most new variables; with more all is computed anew.
 _MOST_RANKS, _MOST_NEW = 12, 8
-# So that rounding and changes that were negligible do not add up, all blocks are computed anew after so many updates.
+# So that rounding and changes that were negligible do not add up, all blocks are computed anew after this many updates.
 _REFRESH = 256
 _RESIDUAL = np.zeros(1 + max(FACTOR_KIND_OF_CODE), np.int64)
 for _code, _kind in FACTOR_KIND_OF_CODE.items():

@@ -1,6 +1,6 @@
 """The columns of a batch as bytes, and where in them each lies: what admission reads, of arrays as of a message.
 
-A robot's steps look alike: so many variables of this kind, so many factors of that.  What follows from the kinds, types
+A robot's steps look alike: the same numbers of variables and factors of each kind.  What follows from the kinds, types
 and shapes of such a step is worked out once and remembered; what is left of a step is to join its columns.
 """
 

@@ -15,7 +15,7 @@ def search(begin: I64, landmark: I64, S: F64, r: F64, gates: F64, budget: int, b
     """The largest set of pairs that is jointly compatible; among equals that with the least joint d².
 
     in   begin (n + 1,): the pairs of sighting i are begin[i] .. begin[i + 1]−1, best first
-         landmark (pairs,): 0 or more   gates (n + 1,): d² allowed for so many pairs
+         landmark (pairs,): 0 or more   gates (n + 1,): d² allowed for 0 .. n pairs
          S (pairs·dim, pairs·dim): joint covariance of all innovations   r (pairs, dim)
          budget: pairs that are tried at most
     out  best (n,): the pair of each sighting, −1: none

@@ -10,7 +10,7 @@ LEAST_CHI2 = 1e-2
 
 @inline_kernel
 def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64, account: F64) -> F64:
-    """The settings of the tree with their thresholds for a graph of so many factors and scalars."""
+    """The settings of the tree with their thresholds for a graph with this number of factors and of scalars."""
     unit, scaled = account[tl.A_UNIT], tree_settings.copy()
     continues = state[tl.S_CONTINUES] != 0
     per_scalar = unit * math.sqrt(factors / max(scalars, 1))  # (9.17)
@@ -18,7 +18,7 @@ def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64,
     scaled[tl.P_RELINEARIZE_THRESHOLD] *= unit
     scaled[tl.P_MAX_ERROR] *= unit
     scaled[tl.P_COOLDOWN_FLOPS] = max(state[tl.S_RELINEARIZING] / tree_settings[tl.P_COOLDOWN_FLOPS], 1.0)
-    share = unit * unit * max(factors, 1) * reluctance(scaled, state)  # of χ²
+    share = unit * unit * max(factors, 1) * cooldown_share(scaled, state)  # of χ²
     scaled[tl.P_SAME_STEP_SHARE] *= share
     scaled[tl.P_NEXT_STEP_SHARE] *= share
     scaled[tl.P_MAX_WAIT] *= scaled[tl.P_COOLDOWN_FLOPS]
@@ -44,7 +44,7 @@ def rescale(factors: int, settings: F64, account: F64) -> None:
 
 
 @inline_kernel
-def reluctance(settings: F64, state: I64) -> float:
+def cooldown_share(settings: F64, state: I64) -> float:
     """The factor on both shares so soon after the last relinearization.  (9.19)"""
     dear = settings[tl.P_COOLDOWN_FLOPS]
     rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)

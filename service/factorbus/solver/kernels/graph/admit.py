@@ -1,7 +1,7 @@
 """Admission: the rows of groups are checked and written behind those that the graph has, all in one call.
 
 Variables come first, whatever the order of their groups, then factors.  A row that is not in order ends it: the rows
-before it are in the graph then, for whoever says what is wrong, and the caller goes back to its mark.
+before it are in the graph then, for the function that names the fault, and the caller goes back to its mark.
 """
 
 import numpy as np
@@ -244,6 +244,6 @@ def int_at(raw: bytes, start: int) -> int:
 
 @inline_kernel
 def negate(start: int, count: int, numbers: F64) -> None:
-    """Change the sign of so many numbers from `start` on."""
+    """Change the sign of `count` numbers from `start` on."""
     for c in range(start, start + count):
         numbers[c] = -numbers[c]

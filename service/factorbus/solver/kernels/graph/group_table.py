@@ -1,6 +1,6 @@
 """The table that admission reads: groups of variables and factors whose columns lie in the bytes of a message.
 
-A row for each group, in any order, and after the last one a row of kind END.  A column is told by the offset of its
+A row for each group, in any order, and after the last one a row of kind END.  A column is given by the offset of its
 first byte: little-endian numbers of eight bytes, row after row without gaps.
 """
 

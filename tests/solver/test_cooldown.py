@@ -3,7 +3,7 @@
 import numpy as np
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.thresholds import reluctance
+from factorbus.solver.kernels.bayes_tree.thresholds import cooldown_share
 
 
 def test_so_soon_after_a_relinearization_more_has_to_be_bent() -> None:
@@ -14,6 +14,6 @@ def test_so_soon_after_a_relinearization_more_has_to_be_bent() -> None:
         settings[tl.P_COOLDOWN_FLOPS] = dear
         for step in (1001, 1035, 1050, 1100, 5000):
             state[tl.S_STEP] = step
-            after[dear, step - 1000] = reluctance(settings, state)
+            after[dear, step - 1000] = cooldown_share(settings, state)
     assert [after[1.0, since] for since in (1, 35, 50, 100, 4000)] == [8.0, 8.0, 4.0, 1.0, 1.0]
     assert [after[4.0, since] for since in (1, 35, 50, 100, 4000)] == [16.0, 16.0, 16.0, 16.0, 1.0]
