@@ -18,8 +18,8 @@ def row_lengths(system: BlockSystem, order: I64) -> I64:
     """Nonzeros of each scalar row of R, rows in elimination order: eliminating v joins its neighbours."""
     graph, lengths = neighbours(system), []
     for v in order.tolist():
-        dim, border = int(system.dims[v]), sum(int(system.dims[w]) for w in graph[v])
-        lengths += [border + dim - i for i in range(dim)]
+        dim, separator = int(system.dims[v]), sum(int(system.dims[w]) for w in graph[v])
+        lengths += [separator + dim - i for i in range(dim)]
         for w in graph[v]:
             graph[w] |= graph[v]
             graph[w] -= {v, w}

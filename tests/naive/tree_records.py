@@ -56,7 +56,7 @@ def assert_is_a_tree(solver: Solver) -> dict[int, Clique]:
         row = tree.clique[c]
         assert [int(tree.node[v, tl.N_PLACE]) for v in clique.frontals] == list(range(len(clique.frontals)))
         assert sum(_DIM[int(graph.var[v, at.V_KIND])] for v in clique.frontals) == row[tl.C_PIVOTS]
-        assert sum(_DIM[int(graph.var[v, at.V_KIND])] for v in clique.separator) == row[tl.C_BORDER]
+        assert sum(_DIM[int(graph.var[v, at.V_KIND])] for v in clique.separator) == row[tl.C_SEPARATOR_SCALARS]
         assert all(found[child].parent == c for child in clique.children)
         if clique.parent < 0:
             assert not clique.separator

@@ -13,7 +13,7 @@ from factorbus.solver.sparse.blocks import HessianBlocks
 
 
 def assert_solves(solver: Solver) -> None:
-    """δ is the solution of the dense normal equations at the linearization points, and the account has its χ²."""
+    """δ is the solution of the dense normal equations at the linearization points, and the totals have its χ²."""
     assert_is_a_tree(solver)
     information, eta, chi2, delta = normal_equations(solver)
     assert_is_solution(solver, information, eta, chi2, delta, least=1e-9)
@@ -29,7 +29,7 @@ def assert_is_solution(
         tell = max(least, 1e-15 * np.linalg.cond(unit))
         np.testing.assert_allclose(delta * scale, right, rtol=0, atol=tell * max(np.abs(right).max(), 1.0))
     model = chi2 - (delta @ eta if delta.size else 0.0)
-    assert tree_of(solver).account[tl.A_MODEL] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
+    assert tree_of(solver).account[tl.T_MODEL] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
 
 
 def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

@@ -67,7 +67,7 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     wanted = twin_of(solver).chi2()
     assert chi2 == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert solver.chi2() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
-    assert tree.stiff[:count, tl.B_CHI2].sum() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+    assert tree.factor_errors[:count, tl.E_CHI2].sum() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert tree.state[tl.S_FACTORS] == tree.state[tl.S_TAKEN] == count
     assert tree.state[tl.S_EXACT] == np.count_nonzero(tree.link[:count, tl.L_KIND] >= tl.EXACT)
     robust = graph.fac[:count, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS
@@ -84,7 +84,8 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
     information, eta, model, delta = normal_equations(solver)
     if solver._stepper.tree.raised:  # then R is not quite that of Λ
         return
-    if not solver._stepper._held:  # else the estimate is where the tree is linearized, and R waits for the next step
+    # Else the estimate is where the tree is linearized, and R waits for the next step.
+    if not solver._stepper._at_linearization:
         assert_is_solution(solver, information, eta, model, delta, least=2e-8)
     scale = np.sqrt(np.diag(information))
     unit = information / scale / scale[:, None]

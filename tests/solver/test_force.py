@@ -49,8 +49,8 @@ def test_error_and_force_are_those_of_the_definition(world: str) -> None:
             size, start = dim_of(int(graph.var[v, at.V_KIND])), int(graph.var[v, at.V_SCALAR])
             was, here = lin[1 + end][:dim, :size], now[1 + end][:dim, :size]
             model += was @ tree.scalars[0][start : start + size]
-            turned, stiff = (here - was).T @ weight @ now[0][:dim], np.diag(here.T @ weight @ here)
-            force += float(np.sum(turned[stiff > 0] ** 2 / stiff[stiff > 0]))
+            turned, diagonal = (here - was).T @ weight @ now[0][:dim], np.diag(here.T @ weight @ here)
+            force += float(np.sum(turned[diagonal > 0] ** 2 / diagonal[diagonal > 0]))
         gap = now[0][:dim] - model
         error, told, chi2 = exact_error(
             f, graph.var, graph.fac, tree.lin[0], graph.values, graph.payload, tree.scalars[0]

@@ -51,19 +51,19 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
 
 def found(solver: Solver, tree: CliqueTree, moved: np.ndarray, bent: float, variables: int) -> tuple:
     """The largest error, Σ error² by factor, who waits, ascending, how each is marked, and χ² by factor."""
-    graph, state, node, account = solver._graph, tree.state.copy(), tree.node.copy(), tree.account.copy()
-    pending, listed, stiff = tree.pending.copy(), np.zeros_like(tree.moved), tree.stiff.copy()
+    graph, state, node, totals = solver._graph, tree.state.copy(), tree.node.copy(), tree.totals.copy()
+    pending, listed, factor_errors = tree.pending.copy(), np.zeros_like(tree.moved), tree.factor_errors.copy()
     node[:, tl.N_FLAGS] = node[:, tl.N_LISTED] = 0
     node[moved, tl.N_LISTED], listed[: moved.size] = MODEL, moved
-    stiff[:, [tl.B_CHI2, tl.B_ERROR, tl.B_COUNTED]] = 0.0
+    factor_errors[:, [tl.E_CHI2, tl.E_ERROR, tl.E_COUNTED]] = 0.0
     state[[tl.S_MOVED, tl.S_PENDING]] = moved.size, 0
-    account[[tl.A_CHI2, tl.A_ERROR, tl.A_COUNTED]] = 0.0
+    totals[[tl.T_CHI2, tl.T_ERROR, tl.T_COUNTED]] = 0.0
     state[tl.S_VARIABLES] = variables
     copied = copy.copy(tree)
-    copied.node, copied.stiff, copied.pending, copied.moved = node, stiff, pending, listed
-    copied.state, copied.account = state, account
+    copied.node, copied.factor_errors, copied.pending, copied.moved = node, factor_errors, pending, listed
+    copied.state, copied.totals = state, totals
     most = evaluate_moved(graph_at(graph.array_table), tree_at(copied.array_table), bent)
-    assert account[tl.A_CHI2] == pytest.approx(stiff[:, tl.B_CHI2].sum())
-    assert account[tl.A_ERROR] == pytest.approx(stiff[:, tl.B_ERROR].sum())
+    assert totals[tl.T_CHI2] == pytest.approx(factor_errors[:, tl.E_CHI2].sum())
+    assert totals[tl.T_ERROR] == pytest.approx(factor_errors[:, tl.E_ERROR].sum())
     waiting = np.sort(pending[: state[tl.S_PENDING]])
-    return most, stiff[:, tl.B_COUNTED], waiting, node[:, tl.N_FLAGS], stiff[:, tl.B_CHI2]
+    return most, factor_errors[:, tl.E_COUNTED], waiting, node[:, tl.N_FLAGS], factor_errors[:, tl.E_CHI2]

@@ -196,7 +196,7 @@ def cliques_above(variables: set[int], node: np.ndarray, clique: np.ndarray) -> 
 
 def flops_of(cliques: set[int], clique: np.ndarray) -> float:
     """What it takes to eliminate these."""
-    p, m = (clique[sorted(cliques)][:, column] for column in (tl.C_PIVOTS, tl.C_BORDER))
+    p, m = (clique[sorted(cliques)][:, column] for column in (tl.C_PIVOTS, tl.C_SEPARATOR_SCALARS))
     return float((p * (p + m + 1) ** 2).sum())
 
 

@@ -60,12 +60,12 @@ BESIDE = (
 before = compiled()
 import factorbus.solver
 from factorbus.solver.kernels.jit import compile as _jit
-from factorbus.solver.kernels.graph.observability import mark_held
+from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.bayes_tree.remove_rows import open_gaps
 list(_jit.iter_compile(open_gaps))
 assert inside() == found
 between = compiled()
-list(_jit.iter_compile(mark_held))
+list(_jit.iter_compile(mark_determined))
 assert _jit.compile_seconds() > 0
 show(before, between, compiled())
 """

@@ -115,7 +115,7 @@ def numbers_of(solver: Solver) -> list[tuple[list[int], bytes]]:
     tree, found = tree_of(solver), []
     for c, clique in cliques(solver).items():
         row = tree.clique[c]
-        p, width = int(row[tl.C_PIVOTS]), int(row[tl.C_PIVOTS] + row[tl.C_BORDER] + 1)
+        p, width = int(row[tl.C_PIVOTS]), int(row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS] + 1)
         rows = [tree.numbers[i : i + width] for i in row[tl.C_ROWS] + np.arange(p) * row[tl.C_LD]]
         upper = b"".join(line[i:].tobytes() for i, line in enumerate(rows))
         found.append((clique.frontals + clique.separator, upper))
@@ -130,7 +130,8 @@ def test_little_room_makes_no_difference(monkeypatch: pytest.MonkeyPatch) -> Non
     tight = Solver(Options.of(**OFTEN))
     tree = tree_of(tight)
     tree.numbers = tree.numbers[: int(tree.state[tl.S_NUMBERS])].copy()
-    tree.link, tree.stiff, tree.hessian = tree.link[:1].copy(), tree.stiff[:1].copy(), tree.hessian[:121].copy()
+    tree.link, tree.factor_errors = tree.link[:1].copy(), tree.factor_errors[:1].copy()
+    tree.hessian = tree.hessian[:121].copy()
 
     def watched(tree: CliqueTree) -> None:
         if tree.state[tl.S_RELINEARIZED] > 0:

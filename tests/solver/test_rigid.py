@@ -63,7 +63,7 @@ def motions(solver: Solver) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray
     tree, graph = tree_of(solver), solver._graph
     for c, clique in cliques(solver).items():
         row = tree.clique[c]
-        p, m, used = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_USED]
+        p, m, used = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], row[tl.C_USED]
         rows = np.stack([tree.numbers[k : k + p + m + 1] for k in row[tl.C_ROWS] + row[tl.C_LD] * np.arange(p)])
         scalars = [int(graph.var[v, at.V_SCALAR]) for v in clique.frontals]
         sizes = [VARIABLE_KIND_OF_CODE[int(graph.var[v, at.V_KIND])].dim for v in clique.frontals]

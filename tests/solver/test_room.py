@@ -16,7 +16,7 @@ from factorbus.solver.graph.factor_graph import FactorGraph, roomy
 from factorbus.solver.kernels.model import layout as at
 
 GRAPH = {"keys": 1, "var": 1, "dims": 1, "stamps": 1, "values": 7, "fac": 1, "payload": 28}
-TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "stiff": 1, "turns": 1, "pending": 1}
+TREE = {"node": 1, "link": 1, "clique": 1, "lists": 8, "hessian": 121, "factor_errors": 1, "turns": 1, "pending": 1}
 TREE |= {"changed": 1, "moved": 1, "marked": 1, "motions": 8}
 
 

@@ -25,19 +25,19 @@ def assert_solved(p: int, m: int, seed: int) -> None:
     """Whatever belongs to nobody is NaN."""
     rng = np.random.default_rng(seed)
     pivots = np.triu(rng.normal(size=(p, p)) / p, 1) + np.diag(rng.choice([-1.0, 1.0], p) * rng.uniform(1.0, 2.0, p))
-    border, above, right = rng.normal(size=(p, m)), rng.normal(size=m), rng.normal(size=p)
+    separator, above, right = rng.normal(size=(p, m)), rng.normal(size=m), rng.normal(size=p)
     ld = p + m + 1 + GAP
     numbers = np.full(ROWS_AT + p * ld + p + m + GAP, np.nan)
     for i in range(p):
         start = ROWS_AT + i * ld
-        numbers[start + i : start + p + m + 1] = *pivots[i, i:], *border[i], right[i]
+        numbers[start + i : start + p + m + 1] = *pivots[i, i:], *separator[i], right[i]
     used = ROWS_AT + p * ld
     numbers[used + p : used + p + m] = above
     before = numbers.copy()
     row = np.zeros(tl.C_WIDTH, np.int64)
-    row[[tl.C_PIVOTS, tl.C_BORDER, tl.C_ROWS, tl.C_LD, tl.C_USED]] = p, m, ROWS_AT, ld, used
+    row[[tl.C_PIVOTS, tl.C_SEPARATOR_SCALARS, tl.C_ROWS, tl.C_LD, tl.C_USED]] = p, m, ROWS_AT, ld, used
     solve_rows(row, numbers, np.full(p, np.nan))
-    expected = np.linalg.solve(pivots, right - border @ above)
+    expected = np.linalg.solve(pivots, right - separator @ above)
     np.testing.assert_allclose(numbers[used : used + p], expected, rtol=1e-9, atol=1e-9)
     before[used : used + p] = numbers[used : used + p]
     np.testing.assert_array_equal(numbers, before)

@@ -46,12 +46,12 @@ def test_fronts_form_a_forest_in_postorder(analysis):
     assert np.array_equal(fronts[:, fr.COLUMN], np.cumsum(fronts[:, fr.PIVOTS]) - fronts[:, fr.PIVOTS])
     children = [[] for _ in fronts]
     for f, front in enumerate(fronts):
-        above, border = front[fr.PARENT], border_of(symbolic, front)
-        assert (above < 0) == (len(border) == 0) or above > f
+        above, separator = front[fr.PARENT], separator_of(symbolic, front)
+        assert (above < 0) == (len(separator) == 0) or above > f
         if above >= 0:
             assert above > f
             children[above].append(f)
-            assert set(border) <= set(columns_of(symbolic, fronts[above]))
+            assert set(separator) <= set(columns_of(symbolic, fronts[above]))
     for f, front in enumerate(fronts):
         linked, c = [], front[fr.CHILD]
         while c >= 0:
@@ -67,13 +67,13 @@ def test_runs_lead_each_border_scalar_to_itself_in_the_parent(analysis):
         if front[fr.PARENT] < 0:
             continue
         above = symbolic.fronts[front[fr.PARENT]]
-        border, columns, covered = border_of(symbolic, front), columns_of(symbolic, above), 0
+        separator, columns, covered = separator_of(symbolic, front), columns_of(symbolic, above), 0
         for first, count, into in symbolic.runs[front[fr.RUNS] : front[fr.RUNS_END]]:
             assert first == covered
-            assert list(columns[into : into + count]) == list(border[first : first + count])
+            assert list(columns[into : into + count]) == list(separator[first : first + count])
             assert into >= above[fr.PIVOTS] or into + count <= above[fr.PIVOTS]
             covered += count
-        assert covered == len(border)
+        assert covered == len(separator)
 
 
 @given(analyses())
@@ -83,7 +83,7 @@ def test_no_two_living_numbers_share_a_place(analysis):
     taken = np.zeros(symbolic.arena, np.int64)
     taken[: fr.SCRATCH] = 1
     for front in symbolic.fronts:
-        p, m = front[fr.PIVOTS], front[fr.BORDER]
+        p, m = front[fr.PIVOTS], front[fr.SEPARATOR]
         lead = fr.padded_size(p) - p
         rows = slice(front[fr.ROWS] - lead, front[fr.ROWS] - lead + p * front[fr.LD_ROWS])
         update = slice(front[fr.UPDATE], front[fr.UPDATE] + fr.update_size(m, front[fr.WIDTH_UPDATE]))
@@ -95,7 +95,8 @@ def test_no_two_living_numbers_share_a_place(analysis):
         c = front[fr.CHILD]
         while c >= 0:
             child = symbolic.fronts[c]
-            place = slice(child[fr.UPDATE], child[fr.UPDATE] + fr.update_size(child[fr.BORDER], child[fr.WIDTH_UPDATE]))
+            size = fr.update_size(child[fr.SEPARATOR], child[fr.WIDTH_UPDATE])
+            place = slice(child[fr.UPDATE], child[fr.UPDATE] + size)
             assert taken[place].all()
             taken[place] = 0
             c = child[fr.SIBLING]
@@ -113,7 +114,7 @@ def test_a_chain_does_not_collapse_into_one_front():
 def test_joined_fronts_hold_few_zeros():
     system = grid(40)
     symbolic = analyze(system.dims, system.rows, system.cols, order(system.dims, system.rows, system.cols))
-    p, m = symbolic.fronts[:, fr.PIVOTS], symbolic.fronts[:, fr.BORDER]
+    p, m = symbolic.fronts[:, fr.PIVOTS], symbolic.fronts[:, fr.SEPARATOR]
     assert symbolic.nnz_r <= (p * (p + 1) // 2 + p * m).sum() <= 1.25 * symbolic.nnz_r
     assert len(symbolic.fronts) < 0.6 * len(system.dims)
 
@@ -138,10 +139,10 @@ def test_a_missing_diagonal_block_is_refused():
         analyze(np.array([3, 2]), np.array([0, 0]), np.array([0, 1]), np.array([0, 1]))
 
 
-def border_of(symbolic: Symbolic, front: np.ndarray) -> np.ndarray:
-    return symbolic.border[front[fr.BORDER_AT] : front[fr.BORDER_AT] + front[fr.BORDER]]
+def separator_of(symbolic: Symbolic, front: np.ndarray) -> np.ndarray:
+    return symbolic.separator[front[fr.SEPARATOR_AT] : front[fr.SEPARATOR_AT] + front[fr.SEPARATOR]]
 
 
 def columns_of(symbolic: Symbolic, front: np.ndarray) -> np.ndarray:
     pivots = np.arange(front[fr.COLUMN], front[fr.COLUMN] + front[fr.PIVOTS])
-    return np.concatenate((pivots, border_of(symbolic, front)))
+    return np.concatenate((pivots, separator_of(symbolic, front)))

@@ -11,7 +11,7 @@ from factorbus.simulate import city_trees, manhattan
 from factorbus.solver import Options, Solver
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.linearization_error import burden, dearness
+from factorbus.solver.kernels.bayes_tree.linearization_error import relinearize_cost, required_share
 from factorbus.solver.kernels.model import layout as at
 
 NEVER = {
@@ -47,7 +47,7 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
             assert (tree.node[before, tl.N_LINEARIZED] == tree.state[tl.S_STEP]).all()
             relinearized += 1
         waited += waiting(tree).size > 0 and not tree.state[tl.S_DUE]
-        share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
+        share = tree.totals[tl.T_COUNTED] / (tree.totals[tl.T_MODEL] + 1e-2)
         rested = options.tuning.relinearize_cooldown_steps / max(
             tree.state[tl.S_STEP] - tree.state[tl.S_RELINEARIZED_AT], 1
         )
@@ -78,7 +78,7 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
             )
         )
         for tree, _, _ in drive(solver, (step.batch for step in manhattan(400, 11))):
-            share = tree.account[tl.A_COUNTED] / (tree.account[tl.A_MODEL] + 1e-2)
+            share = tree.totals[tl.T_COUNTED] / (tree.totals[tl.T_MODEL] + 1e-2)
             if tree.state[tl.S_DUE] and share > 0.0:  # 0: nothing that waits counts
                 shares[many == 10].append(share)
     assert len(shares[True]) > 3
@@ -88,10 +88,10 @@ def test_the_more_wait_the_more_it_has_to_be_worth() -> None:
 
 def test_poses_in_space_and_landmarks_have_to_be_worth_more() -> None:
     """(9.22): one of them among all that wait is enough."""
-    assert [dearness(kind) for kind in (at.SE2, at.SE3, at.POINT2, at.POINT3)] == [1.0, 8.0, 24.0, 24.0]
+    assert [relinearize_cost(kind) for kind in (at.SE2, at.SE3, at.POINT2, at.POINT3)] == [1.0, 8.0, 24.0, 24.0]
     settings = np.zeros(tl.P_SIZE)
     settings[tl.P_FULL_BATCH] = 1000
-    assert [burden(count, settings) for count in (3, 500, 1000, 10**5)] == [0.02, 0.125, 1.0, 1.0]
+    assert [required_share(count, settings) for count in (3, 500, 1000, 10**5)] == [0.02, 0.125, 1.0, 1.0]
 
 
 def test_nothing_waits_longer_than_patience() -> None:
@@ -113,7 +113,8 @@ def test_what_is_bent_far_does_not_wait() -> None:
     for tree, before, due in drive(solver, (step.batch for step in manhattan(400, 11))):
         if due:
             assert (tree.node[before, tl.N_LINEARIZED] == tree.state[tl.S_STEP]).all()
-        worst = np.sqrt(tree.stiff[: tree.state[tl.S_FACTORS], tl.B_COUNTED].max(initial=0.0)) / tree.account[tl.A_UNIT]
+        counted = tree.factor_errors[: tree.state[tl.S_FACTORS], tl.E_COUNTED]
+        worst = np.sqrt(counted.max(initial=0.0)) / tree.totals[tl.T_UNIT]
         assert worst <= limit or tree.state[tl.S_DUE]
         found += bool(tree.state[tl.S_DUE])
     assert found > 3

@@ -192,7 +192,7 @@ def test_what_is_cut_off_is_whole_subtrees_of_a_small_share(sizes: list, data: s
     # Postorder: who comes next takes some of the last roots as children.
     roots: list[int] = []
     for f, (p, m) in enumerate(sizes):
-        records[f, fr.PIVOTS], records[f, fr.BORDER] = p, m
+        records[f, fr.PIVOTS], records[f, fr.SEPARATOR] = p, m
         for _ in range(data.draw(st.integers(0, min(len(roots), 3)))):
             records[roots.pop(), fr.PARENT] = f
         roots.append(f)

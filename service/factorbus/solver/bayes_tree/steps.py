@@ -25,7 +25,7 @@ from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settlin
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import PhaseShares, StepReport, Stopwatch
-from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
 from factorbus.wording import counted
 
@@ -57,7 +57,7 @@ class TreeSteps:
         self._graph, self._options = graph, options
         self._tree = CliqueTree(graph, options)
         self._mark = graph.mark()
-        self._first_new, self._batched, self._held = 0, False, False
+        self._first_new, self._batched, self._at_linearization = 0, False, False
         self._bounded = True  # whether the last step ended within its bound
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
@@ -80,7 +80,7 @@ class TreeSteps:
         try:
             status = tree.step()
             if status == tl.UNSURE:
-                because = self._check_held()
+                because = self._check_determined()
                 status = tree.step(sure=True)
             if status == tl.FAILED:
                 raise self._system(self._apart()).underconstrained(tree.failed)
@@ -90,11 +90,11 @@ class TreeSteps:
             self._graph.forget(self._mark)
             raise
         compiled = clock() if clock else 0.0
-        self._held = False
+        self._at_linearization = False
         if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
             return self._account(started, compiled, None, because)
-        course, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
-        return self._account(started, compiled, course, because)
+        result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
+        return self._account(started, compiled, result, because)
 
     def resume(self, settle: bool) -> StepReport:
         """The first step for a graph that was taken over: it goes on from the estimate, none of which is new."""
@@ -136,10 +136,10 @@ class TreeSteps:
     @property
     def unfinished(self) -> bool:
         """Whether a step with nothing new may bring the estimate nearer to the optimum by what χ² shows, (9.27)."""
-        _, chi2, _, error, _, _, _, left, *_ = self._tree.account.tolist()
+        _, chi2, _, error, _, _, _, left, *_ = self._tree.totals.tolist()
         share = max(chi2, 0.0) + LEAST_CHI2
         scalars = int(self._graph.counts[at.SCALARS])
-        if self._held or self._tree.raised:
+        if self._at_linearization or self._tree.raised:
             return not self._is_within(_AT_END, chi2)
         return error > FINISHED * share or left * scalars > _FINISHED_LEFT * share
 
@@ -148,20 +148,20 @@ class TreeSteps:
         """Whether the tree's last step, with nothing new, left more to do and lowered χ² by less than that."""
         if not self._tree.state.item(tl.S_CONTINUES) or not self.unfinished:
             return False
-        chi2, before = self._tree.account.item(tl.A_CHI2), self._tree.account.item(tl.A_BEFORE)
+        chi2, before = self._tree.totals.item(tl.T_CHI2), self._tree.totals.item(tl.T_BEFORE)
         return before - chi2 <= FINISHED * (max(chi2, 0.0) + LEAST_CHI2)
 
     def _is_within(self, share: float, chi2: float) -> bool:
         """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
-        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._tree.account.item(tl.A_LEAST) + LEAST_CHI2)
+        return chi2 + LEAST_CHI2 <= (1.0 + share) * (self._tree.totals.item(tl.T_LEAST) + LEAST_CHI2)
 
     def chi2(self) -> float:
         """Σ rᵀ Ω r at the estimate, as of the last step, summed anew."""
         return max(self._sum_chi2(self._mark[at.FACTORS]), 0.0)  # pieces of a form sum to zero but for rounding
 
-    def _check_held(self) -> str:
+    def _check_determined(self) -> str:
         """Refuse new variables that nothing holds; gives why the others were looked at.  Raises Underconstrained."""
-        suspects = find_unheld(self._graph, self._mark)
+        suspects = find_undetermined(self._graph, self._mark)
         if not suspects.size:
             return ""
         free = find_unanchored(self._graph, self._mark)
@@ -179,8 +179,8 @@ class TreeSteps:
     def _complete(self, settle: bool, because: str) -> tuple[Minimization | None, str]:
         """What has to follow a step, if anything, and why.  Raises NotFinite; all is as before the step then."""
         tree, after = self._tree, self._tree.state.item(tl.S_AFTER)
-        chi2, chi2_before = tree.account.item(tl.A_CHI2), tree.account.item(tl.A_BEFORE)
-        course, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
+        chi2, chi2_before = tree.totals.item(tl.T_CHI2), tree.totals.item(tl.T_BEFORE)
+        result, before, worse, rises = None, self._graph.values, after & tl.WORSE, after & tl.ROSE
         continues = self._graph.mark() == self._mark
         goes_on = after & tl.RAISED and continues and not self._is_within(_AT_END, chi2)
         if settle or worse or rises or goes_on or self._stalls:
@@ -188,20 +188,20 @@ class TreeSteps:
             before = self._graph.values.copy()
             if not worse:
                 tree.exchange()
-            course = self._batch(before, settle, continues)
+            result = self._batch(before, settle, continues)
             reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
             because = next(reason for holds, reason in reasons if holds)
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
-            if goes_on and chi2_before - course.chi2 <= _AT_END * (course.chi2 + LEAST_CHI2):
-                course.converged = True
-            if course and course.converged:
-                tree.account[tl.A_LEAST] = tree.account[tl.A_CHI2]
+            if goes_on and chi2_before - result.chi2 <= _AT_END * (result.chi2 + LEAST_CHI2):
+                result.converged = True
+            if result and result.converged:
+                tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2]
             # The tree's own step followed, and what it was before is that of the step.
-            tree.account[tl.A_BEFORE] = chi2_before
-        if not math.isfinite(tree.account[tl.A_CHI2]):
+            tree.totals[tl.T_BEFORE] = chi2_before
+        if not math.isfinite(tree.totals[tl.T_CHI2]):
             self._begin_anew(before)
             raise errors.NotFinite("χ² of the estimate after the step")
-        return course, because
+        return result, because
 
     def _begin_anew(self, before: F64) -> None:
         """The graph as it was before the step, at the values `before`, and a tree made for it that leaves it there."""
@@ -210,8 +210,8 @@ class TreeSteps:
         self._tree.clear()
         if self._graph.counts[at.VARIABLES]:
             self._tree.step(sure=True)
-            self._tree.hold()
-            self._held = True
+            self._tree.reset_to_linearization()
+            self._at_linearization = True
 
     def _apart(self) -> FactorGraph:
         """The graph with rows of its own, for equations that leave it as it is."""
@@ -240,52 +240,52 @@ class TreeSteps:
         rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
         if settle:
             rule = settling_rule(options)
-        course = minimize(system, chi2, 0.0, rule)
-        if course.iterations or not settle:
+        result = minimize(system, chi2, 0.0, rule)
+        if result.iterations or not settle:
             self._tree.move_all()
             self._tree.step()
-            self._held = not self._tree.account[tl.A_CHI2] <= course.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
-            if self._held:
-                self._tree.hold()
+            self._at_linearization = not self._tree.totals[tl.T_CHI2] <= result.chi2 * (1.0 + _ROUNDING) + _LEAST_GAIN
+            if self._at_linearization:
+                self._tree.reset_to_linearization()
         count = int(self._graph.counts[at.VARIABLES])
         found = np.empty(count, np.int64)
         bits = before.view(np.int64), self._graph.values.view(np.int64)
         self._moved = found[: differing(self._mark[at.VARIABLES], count, self._graph.var, *bits, found)]
-        return course
+        return result
 
     def _sum_chi2(self, factors: int) -> float:
         graph = self._graph
         return float(sum_chi2(0, factors, graph.var, graph.fac, graph.values, graph.payload))
 
-    def _account(self, started: float, compiled: float, course: Minimization | None, because: str) -> StepReport:
+    def _account(self, started: float, compiled: float, result: Minimization | None, because: str) -> StepReport:
         before, self._mark = self._mark, self._graph.mark()
         now, clock = self._mark, self._options.clock
-        self._first_new, self._batched = before[at.VARIABLES], course is not None
+        self._first_new, self._batched = before[at.VARIABLES], result is not None
         reported = self._tree.state[tl.S_REPORT_BEGIN : tl.S_REPORT_END].tolist()
         nonzeros, inactive, changed, eliminated, relinearized, _, moved, flops, rounds = reported[:_COUNTS]
         compiled_ms = 1e3 * (compiled - started)
-        _, chi2, _, error, allowed, chi2_before = self._tree.account[: tl.A_BEFORE + 1].tolist()
+        _, chi2, _, error, allowed, chi2_before = self._tree.totals[: tl.T_BEFORE + 1].tolist()
         chi2 = max(chi2, 0.0)  # pieces of a form sum to zero but for rounding
         share = self._options.converged_share
-        converged = course.converged if course else error <= allowed
-        if not course and self._tree.raised:
+        converged = result.converged if result else error <= allowed
+        if not result and self._tree.raised:
             converged &= self._is_within(share, chi2)
         bounded = converged
-        if not course and not self._bounded:  # in a long valley a step gains hardly less than the one before
+        if not result and not self._bounded:  # in a long valley a step gains hardly less than the one before
             converged &= chi2_before - chi2 <= _STILL * share * (chi2 + LEAST_CHI2)
         self._bounded = bounded
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
         return _new(StepReport, (
             "bayes-tree",
-            "batch" if course else ("tree" if moved or relinearized else "extend"),
+            "batch" if result else ("tree" if moved or relinearized else "extend"),
             because or (_relinearized(relinearized, rounds) if relinearized else _NOTHING_TO_RELINEARIZE),
-            course.iterations if course else rounds,
+            result.iterations if result else rounds,
             chi2,
             max(chi2_before, 0.0),
             now[at.VARIABLES] - before[at.VARIABLES],
             now[at.FACTORS] - before[at.FACTORS],
-            self._moved.size if course else changed,
+            self._moved.size if result else changed,
             relinearized,
             eliminated,
             inactive,

@@ -15,7 +15,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree import records
 from factorbus.solver.kernels.bayes_tree.begin_step import HESSIAN
 from factorbus.solver.kernels.bayes_tree.changed_variables import exchange, list_changed
-from factorbus.solver.kernels.bayes_tree.reset_estimate import hold_at_linearization
+from factorbus.solver.kernels.bayes_tree.reset_estimate import reset_to_linearization
 from factorbus.solver.kernels.bayes_tree.step import tree_step
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
@@ -58,7 +58,7 @@ class CliqueTree(Arenas):
         self.hessian: F64 = pages.zeros(16384)
         self.lin: F64 = np.empty((3, 1024))
         self.scalars: F64 = np.zeros((3, 1024))
-        self.stiff: F64 = lines((512, tl.B_WIDTH), np.float64)
+        self.factor_errors: F64 = lines((512, tl.E_WIDTH), np.float64)
         self.turns: F64 = lines((256, tl.U_WIDTH), np.float64)
         self.pending: I64 = np.empty(256, np.int64)
         self.changed: I64 = np.empty(256, np.int64)
@@ -66,7 +66,7 @@ class CliqueTree(Arenas):
         self.marked: I64 = np.empty(256, np.int64)
         self.saved: F64 = np.empty((16, 8))
         self.state: I64 = np.zeros(tl.S_SIZE, np.int64)
-        self.account: F64 = np.zeros(tl.A_SIZE)
+        self.totals: F64 = np.zeros(tl.T_SIZE)
         self.state[tl.S_FREE_CLIQUE], self.state[tl.S_RELINEARIZED_AT] = -1, -self._rest
         self.state[tl.S_NUMBERS] = fr.SCRATCH
 
@@ -108,9 +108,9 @@ class CliqueTree(Arenas):
         self.state[[tl.S_DUE, tl.S_ONCE]] = 1
         self.state[tl.S_RAISED] = 0
 
-    def hold(self) -> None:
+    def reset_to_linearization(self) -> None:
         """Put the estimate back to the linearization points: the solution of the linear problem is not taken."""
-        hold_at_linearization(self._graph.array_table, self.array_table)
+        reset_to_linearization(self._graph.array_table, self.array_table)
 
     def list_changed(self, first_new: int) -> I64:
         """Variables whose estimate the last step gave other bits, and those from index `first_new` on, ascending."""
@@ -130,7 +130,7 @@ class CliqueTree(Arenas):
             for entry in (tl.S_VARIABLES, tl.S_FACTORS, tl.S_CLIQUES, tl.S_LISTS, tl.S_NUMBERS, tl.S_HESSIAN)
         )
         counts = self._graph.counts
-        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.B_WIDTH)
+        rows = variables * (tl.N_WIDTH + tl.U_WIDTH + 3) + factors * (tl.L_WIDTH + tl.E_WIDTH)
         rows += cliques * (tl.C_WIDTH + tl.M_WIDTH)
         columns = 3 * int(counts[at.VALUES]) + 3 * int(counts[at.SCALARS])
         return 8 * (rows + columns + lists + numbers + hessian)
@@ -162,7 +162,7 @@ class CliqueTree(Arenas):
                 with_room(array, variables) for array in (self.node, self.turns, self.pending, self.changed, self.moved)
             )
         if factors > len(self.link):
-            self.link, self.stiff = with_room(self.link, factors), with_room(self.stiff, factors)
+            self.link, self.factor_errors = with_room(self.link, factors), with_room(self.factor_errors, factors)
         if counts[at.VALUES] > self.lin.shape[1]:
             self.lin = _widened(self.lin, counts[at.VALUES])
         if counts[at.SCALARS] > self.scalars.shape[1]:

@@ -40,7 +40,7 @@ def find_convertible(graph: FactorGraph, below: float) -> I64:
     guessed = 1.0 / np.sqrt(graph.payload[firsts[:, at.F_AT] + _GUESS])
     known = found[features] * np.abs(graph.values[graph.var[features, at.V_AT] + 5]) / 4.0
     found[features[guessed < _SURER * known]] = np.inf
-    found[is_held(graph)] = np.inf
+    found[has_linear_factor(graph)] = np.inf
     return np.flatnonzero(found < below)
 
 
@@ -52,16 +52,16 @@ def pick_features(graph: FactorGraph, keys: I64) -> I64:
             raise errors.UnknownVariable(key, _TURNING)
         if (kind := int(graph.var[v, at.V_KIND])) != at.IDP:
             raise errors.KindMismatch(key, _TURNING, VARIABLE_KIND_OF_CODE[kind].name, "idp")
-        if is_held(graph)[v]:
+        if has_linear_factor(graph)[v]:
             raise errors.KindMismatch(key, _TURNING, "idp with a linear factor", "idp that cameras see")
     return picked
 
 
-def is_held(graph: FactorGraph) -> np.ndarray:
+def has_linear_factor(graph: FactorGraph) -> np.ndarray:
     """Which variables (n,) a linear factor is on: a feature that has one stays what that is of."""
-    fac, held = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
-    held[fac[LINEAR[fac[:, at.F_KIND]], at.F_I : at.F_J + 1]] = True
-    return held[:-1]
+    fac, marked = graph.fac[: graph.counts[at.FACTORS]], np.zeros(int(graph.counts[at.VARIABLES]) + 1, bool)
+    marked[fac[LINEAR[fac[:, at.F_KIND]], at.F_I : at.F_J + 1]] = True
+    return marked[:-1]
 
 
 def with_points(graph: FactorGraph, features: I64) -> FactorGraph:

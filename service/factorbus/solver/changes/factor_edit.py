@@ -25,7 +25,7 @@ from factorbus.solver.kernels.bayes_tree.remove_rows import close_gaps, open_gap
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import LINEAR
-from factorbus.solver.sparse.anchors import find_unheld
+from factorbus.solver.sparse.anchors import find_undetermined
 
 # What nobody has any more of the payload or of the Hessians, as a share of all: with more everything is packed anew.
 _MOST_HOLES = 0.5
@@ -39,10 +39,10 @@ class _Before:
     """What an edit is about to change, as it was."""
 
     counted: I64
-    account: F64
+    totals: F64
     fac: I64
     link: I64
-    stiff: F64
+    factor_errors: F64
     ends: I64
     diagonals: list[F64]
     levers: F64
@@ -79,7 +79,7 @@ class FactorEdit:
         hollow = state[tl.S_HOLES] > _MOST_HOLES * state[tl.S_HESSIAN]
         if hollow or graph.holes > _MOST_HOLES * graph.counts[at.PAYLOAD]:
             return False
-        return not self.gone.size or self._are_held()
+        return not self.gone.size or self._are_determined()
 
     def make(self) -> bool:
         """Change graph and tree, ahead of a step; False: a χ² is beyond numbers, `undo` it."""
@@ -110,7 +110,7 @@ class FactorEdit:
         for row, numbers in zip(self.renewed.tolist(), before.weighed, strict=True):
             start = graph.fac[row, at.F_AT]
             graph.payload[start : start + numbers.size] = numbers
-        tree.link[self._rows], tree.stiff[self._rows] = before.link, before.stiff
+        tree.link[self._rows], tree.factor_errors[self._rows] = before.link, before.factor_errors
         relink(self._linked, self._log, tree.array_table)
         for row, hessian in zip(self.renewed.tolist(), before.hessians, strict=True):
             start = tree.link[row, tl.L_AT]
@@ -119,12 +119,12 @@ class FactorEdit:
             start = graph.var[v, at.V_SCALAR]
             tree.scalars[1, start : start + diagonal.size] = diagonal
         tree.turns[before.ends, tl.U_LEVER] = before.levers
-        tree.account[:], tree.state[list(_COUNTED)] = before.account, before.counted
+        tree.totals[:], tree.state[list(_COUNTED)] = before.totals, before.counted
         tree.node[tree.moved[: tree.state[tl.S_MOVED]], tl.N_LISTED] = 0
         tree.state[[tl.S_MOVED, tl.S_EDITED]] = 0
         self._before = None
 
-    def _are_held(self) -> bool:
+    def _are_determined(self) -> bool:
         """Whether the factors that stay hold what the others were on, by the rules for what is new (MATH §7).
 
         What of the map is held by its numbers alone is then still held: a direction in which it could move would have
@@ -134,7 +134,7 @@ class FactorEdit:
         kept.fac, kept.counts = graph.fac[: self._edits.kept.size][self._edits.kept], graph.counts.copy()
         kept.counts[at.FACTORS] = len(kept.fac)
         ends = graph.fac[self.gone, at.F_I : at.F_J + 1]
-        return not np.isin(ends, find_unheld(kept, (0,) * at.COUNTS)).any()
+        return not np.isin(ends, find_undetermined(kept, (0,) * at.COUNTS)).any()
 
     def _remember(self) -> _Before:
         graph, tree = self._graph, self._tree
@@ -154,10 +154,10 @@ class FactorEdit:
             weighed.append(graph.payload[start : start + int(self._widths(np.array([row]))[0])].copy())
         return _Before(
             tree.state[list(_COUNTED)],
-            tree.account.copy(),
+            tree.totals.copy(),
             fac,
             link,
-            tree.stiff[self._rows],
+            tree.factor_errors[self._rows],
             ends,
             diagonals,
             tree.turns[ends, tl.U_LEVER],

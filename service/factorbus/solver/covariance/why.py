@@ -162,10 +162,10 @@ def _account(blocks: CovarianceBlocks, index: int, linear: Linear, T: F64) -> Fa
     sign = -1.0 if W[0, 0] < 0.0 else 1.0
     L = np.linalg.cholesky(sign * W)
     # I − Lᵀ T L has the share of each direction that the others know; where that is nothing, all is this factor's.
-    M, pull = L.T @ T @ L, L.T @ softened
+    M, whitened = L.T @ T @ L, L.T @ softened
     without = None
     if sign > 0.0 and np.linalg.eigvalsh(np.eye(d) - M)[0] > _NOTHING:
-        without = rho + float(pull @ np.linalg.solve(np.eye(d) - M, M @ pull))
+        without = rho + float(whitened @ np.linalg.solve(np.eye(d) - M, M @ whitened))
     return FactorAccount(
         factor, kind.name, keys, r, L.T @ r, s, d, float(np.trace(W @ T)), without,
         LOSS_OF_CODE.get(int(row[at.F_FLAGS]) >> at.LOSS_SHIFT, ""), 0.0 if inactive else _weight(r, softened), rho,

@@ -69,7 +69,7 @@ class BlockFactor(Arenas):
         if self.index.size < symbolic.stored:
             self.index = np.empty(self.numbers.size, np.int64)
         take_fronts(
-            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.border, arena, self.array_table
+            symbolic.order, symbolic.dims, symbolic.starts, symbolic.fronts, symbolic.separator, arena, self.array_table
         )
         self.d[: symbolic.size] = d
 

@@ -20,21 +20,21 @@ from factorbus.solver.kernels.graph.local_init import settle_new
 from factorbus.solver.kernels.jit.compile import I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.modes import mode_named
-from factorbus.solver.optimize.gauss_newton import Minimization, glide, minimize
+from factorbus.solver.optimize.gauss_newton import Minimization, minimize, try_linear_step
 from factorbus.solver.optimize.rules import further_rule, ordinary_rule, settling_rule
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import StepReport, Stopwatch
-from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
 from factorbus.solver.sparse.symbolic import Symbolic
 from factorbus.wording import counted
 
 # A step of a robot brings no more variables than this, and some factors each.
 _FEW = 8
-# The old R is tried while it served in more than _LEAST_TRUST + _DEAR · (factors per variable) of the steps that tried
-# lately: a try that fails costs two linearizations, one that does not saves a factorization.
-_LEAST_TRUST, _DEAR, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
+# The old R is tried while it served in more than _LEAST_TRUST + _TRUST_BY_DENSITY · (factors per variable) of the
+# steps that tried lately: a try that fails costs two linearizations, one that does not saves a factorization.
+_LEAST_TRUST, _TRUST_BY_DENSITY, _LEARN, _TRY_AGAIN = 0.15, 0.1, 0.1, 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +128,13 @@ class IncrementalSteps:
             # 4. Solve, if there is anything to solve.
             because = self._reason_to_solve(added, settle, suspects)
             batch = settle or self._goes_on or self._is_batch_due()
-            course, finished = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
+            result, finished = self._solve(added, settle, batch, suspects, watch) if because else self._extend(added)
         except BaseException:
             self._take_back()
             raise
         # 5. Remember where this leaves things, and account for it.
-        report = self._report(course, added, self._reported(plan, because, batch), watch)
-        self._commit(course, added, bool(because), batch, finished)
+        report = self._report(result, added, self._reported(plan, because, batch), watch)
+        self._commit(result, added, bool(because), batch, finished)
         return report
 
     def _place_new(self) -> None:
@@ -147,7 +147,7 @@ class IncrementalSteps:
 
     def _suspects(self) -> I64:
         """New variables that only the numbers can judge.  Raises Underconstrained for what nothing can hold."""
-        suspects = find_unheld(self._graph, self._done.graph)
+        suspects = find_undetermined(self._graph, self._done.graph)
         if suspects.size:
             free = find_unanchored(self._graph, self._done.graph)
             if free >= 0:
@@ -210,25 +210,25 @@ class IncrementalSteps:
         elif goes_on:
             rule = further_rule(options, tolerance)
         system.begin(suspects, watch)
-        course = None
+        result = None
         if self._mode.batch_every and not batch:
-            course = glide(system, chi2, rule)
-        if course is None:
+            result = try_linear_step(system, chi2, rule)
+        if result is None:
             if self._mode.batch_every:
                 system.relinearize()
             have_factor = self._done.damping == 0.0 and not goes_on and system.factor.serve()
-            course = minimize(system, chi2, self._done.damping, rule, have_factor)
-            if not (self._mode.updates and course.converged and self._keeps(have_factor, course)):
+            result = minimize(system, chi2, self._done.damping, rule, have_factor)
+            if not (self._mode.updates and result.converged and self._keeps(have_factor, result)):
                 system.have_lambda()
-        if course.failed >= 0 and course.iterations == 0:
-            raise system.underconstrained(system.variable_of(course.failed))
+        if result.failed >= 0 and result.iterations == 0:
+            raise system.underconstrained(system.variable_of(result.failed))
         self._changed = system.end(self._done.graph[at.VARIABLES])
-        finished = course.converged and (settle or goes_on)
+        finished = result.converged and (settle or goes_on)
         if goes_on:
-            course.converged |= ordinary_rule(options, tolerance).is_negligible(course.left, course.chi2)
-        return course, finished
+            result.converged |= ordinary_rule(options, tolerance).is_negligible(result.left, result.chi2)
+        return result, finished
 
-    def _keeps(self, had_factor: bool, course: Minimization) -> bool:
+    def _keeps(self, had_factor: bool, result: Minimization) -> bool:
         """Whether R is to stay in use at the new linearization point.
 
         It is where that has led to the new optimum often enough lately; else every `_TRY_AGAIN`-th of the steps that
@@ -236,13 +236,14 @@ class IncrementalSteps:
         """
         if not self._options.tuning.reuse_factor:
             return False
-        if course.iterations == 0:
+        if result.iterations == 0:
             return True
         if had_factor:
-            self._trust += (0.0 if course.factorizations else _LEARN) - _LEARN * self._trust
+            self._trust += (0.0 if result.factorizations else _LEARN) - _LEARN * self._trust
         self._moves += 1
-        dear = _LEAST_TRUST + _DEAR * int(self._graph.counts[at.FACTORS]) / int(self._graph.counts[at.VARIABLES])
-        return self._trust > dear or self._moves % _TRY_AGAIN == 0
+        factors, variables = int(self._graph.counts[at.FACTORS]), int(self._graph.counts[at.VARIABLES])
+        least_trust = _LEAST_TRUST + _TRUST_BY_DENSITY * factors / variables
+        return self._trust > least_trust or self._moves % _TRY_AGAIN == 0
 
     def _extend(self, added: float) -> tuple[Minimization, bool]:
         """Nothing moves: what is new has the values it was given or composed to."""
@@ -253,17 +254,17 @@ class IncrementalSteps:
         self._graph.forget(self._done.graph)
         self._system.take_back(self._done.fill)
 
-    def _commit(self, course: Minimization, added: float, solved: bool, batch: bool, finished: bool) -> None:
+    def _commit(self, result: Minimization, added: float, solved: bool, batch: bool, finished: bool) -> None:
         unsolved = self._done.unsolved + added
         if solved:
-            unsolved = 0.0 if course.converged else np.inf
+            unsolved = 0.0 if result.converged else np.inf
         blocks, numbers = self._system.blocks.fill.tolist()
         self._done = _Done(
             self._graph.mark(),
             (blocks, numbers),
-            course.chi2,
+            result.chi2,
             unsolved,
-            0.0 if course.converged else course.damping,
+            0.0 if result.converged else result.damping,
             int(self._graph.counts[at.VARIABLES]) if batch else self._done.batch,
             finished,
         )
@@ -276,26 +277,26 @@ class IncrementalSteps:
             return Plan("full", f"{because}; a batch is due", plan.rows)
         return Plan(plan.strategy, f"{because}; {plan.because}", plan.rows)
 
-    def _report(self, course: Minimization, added: float, plan: Plan, watch: Stopwatch) -> StepReport:
+    def _report(self, result: Minimization, added: float, plan: Plan, watch: Stopwatch) -> StepReport:
         columns, factor = int(self._graph.counts[at.COLUMNS]), self._system.factor
         nonzeros, flops = factor.cost() if plan.strategy != "extend" else (0, 0.0)
         return StepReport(
             mode=self._mode.name,
             strategy=plan.strategy,
             because=plan.because,
-            iterations=course.iterations,
-            chi2=max(course.chi2, 0.0),
+            iterations=result.iterations,
+            chi2=max(result.chi2, 0.0),
             chi2_before=self._done.chi2 + added,
             new_variables=int(self._graph.counts[at.VARIABLES]) - self._done.graph[at.VARIABLES],
             new_factors=int(self._graph.counts[at.FACTORS]) - self._done.graph[at.FACTORS],
             changed=int(self._changed.size),
-            relinearized=course.iterations * columns,
-            eliminated=plan.rows + course.factorizations * columns,
+            relinearized=result.iterations * columns,
+            eliminated=plan.rows + result.factorizations * columns,
             inactive=len(observations.inactive(self._graph)) if self._graph.sights else 0,
             nnz_r=nonzeros,
             flops=flops,
-            damping=course.damping,
-            converged=course.converged,
+            damping=result.damping,
+            converged=result.converged,
             phases_ms=watch.phases_ms,
             step_ms=watch.total_ms(),
         )

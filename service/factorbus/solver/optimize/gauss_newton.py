@@ -112,77 +112,77 @@ def minimize(
     it begins without `damping`, which counts once they have been taken back.
     """
     hills = rule.nonmonotone
-    course = Minimization(chi2, 0.0 if hills else damping)
+    result = Minimization(chi2, 0.0 if hills else damping)
     decrease, solved, fresh = problem.decrease() if have_factor else 0.0, have_factor, False
     for _ in range(rule.limit):
         if not solved:
-            course.factorizations += 1
-            course.failed = problem.factorize(course.damping)
-            if course.failed >= 0:
-                if _damp_more(course):
+            result.factorizations += 1
+            result.failed = problem.factorize(result.damping)
+            if result.failed >= 0:
+                if _damp_more(result):
                     continue
                 break
             decrease, fresh = problem.decrease(), True
-        undamped = course.damping == 0.0
-        course.left = decrease if undamped else math.inf
-        if undamped and rule.is_negligible(decrease, course.chi2):
-            course.converged = True
+        undamped = result.damping == 0.0
+        result.left = decrease if undamped else math.inf
+        if undamped and rule.is_negligible(decrease, result.chi2):
+            result.converged = True
             break
         reached = problem.linearize_at(problem.step())
         solved = False
-        if not reached <= course.chi2:
+        if not reached <= result.chi2:
             if not fresh:
                 continue
-            course.converged = undamped and _is_rounding(decrease, course.chi2)
-            if course.converged:
+            result.converged = undamped and _is_rounding(decrease, result.chi2)
+            if result.converged:
                 break
             if undamped and hills:
-                made = _go_over_hill(problem, course, reached, hills)
+                made = _go_over_hill(problem, result, reached, hills)
                 hills = hills - made if made else 0
                 if made:
                     continue
                 if damping > 0.0:
-                    course.damping = damping
+                    result.damping = damping
                     continue
-            if not _damp_more(course):
+            if not _damp_more(result):
                 break
             continue
         problem.accept()
-        course.iterations += 1
-        gained, course.chi2 = course.chi2 - reached, reached
-        _damp_less(course, gained, expected=decrease)
+        result.iterations += 1
+        gained, result.chi2 = result.chi2 - reached, reached
+        _damp_less(result, gained, expected=decrease)
         if undamped:
             decrease, fresh = problem.decrease(), False
-            course.left = decrease
+            result.left = decrease
             if gained == 0.0:
-                course.converged = True
+                result.converged = True
                 break
             solved = decrease <= rule.reuse * gained or rule.is_negligible(decrease, reached)
     else:
         # The last try may have been all that was needed.
-        course.converged = course.damping == 0.0 and solved and rule.is_negligible(decrease, course.chi2)
-    if course.converged and course.damping == 0.0 and rule.polish:
-        _polish(problem, course, rule.polish)
-    return course
+        result.converged = result.damping == 0.0 and solved and rule.is_negligible(decrease, result.chi2)
+    if result.converged and result.damping == 0.0 and rule.polish:
+        _polish(problem, result, rule.polish)
+    return result
 
 
-def glide(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
+def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: StoppingRule) -> Minimization | None:
     """One step of the linear problem, whose Λ and R stay as they are; None: χ² would rise, or there is no R."""
-    course = Minimization(chi2, 0.0, factorizations=1, converged=True)
+    result = Minimization(chi2, 0.0, factorizations=1, converged=True)
     if problem.factorize(0.0) >= 0:
         return None
     if rule.is_negligible(problem.decrease(), chi2):
-        return course
+        return result
     reached = problem.linearize_at(problem.step())
     if not reached <= chi2:
         return None
     problem.accept_linear()
-    course.chi2, course.iterations = reached, 1
-    return course
+    result.chi2, result.iterations = reached, 1
+    return result
 
 
-def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, most: int) -> int:
-    """Undamped steps whatever χ² does, until it is lower than that of `course`; else back.  `problem` has tried the
+def _go_over_hill(problem: LeastSquares, result: Minimization, reached: float, most: int) -> int:
+    """Undamped steps whatever χ² does, until it is lower than that of `result`; else back.  `problem` has tried the
     first, which led to χ² `reached`.  Gives how many were made; 0: they were taken back.
 
     What turns by much in one step is far off in the model of the second order: χ² rises in the first step, as the
@@ -193,10 +193,10 @@ def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, m
         if not math.isfinite(reached):
             break
         problem.accept()
-        if reached < course.chi2:
-            course.chi2, course.iterations = reached, course.iterations + made
+        if reached < result.chi2:
+            result.chi2, result.iterations = reached, result.iterations + made
             return made
-        course.factorizations += 1
+        result.factorizations += 1
         if problem.factorize(0.0) >= 0 or _is_rounding(problem.decrease(), reached):
             break
         reached = problem.linearize_at(problem.step())
@@ -204,19 +204,19 @@ def _go_over_hill(problem: LeastSquares, course: Minimization, reached: float, m
     return 0
 
 
-def _polish(problem: LeastSquares, course: Minimization, most: int) -> None:
+def _polish(problem: LeastSquares, result: Minimization, most: int) -> None:
     """Steps by the old factor, which is nearly that of the optimum: δ is exact to more digits than χ² has."""
     last = math.inf
     for _ in range(most):
         decrease = problem.decrease()
-        if decrease <= _EXACT * course.chi2 + _EXACT_FLOOR or not decrease <= 0.9 * last:
+        if decrease <= _EXACT * result.chi2 + _EXACT_FLOOR or not decrease <= 0.9 * last:
             return
         reached = problem.linearize_at(problem.step())
-        if not _is_rounding(reached - course.chi2, course.chi2):
+        if not _is_rounding(reached - result.chi2, result.chi2):
             return
         problem.accept()
-        course.iterations += 1
-        course.chi2, last = reached, decrease
+        result.iterations += 1
+        result.chi2, last = reached, decrease
 
 
 def _is_rounding(decrease: float, chi2: float) -> bool:
@@ -224,20 +224,20 @@ def _is_rounding(decrease: float, chi2: float) -> bool:
     return decrease <= _ROUNDING * chi2 + _ROUNDING_FLOOR
 
 
-def _damp_more(course: Minimization) -> bool:
+def _damp_more(result: Minimization) -> bool:
     """Ten times the damping; False: that has no use any more, and whoever tries again starts without any."""
-    course.damping = max(10.0 * course.damping, _FIRST_DAMPING)
-    if course.damping > _MOST_DAMPING:
-        course.damping = 0.0
+    result.damping = max(10.0 * result.damping, _FIRST_DAMPING)
+    if result.damping > _MOST_DAMPING:
+        result.damping = 0.0
         return False
     return True
 
 
-def _damp_less(course: Minimization, gained: float, expected: float) -> None:
+def _damp_less(result: Minimization, gained: float, expected: float) -> None:
     """After a good step: less damping where the model was right, more where it was poor."""
     if gained < 0.25 * expected:
-        course.damping *= 2.0
+        result.damping *= 2.0
     else:
-        course.damping *= 0.1
-    if course.damping < _LEAST_DAMPING:
-        course.damping = 0.0
+        result.damping *= 0.1
+    if result.damping < _LEAST_DAMPING:
+        result.damping = 0.0

@@ -1,8 +1,9 @@
-"""Is every variable held by something?  Checked before a factorization would fail, or survive by luck.  MATH §7.
+"""Is every variable determined by something?  Checked before a factorization would fail, or survive by luck.  MATH §7.
 
-Variables that earlier steps took in are held.  A new one is when it is fixed, has a prior, is joined to a held pose by
-a between factor, seen from a held pose, or fixed by several factors on what is held.  Those that this finds are held;
-the others ("suspects") may still be, which only the numbers can tell: `find_loose` asks the factor of Λ.
+Variables that earlier steps took in are determined.  A new one is when it is fixed, has a prior, is joined to a
+determined pose by a between factor, seen from a determined pose, or fixed by several factors on what is determined.
+Those that this finds are determined; the others ("suspects") may still be, which only the numbers can tell:
+`find_loose` asks the factor of Λ.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ import numpy as np
 
 from factorbus.solver.graph.factor_graph import FactorGraph, Mark
 from factorbus.solver.kernels.graph.initialize import join, reach
-from factorbus.solver.kernels.graph.observability import mark_held
+from factorbus.solver.kernels.graph.observability import mark_determined
 from factorbus.solver.kernels.jit.compile import F64, I64
 from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.sparse.blocks import HessianBlocks
@@ -21,20 +22,20 @@ _LOOSE = 1e12
 _NONE = np.empty(0, np.int64)
 
 
-def find_unheld(graph: FactorGraph, since: Mark) -> I64:
-    """The free variables after `since` that neither a chain of factors holds, nor several on what is held."""
+def find_undetermined(graph: FactorGraph, since: Mark) -> I64:
+    """The free variables after `since` that neither a chain of factors nor several on determined ones determine."""
     first, last = since[at.VARIABLES], int(graph.counts[at.VARIABLES])
     if first == last:
         return _NONE
-    held = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
+    determined = (graph.var[first:last, at.V_COLUMN] < 0).astype(np.int64)
     factors = since[at.FACTORS], int(graph.counts[at.FACTORS])
     arenas = graph.var, graph.fac, graph.values, graph.payload
-    while reach(False, first, *factors, graph.array_table, held) >= 0:
-        if not mark_held(first, *factors, *arenas, held):
+    while reach(False, first, *factors, graph.array_table, determined) >= 0:
+        if not mark_determined(first, *factors, *arenas, determined):
             break
     else:
         return _NONE
-    return first + np.flatnonzero(held == 0)
+    return first + np.flatnonzero(determined == 0)
 
 
 def find_unanchored(graph: FactorGraph, since: Mark) -> int:

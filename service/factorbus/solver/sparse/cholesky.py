@@ -69,13 +69,13 @@ class Cholesky:
         """d = R⁻ᵀPη, in elimination order."""
         symbolic, d = self._of(eta), np.empty(len(eta))
         into_elimination_order(symbolic.place, symbolic.starts, symbolic.dims, np.array(eta, float), d)
-        solve_fronts_transposed(symbolic.fronts, symbolic.border, self._arena, d, self._room)
+        solve_fronts_transposed(symbolic.fronts, symbolic.separator, self._arena, d, self._room)
         return d
 
     def back(self, d: F64) -> F64:
         """δ = PᵀR⁻¹d: from elimination order back to insertion order."""
         symbolic, x, delta = self._of(d), np.array(d, float), np.empty(len(d))
-        solve_fronts(symbolic.fronts, symbolic.border, self._arena, x, self._room)
+        solve_fronts(symbolic.fronts, symbolic.separator, self._arena, x, self._room)
         into_insertion_order(symbolic.place, symbolic.starts, symbolic.dims, x, delta)
         return delta
 
@@ -86,9 +86,9 @@ class Cholesky:
         symbolic = self._of(None)
         rows, cols, values = [], [], []
         for front in symbolic.fronts:
-            p, m, k = int(front[fr.PIVOTS]), int(front[fr.BORDER]), int(front[fr.COLUMN])
-            border = symbolic.border[front[fr.BORDER_AT] : front[fr.BORDER_AT] + m]
-            columns = np.concatenate((np.arange(k, k + p), border))
+            p, m, k = int(front[fr.PIVOTS]), int(front[fr.SEPARATOR]), int(front[fr.COLUMN])
+            separator = symbolic.separator[front[fr.SEPARATOR_AT] : front[fr.SEPARATOR_AT] + m]
+            columns = np.concatenate((np.arange(k, k + p), separator))
             for i in range(p):
                 at = int(front[fr.ROWS] + i * front[fr.LD_ROWS])
                 values.append(self._arena[at + i : at + p + m])

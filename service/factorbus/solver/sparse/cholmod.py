@@ -38,7 +38,7 @@ def factorize_by_cholmod(
         return symbolic.variable_at(min(int(failed.column), symbolic.size - 1))
     L.sort_indices()
     fill_fronts(
-        symbolic.fronts, symbolic.border, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data, arena
+        symbolic.fronts, symbolic.separator, L.indptr.astype(np.int64), L.indices.astype(np.int64), L.data, arena
     )  # fmt: skip
     return -1
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorbus.solver.kernels.jit.compile import I64
-from factorbus.solver.kernels.sparse.fronts import BORDER
+from factorbus.solver.kernels.sparse.fronts import SEPARATOR
 from factorbus.solver.kernels.sparse.symbolic import analyze_pattern
 from factorbus.solver.sparse.ordering import checked_pattern, integers
 
@@ -17,7 +17,7 @@ class Symbolic:
     order (n,): the variable eliminated k-th (fill and constraints as in the given order, fronts in postorder).
     place (n,): first scalar of each variable in elimination order.  starts (n + 1,): in insertion order.
     nnz_r: structural scalar nonzeros of R.  flops: to factorize, the sum of squared row lengths of R.
-    areas (nb,): numbers in each block.  widest: scalars of the longest border.
+    areas (nb,): numbers in each block.  widest: scalars of the longest separator.
     stored: doubles that hold R, with padding and the zeros of joined fronts.  arena: those and the update matrices.
     """
 
@@ -27,7 +27,7 @@ class Symbolic:
     starts: I64
     fronts: I64
     runs: I64
-    border: I64
+    separator: I64
     blocks: I64
     areas: I64
     widest: int
@@ -66,7 +66,7 @@ def analyze(dims: I64, rows: I64, cols: I64, perm: I64) -> Symbolic:
         raise ValueError(f"variable {int(diagonal.argmin())} has no diagonal block: each needs one")
     if not is_permutation(perm, len(dims)):
         raise ValueError(f"perm is not a permutation of 0 to {len(dims) - 1}")
-    order, place, fronts, runs, border, blocks, sizes, work = analyze_pattern(dims, rows, cols, perm)
+    order, place, fronts, runs, separator, blocks, sizes, work = analyze_pattern(dims, rows, cols, perm)
     starts = np.zeros(len(dims) + 1, np.int64)
     np.cumsum(dims, out=starts[1:])
     stored, arena = (int(size) for size in sizes)
@@ -77,10 +77,10 @@ def analyze(dims: I64, rows: I64, cols: I64, perm: I64) -> Symbolic:
         starts,
         fronts,
         runs,
-        border,
+        separator,
         blocks,
         areas=dims[rows] * dims[cols],
-        widest=int(fronts[:, BORDER].max(initial=0)),
+        widest=int(fronts[:, SEPARATOR].max(initial=0)),
         stored=stored,
         arena=arena,
         nnz_r=int(work[0]),

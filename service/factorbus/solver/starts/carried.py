@@ -22,13 +22,15 @@ def tied(graph: FactorGraph, space: PoseSpace, relations: Relations, R: F64, t: 
     count, d = int(graph.counts[at.VARIABLES]), space.dim
     kinds = graph.var[:count, at.V_KIND]
     free = np.concatenate([[False], (kinds == space.point) & (graph.var[:count, at.V_COLUMN] >= 0)])
-    whole = np.linalg.eigvalsh(relations.hold)[:, 0] > 1e-9 * np.trace(relations.hold, axis1=1, axis2=2)
+    whole = np.linalg.eigvalsh(relations.t_information)[:, 0] > 1e-9 * np.trace(
+        relations.t_information, axis1=1, axis2=2
+    )
     measured = np.zeros(count + 1, bool)
     measured[relations.b[whole & (relations.turn == 0.0)]] = True
     points, poses, rows = _first_seen(graph, free & ~measured, np.concatenate([[False], kinds == space.pose]))
     if not points.size:
         return relations
-    m, strength = points.size, np.trace(relations.hold, axis1=1, axis2=2)
+    m, strength = points.size, np.trace(relations.t_information, axis1=1, axis2=2)
     strongest = np.zeros(count + 1)
     np.maximum.at(strongest, relations.b, strength)
     usual = float(np.median(strength)) if strength.size else 1.0

@@ -66,7 +66,7 @@ def _pairs(
     fixes = inside.where((inside.a == 0) & members[inside.b] & (inside.turn == 0.0))
     antenna = local[fixes.b] + (R[fixes.b] @ fixes.lever[:, :, None])[:, :, 0]
     seen = np.flatnonzero(points)
-    weight = np.trace(fixes.hold, axis1=1, axis2=2)
+    weight = np.trace(fixes.t_information, axis1=1, axis2=2)
     each = np.full(seen.size, float(np.median(weight)) if weight.size else 1.0)
     there = np.concatenate([fixes.t, t[seen]])
     return there, np.concatenate([antenna, local[seen]]), np.concatenate([weight, each])

@@ -17,7 +17,7 @@ from factorbus.solver.optimize.gauss_newton import StoppingRule, minimize
 from factorbus.solver.optimize.system import System
 from factorbus.solver.options import Options
 from factorbus.solver.report import Stopwatch
-from factorbus.solver.sparse.anchors import find_unanchored, find_unheld
+from factorbus.solver.sparse.anchors import find_unanchored, find_undetermined
 from factorbus.solver.sparse.elimination import Elimination
 
 VALUES, ODOMETRY, ROTATIONS = "values", "odometry", "rotations"
@@ -65,7 +65,7 @@ class Descents:
         self._rule = options.tuning.converge_tolerance, 1e-8 * options.tuning.chi2_epsilon
         self.graph, none = graph, (0,) * at.COUNTS
         self._system = System(graph, Incremental(Elimination(options), options))
-        self._suspects = find_unheld(graph, none)
+        self._suspects = find_undetermined(graph, none)
         if self._suspects.size and (free := find_unanchored(graph, none)) >= 0:
             raise self._system.underconstrained(
                 free,
@@ -116,14 +116,14 @@ class Descents:
             return
         system.anew()
         tolerance, floor = self._rule
-        course = minimize(system, descent.chi2, descent.damping, StoppingRule(tolerance, floor, _CHUNK, polish=_POLISH))
-        if course.failed >= 0 and course.iterations == 0:
-            raise system.underconstrained(system.variable_of(course.failed))
-        descent.rate = descent.chi2 / course.chi2 if course.chi2 > 0.0 else np.inf
-        descent.values, descent.chi2, descent.damping = graph.values, max(course.chi2, 0.0), course.damping
-        descent.iterations += course.iterations
+        result = minimize(system, descent.chi2, descent.damping, StoppingRule(tolerance, floor, _CHUNK, polish=_POLISH))
+        if result.failed >= 0 and result.iterations == 0:
+            raise system.underconstrained(system.variable_of(result.failed))
+        descent.rate = descent.chi2 / result.chi2 if result.chi2 > 0.0 else np.inf
+        descent.values, descent.chi2, descent.damping = graph.values, max(result.chi2, 0.0), result.damping
+        descent.iterations += result.iterations
         descent.tries += _CHUNK
-        descent.converged = course.converged
+        descent.converged = result.converged
 
 
 def _is_over(descent: Descent, other: Descent) -> bool:

@@ -50,7 +50,8 @@ class Relations:
 
     a, b (m,)   R (m, d, d): of b in a   t (m, d): of b in a, metres
     turn (m,): information of a rotation, one number, 1/rad²; 0: there is none
-    hold (m, d, d): information of t in the frame of a, 1/m²   couple (m, d, ρ): of t with the rotation's residual
+    t_information (m, d, d): information of t in the frame of a, 1/m²
+    couple (m, d, ρ): of t with the rotation's residual
     lever (m, d): a point of b that t is the place of, in b
     row (m,): of the factor   loss (m,), scale (m,): its loss
     """
@@ -60,7 +61,7 @@ class Relations:
     R: F64
     t: F64
     turn: F64
-    hold: F64
+    t_information: F64
     couple: F64
     lever: F64
     row: I64
@@ -77,7 +78,12 @@ class Relations:
     def weighed(self, weights: F64) -> "Relations":
         """The same, each counted so many times."""
         wide = weights[:, None, None]
-        return replace(self, turn=self.turn * weights, hold=self.hold * wide, couple=self.couple * wide)
+        return replace(
+            self,
+            turn=self.turn * weights,
+            t_information=self.t_information * wide,
+            couple=self.couple * wide,
+        )
 
     def joined(self, other: "Relations") -> "Relations":
         """These and others behind them."""
@@ -134,7 +140,15 @@ def _losses(graph: FactorGraph, kind: int, fac: I64) -> tuple[I64, F64]:
 
 
 def _made(
-    graph: FactorGraph, kind: int, rows: I64, fac: I64, a: I64, b: I64, t: F64, hold: F64, **more: np.ndarray
+    graph: FactorGraph,
+    kind: int,
+    rows: I64,
+    fac: I64,
+    a: I64,
+    b: I64,
+    t: F64,
+    t_information: F64,
+    **more: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """A part of `Relations`; what is not given is nothing."""
     m, d = t.shape
@@ -144,7 +158,7 @@ def _made(
     }  # fmt: skip
     got = nothing | more
     loss, scale = _losses(graph, kind, fac)
-    return a, b, got["R"], t, got["turn"], hold, got["couple"], got["lever"], rows, loss, scale
+    return a, b, got["R"], t, got["turn"], t_information, got["couple"], got["lever"], rows, loss, scale
 
 
 def poses_apart(numbers: F64) -> tuple[F64, F64]:
@@ -159,9 +173,9 @@ def _poses(graph: FactorGraph, space: PoseSpace, kind: int) -> tuple[np.ndarray,
     (R, t), d = poses_apart(measured), space.dim
     b = fac[:, at.F_J] + 1 if kind == space.between else fac[:, at.F_I] + 1
     a = fac[:, at.F_I] + 1 if kind == space.between else np.zeros(rows.size, np.int64)
-    hold = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
+    t_information = R @ information[:, :d, :d] @ R.transpose(0, 2, 1)
     turn, couple = _turn(information, d), R @ information[:, :d, d:]
-    return _made(graph, kind, rows, fac, a, b, t, hold, R=R, turn=turn, couple=couple)
+    return _made(graph, kind, rows, fac, a, b, t, t_information, R=R, turn=turn, couple=couple)
 
 
 def _turn(information: F64, d: int) -> F64:
@@ -186,9 +200,9 @@ def _bearing_ranges(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     bearing, distance = measured.T
     u = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
     g = np.stack([np.stack([-u[:, 1], u[:, 0]], axis=1) / distance[:, None], u], axis=1)
-    hold = g.transpose(0, 2, 1) @ information @ g
+    t_information = g.transpose(0, 2, 1) @ information @ g
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, hold)
+    return _made(graph, at.BEARING_RANGE_SE2, rows, fac, a, b, distance[:, None] * u, t_information)
 
 
 def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
@@ -201,8 +215,8 @@ def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     across = np.eye(space.dim) - u[:, :, None] * u[:, None, :]
     weight = np.trace(information, axis1=1, axis2=2) / information.shape[1] / distance**2
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    hold = weight[:, None, None] * across
-    return _made(graph, space.bearing, rows, fac, a, b, distance[:, None] * u, hold)
+    t_information = weight[:, None, None] * across
+    return _made(graph, space.bearing, rows, fac, a, b, distance[:, None] * u, t_information)
 
 
 def _value(graph: FactorGraph, variables: I64, numbers: int) -> F64:
@@ -221,9 +235,9 @@ def _headings(graph: FactorGraph) -> tuple[np.ndarray, ...]:
     rows, fac, measured, information = _rows(graph, at.HEADING_SE2)
     R, a = matrices_of_angles(measured[:, 0]), np.zeros(rows.size, np.int64)
     nothing = np.zeros((rows.size, 2))
-    hold = np.zeros((rows.size, 2, 2))
+    t_information = np.zeros((rows.size, 2, 2))
     turn = information[:, 0, 0]
-    return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, hold, R=R, turn=turn)
+    return _made(graph, at.HEADING_SE2, rows, fac, a, fac[:, at.F_I] + 1, nothing, t_information, R=R, turn=turn)
 
 
 def _linear_pairs(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
@@ -235,10 +249,10 @@ def _linear_pairs(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...
     weight = np.maximum(np.einsum("mri,mrs,msi->mi", H, information, H), 0.0)
     back = Ra.transpose(0, 2, 1)
     t = (back @ (tb - ta)[:, :, None])[:, :, 0]
-    hold = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
+    t_information = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
     turn = weight[:, d:].mean(axis=1)
     a, b = fac[:, at.F_I] + 1, fac[:, at.F_J] + 1
-    return _made(graph, space.linear_pair, rows, fac, a, b, t, hold, R=back @ Rb, turn=turn)
+    return _made(graph, space.linear_pair, rows, fac, a, b, t, t_information, R=back @ Rb, turn=turn)
 
 
 def _linear(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
@@ -250,9 +264,9 @@ def _linear(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
     weight = np.einsum("mri,mrs,msi->mi", H, information, H)
     whole = (weight > 0.0).all(axis=1)
     weight = np.where(whole[:, None], weight, 0.0)
-    hold = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
+    t_information = weight[:, :d].mean(axis=1)[:, None, None] * np.eye(d)
     a, b = np.zeros(rows.size, np.int64), fac[:, at.F_I] + 1
-    return _made(graph, space.linear, rows, fac, a, b, t, hold, R=R, turn=weight[:, d:].mean(axis=1))
+    return _made(graph, space.linear, rows, fac, a, b, t, t_information, R=R, turn=weight[:, d:].mean(axis=1))
 
 
 def _directions(graph: FactorGraph, space: PoseSpace) -> Directions:

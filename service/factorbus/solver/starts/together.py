@@ -63,5 +63,5 @@ def _ends(used: Relations) -> tuple[F64, F64]:
 
 def _weights(used: Relations, d: int) -> F64:
     """(m, d + 1): what the rows of the residuals count."""
-    hold = np.trace(used.hold, axis1=1, axis2=2) / d
-    return np.concatenate([np.repeat(used.turn[:, None], d, axis=1), hold[:, None]], axis=1)
+    t_information = np.trace(used.t_information, axis1=1, axis2=2) / d
+    return np.concatenate([np.repeat(used.turn[:, None], d, axis=1), t_information[:, None]], axis=1)

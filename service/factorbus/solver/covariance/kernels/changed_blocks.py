@@ -35,7 +35,7 @@ def has_changed_separator(tree: Tree, c: int, changes: BlockChanges) -> bool:
 def mark_changed(tree: Tree, c: int, dims: I64, a: F64, target: int, changes: BlockChanges, blocks: F64) -> None:
     """Compare the frontals' `blocks` with those in the square of clique c at `target`."""
     row, lists, scalar = tree.clique[c], tree.lists, 0
-    ld = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER])
+    ld = row_length(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS])
     for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
         v = lists[s]
         d, block, corner = dims[v], blocks[v], target + scalar * ld + scalar

@@ -41,7 +41,7 @@ def cross_blocks(
     rank = np.empty(len(clique), np.int64)
     for k in range(order.size):
         rank[order[k]] = k
-        widest = max(widest, clique[order[k], tl.C_PIVOTS] + clique[order[k], tl.C_BORDER])
+        widest = max(widest, clique[order[k], tl.C_PIVOTS] + clique[order[k], tl.C_SEPARATOR_SCALARS])
     ldx = whole_vectors(deepest)
     a = np.empty((scalars + widest) * ldx)
     stamp, path = np.zeros(order.size, np.int64), np.zeros(order.size, np.int64)

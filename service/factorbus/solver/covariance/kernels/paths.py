@@ -37,7 +37,7 @@ def joint_block(variables: I64, var: I64, sizes: I64, tree_table: I64, out: F64)
         for s in range(clique[c, tl.C_LIST], clique[c, tl.C_LIST] + clique[c, tl.C_FRONTALS]):
             start[lists[s]], dims[lists[s]] = rows, sizes[var[lists[s], at.V_KIND]]
             rows += dims[lists[s]]
-        widest = max(widest, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
+        widest = max(widest, clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS])
     d = len(out)
     ld = whole_vectors(d)
     scratch = (rows + d) * ld

@@ -78,7 +78,7 @@ def diagonal_blocks(roots: I64, tree_table: I64, dims: I64, since: int, step: in
         while c >= 0:
             row, child = clique[c], -1
             if since < 0 or row[tl.C_MARK] > since or has_changed_separator(tree, c, changes):
-                p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
+                p, m = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS]
                 if starts[depth] + working_size(p, m) > a.size:
                     a = enlarged(a, starts[depth], 2 * (starts[depth] + working_size(p, m)))
                 if 5 * (p + m) > runs.size:

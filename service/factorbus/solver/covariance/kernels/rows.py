@@ -11,7 +11,7 @@ def size_of_rows(order: I64, clique: I64) -> int:
     """Doubles in the rows of the cliques `order`."""
     size = 0
     for c in order:
-        size += clique[c, tl.C_PIVOTS] * (clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
+        size += clique[c, tl.C_PIVOTS] * (clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS])
     return size
 
 
@@ -21,7 +21,7 @@ def copy_rows(order: I64, clique: I64, numbers: F64, out: F64) -> None:
     first = 0
     for c in order:
         row = clique[c]
-        p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_LD]
+        p, width, ld = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS], row[tl.C_LD]
         for i in range(p):
             start = row[tl.C_ROWS] + i * ld
             for k in range(i, width):

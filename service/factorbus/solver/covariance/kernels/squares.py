@@ -69,8 +69,8 @@ def gather_separator_block(
     above = tree.clique[row[tl.C_PARENT]]
     count = list_separator_runs(row, above, tree.lists, dims, column, runs)
     p, pivots = row[tl.C_PIVOTS], above[tl.C_PIVOTS]
-    wide, gap = row_length(pivots, above[tl.C_BORDER]), whole_vectors(pivots) - pivots
-    ld, end = row_length(p, row[tl.C_BORDER]), 3 * count
+    wide, gap = row_length(pivots, above[tl.C_SEPARATOR_SCALARS]), whole_vectors(pivots) - pivots
+    ld, end = row_length(p, row[tl.C_SEPARATOR_SCALARS]), 3 * count
     for k in range(count):
         start = runs[3 * k] + gap if runs[3 * k] >= pivots else runs[3 * k]
         for n in range(0, runs[3 * k + 1], RUN):
@@ -109,16 +109,16 @@ def solve_square(tree: Tree, c: int, a: F64, target: int, whole: bool) -> None:
     diagonal and right of it.
     """
     row = tree.clique[c]
-    p, m = row[tl.C_PIVOTS], row[tl.C_BORDER]
-    ld, border, wide = row_length(p, m), whole_vectors(p), whole_vectors(p + m)
+    p, m = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS]
+    ld, past_pivots, wide = row_length(p, m), whole_vectors(p), whole_vectors(p + m)
     high, w = height(p), target + (2 * p + m) * ld
     solve_for_square(row, tree.numbers, a, w, wide)
     for j in range(0, m, TILE_VECTORS * LANES):
-        vectors, Y = min(TILE_VECTORS, (m - j + LANES - 1) // LANES), VectorRows(target + p * ld + border + j, ld)
+        vectors, Y = min(TILE_VECTORS, (m - j + LANES - 1) // LANES), VectorRows(target + p * ld + past_pivots + j, ld)
         for i in range(0, p, high):
-            C = Tile(min(high, p - i), vectors, target + i * ld + border + j, ld)
+            C = Tile(min(high, p - i), vectors, target + i * ld + past_pivots + j, ld)
             negative_product(a, C, a, Strided(w + i * wide, wide, 1), Y, m)
-    transpose(a, p, m, target + border, ld, target + p * ld, ld)
+    transpose(a, p, m, target + past_pivots, ld, target + p * ld, ld)
     transpose_negative(a, p, p, w + m, wide, target + (p + m) * ld, ld)
     for j in range(0, p, TILE_VECTORS * LANES):
         vectors, Y = min(TILE_VECTORS, (p - j + LANES - 1) // LANES), VectorRows(target + p * ld + j, ld)
@@ -133,7 +133,7 @@ def solve_square(tree: Tree, c: int, a: F64, target: int, whole: bool) -> None:
 @part
 def solve_for_square(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
     """[ K T ] at w from R_F [ K T ] = [ R_S I ], some rows at a time from the last."""
-    p, m, start, step = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
+    p, m, start, step = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], row[tl.C_ROWS], row[tl.C_LD]
     for i in range(p):
         source, v = start + i * step + p, w + i * wide
         for j in range(m):
@@ -159,7 +159,7 @@ def solve_for_square(row: I64, numbers: F64, a: F64, w: int, wide: int) -> None:
 def put_blocks(tree: Tree, c: int, dims: I64, a: F64, target: int, out: F64) -> None:
     """The diagonal blocks of the frontals of clique c, from its square at `target`, into out (n, d, d)."""
     row, lists = tree.clique[c], tree.lists
-    ld, corner = row_length(row[tl.C_PIVOTS], row[tl.C_BORDER]), target
+    ld, corner = row_length(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS]), target
     for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
         block, d = out[lists[s]], dims[lists[s]]
         for i in range(d):

@@ -55,7 +55,8 @@ def group_of_columns(first: int, ld: int, scratch: int) -> RightSides:
 def forward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides) -> None:
     """X_F := R_F⁻ᵀ X_F,  X_S −= R_Sᵀ X_F, with the rows of clique c."""
     row, numbers = tree.clique[c], tree.numbers
-    p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
+    p, start, step = row[tl.C_PIVOTS], row[tl.C_ROWS], row[tl.C_LD]
+    width = p + row[tl.C_SEPARATOR_SCALARS]
     ld, every = x.vectors * LANES, row[tl.C_FRONTALS] + row[tl.C_SEPARATORS]
     variables, solved = tree.lists[row[tl.C_LIST] : row[tl.C_LIST] + every], VectorRows(x.scratch, ld)
     gather_rows(variables, layout, a, x, x.scratch)
@@ -73,10 +74,11 @@ def forward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides) -> 
 def backward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides, fresh: bool) -> None:
     """X_F := R_F⁻¹ (X_F − R_S X_S), likewise; if `fresh` X_F is zero, whatever is there."""
     row, numbers = tree.clique[c], tree.numbers
-    p, width, start, step = row[tl.C_PIVOTS], row[tl.C_PIVOTS] + row[tl.C_BORDER], row[tl.C_ROWS], row[tl.C_LD]
+    p, start, step = row[tl.C_PIVOTS], row[tl.C_ROWS], row[tl.C_LD]
+    width = p + row[tl.C_SEPARATOR_SCALARS]
     ld, first = x.vectors * LANES, row[tl.C_LIST]
-    border = first + row[tl.C_FRONTALS]
-    frontals, separator = tree.lists[first:border], tree.lists[border : border + row[tl.C_SEPARATORS]]
+    middle = first + row[tl.C_FRONTALS]
+    frontals, separator = tree.lists[first:middle], tree.lists[middle : middle + row[tl.C_SEPARATORS]]
     if not fresh:
         gather_rows(frontals, layout, a, x, x.scratch)
     gather_rows(separator, layout, a, x, x.scratch + p * ld)
@@ -98,7 +100,7 @@ def backward(tree: Tree, c: int, layout: ColumnLayout, a: F64, x: RightSides, fr
 def prefetch_rows(tree: Tree, c: int) -> None:
     """The rows of clique c will be read next."""
     row = tree.clique[c]
-    size = (row[tl.C_PIVOTS] - 1) * row[tl.C_LD] + row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    size = (row[tl.C_PIVOTS] - 1) * row[tl.C_LD] + row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS]
     prefetch(tree.numbers, row[tl.C_ROWS], size)
 
 

@@ -53,7 +53,7 @@ def whole_blocks(order: I64, hub: int, tree_table: I64, dims: I64, start: I64, o
         if start[v] >= 0:
             scalars = max(scalars, start[v] + dims[v])
     for c in order:
-        widest = max(widest, 2 * clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER])
+        widest = max(widest, 2 * clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS])
     width = dims[hub] if hub >= 0 else 0
     ldx = whole_vectors(width)
     x, block_rows = RightSides(0, ldx, ldx // LANES, scalars * ldx), column[:, :width]
@@ -75,7 +75,7 @@ def whole_blocks(order: I64, hub: int, tree_table: I64, dims: I64, start: I64, o
         if parent >= 0:
             depth[c] = depth[parent] + 1
         square = starts[depth[c]]
-        starts[depth[c] + 1] = square + square_size(row[tl.C_PIVOTS], row[tl.C_BORDER])
+        starts[depth[c] + 1] = square + square_size(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS])
         prefetch_rows(tree, order[min(k + AHEAD, order.size - 1)])
         if parent >= 0:
             gather_separator_block(tree, c, dims, places, runs, a, starts[depth[c] - 1], square)
@@ -91,7 +91,7 @@ def squares_size(tree: Tree, order: I64, first: int) -> int:
     clique = tree.clique
     end, most = np.zeros(len(clique), np.int64), first
     for c in order:
-        p, m, parent = clique[c, tl.C_PIVOTS], clique[c, tl.C_BORDER], clique[c, tl.C_PARENT]
+        p, m, parent = clique[c, tl.C_PIVOTS], clique[c, tl.C_SEPARATOR_SCALARS], clique[c, tl.C_PARENT]
         start = end[parent] if parent >= 0 else first
         end[c] = start + square_size(p, m)
         most = max(most, start + working_size(p, m))
@@ -104,9 +104,9 @@ def put_column(
 ) -> None:
     """X_F (10.11) in place of Y_F, from the rows behind the square of clique c, and its blocks, out (n, d, ·)."""
     row, ldx = tree.clique[c], x.ld
-    p, m, first = row[tl.C_PIVOTS], row[tl.C_BORDER], row[tl.C_LIST]
-    border = first + row[tl.C_FRONTALS]
-    frontals, separator = tree.lists[first:border], tree.lists[border : border + row[tl.C_SEPARATORS]]
+    p, m, first = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], row[tl.C_LIST]
+    middle = first + row[tl.C_FRONTALS]
+    frontals, separator = tree.lists[first:middle], tree.lists[middle : middle + row[tl.C_SEPARATORS]]
     wide, high = whole_vectors(p + m), height(p)
     w, depth, result = square + (2 * p + m) * row_length(p, m), m, x.scratch + (m + p) * ldx
     gather_rows(separator, layout, a, x, x.scratch)

@@ -51,15 +51,15 @@ def note_turn(v: int, var: I64, lin: F64, turns: F64) -> None:
 def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
     """Factors up to f1 are linearized, and join the incidences of their variables; gives whether all χ² are numbers.
 
-    A_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
+    T_ADDED gets their χ² at the estimate.  Their first variables are listed: one may have moved since it was
     linearized, and the factor is then off its model from the start.
 
     saved (2 per factor, 8): what that changes of variables, for `take_out`
     """
     var, fac, values = graph.var, graph.fac, graph.values
     node, link, hessian, scalars = tree.node, tree.link, tree.hessian, tree.scalars
-    stiff, turns, moved, saved, state = tree.stiff, tree.turns, tree.moved, tree.saved, tree.state
-    account = tree.account
+    factor_errors, turns, moved, saved, state = tree.factor_errors, tree.turns, tree.moved, tree.saved, tree.state
+    totals = tree.totals
     f0, finite = state[tl.S_FACTORS], True
     scratch = make_scratch()
     for f in range(f0, f1):
@@ -77,13 +77,13 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
             _save(j, saved[2 * (f - f0) + 1], var, node, scalars, turns)
         weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(i, var, scalars))
+        totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(i, var, scalars))
         if j >= 0:
-            account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(j, var, scalars))
-        stiff[f, tl.B_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
-        stiff[f, tl.B_ERROR] = stiff[f, tl.B_COUNTED] = 0.0
-        account[tl.A_ADDED] += stiff[f, tl.B_CHI2]
-        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(stiff[f, tl.B_CHI2])
+            totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(j, var, scalars))
+        factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
+        factor_errors[f, tl.E_ERROR] = factor_errors[f, tl.E_COUNTED] = 0.0
+        totals[tl.T_ADDED] += factor_errors[f, tl.E_CHI2]
+        finite &= math.isfinite(hessian[state[tl.S_HESSIAN] - 1]) and math.isfinite(factor_errors[f, tl.E_CHI2])
         note_moved(MODEL, i, node, moved, state)
         link[f, tl.L_I], node[i, tl.N_ADJ] = node[i, tl.N_ADJ], 2 * f
         node[i, tl.N_SEEN] = state[tl.S_STEP]
@@ -95,7 +95,7 @@ def take_in_factors(graph: Graph, tree: Tree, f1: int) -> bool:
 
 
 @inline_kernel
-def stiffest_of(v: int, var: I64, scalars: F64) -> float:
+def largest_diagonal_of(v: int, var: I64, scalars: F64) -> float:
     """The largest sum of the diagonals of Hessians of variable v."""
     d, most = var[v, at.V_SCALAR], 0.0
     if d >= 0:

@@ -52,12 +52,12 @@ def variable_at(scalar: int, row: I64, var: I64, lists: I64) -> int:
 
 @inline_kernel
 def front_of_clique(row: I64) -> fr.Front:
-    """The front that a clique is eliminated in: its border has the right-hand side as the last column."""
+    """The front that a clique is eliminated in: its separator has the right-hand side as the last column."""
     return fr.Front(
         row[tl.C_ROWS],
         row[tl.C_LD],
         row[tl.C_PIVOTS],
-        row[tl.C_BORDER] + 1,
+        row[tl.C_SEPARATOR_SCALARS] + 1,
         row[tl.C_UPDATE],
         row[tl.C_WIDTH_UPDATE],
     )
@@ -96,7 +96,7 @@ def add_hessian(graph: Graph, tree: Tree, f: int, row: I64, column: I64) -> None
 @inline_kernel
 def _add_blocks(di: int, dj: int, ci: int, cj: int, h: int, row: I64, hessian: F64, numbers: F64) -> None:
     """`add_hessian` of variables of di and dj scalars, at columns ci and cj; −1: there is none, or it is fixed."""
-    last = row[tl.C_PIVOTS] + row[tl.C_BORDER]
+    last = row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS]
     g = h + di * di + di * dj + dj * dj
     if ci >= 0:
         _add_diagonal(di, ci, last, h, g, row, hessian, numbers)
@@ -131,7 +131,7 @@ def _add_diagonal(d: int, c: int, last: int, h: int, g: int, row: I64, hessian: 
 def list_column_runs(graph: Graph, tree: Tree, start: int, end: int, column: I64, p: int, m: int, runs: I64) -> int:
     """Where the columns of a child go: runs of neighbours that stay neighbours, the right-hand side last.
 
-    A run lies wholly among the pivots or wholly in the border of the front.  Gives how many there are.
+    A run lies wholly among the pivots or wholly in the separator of the front.  Gives how many there are.
     """
     var = graph.var
     node, lists = tree.node, tree.lists
@@ -227,7 +227,7 @@ def split_sizes(c: int, var: I64, clique: I64, lists: I64) -> tuple:
     p, start = 0, clique[c, tl.C_LIST]
     for s in range(start, start + clique[c, tl.C_FIRST]):
         p += dim_of_variable(var, lists[s])
-    return p, clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER] - p
+    return p, clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS] - p
 
 
 @part
@@ -292,7 +292,7 @@ def _add_child(graph: Graph, tree: Tree, child: int, m: int, u: int, wide: int) 
     var = graph.var
     node, clique, lists, numbers = tree.node, tree.clique, tree.lists, tree.numbers
     start = clique[child, tl.C_LIST] + clique[child, tl.C_FRONTALS]
-    end, last = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_BORDER]
+    end, last = start + clique[child, tl.C_SEPARATORS], clique[child, tl.C_SEPARATOR_SCALARS]
     source, width = clique[child, tl.C_UPDATE], clique[child, tl.C_WIDTH_UPDATE]
     x = 0
     for s in range(start, end):

@@ -26,16 +26,16 @@ def substitute(graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, qu
     """Solve the new cliques and whatever moves with them.
 
     changed: gets the variables whose δ changed, each once in a step; S_CHANGED says how many.  lin[2] gets what they
-    were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  A_LEFT gets
+    were.  moved: gets them all since their factors were evaluated last.  listed: scratch, for all cliques.  T_LEFT gets
     the largest square by which a separator that was left alone is off.  wildfire_threshold 0: no separator is left
     alone, nor one that was so below a clique that does not move now
     """
     var = graph.var
     clique, lists, numbers, lin = tree.clique, tree.lists, tree.numbers, tree.lin
     scalars, motions = tree.scalars, tree.motions
-    state, account = tree.state, tree.account
+    state, totals = tree.state, tree.totals
     far, delta, weight, motion = wildfire_threshold * wildfire_threshold, scalars[0], scalars[1], np.empty(rg.SIZE)
-    if wildfire_threshold == 0.0 and account[tl.A_LEFT] > 0.0:
+    if wildfire_threshold == 0.0 and totals[tl.T_LEFT] > 0.0:
         far = -1.0
     motion[rg.LEFT] = 0.0
     shares = np.empty(64)
@@ -66,7 +66,7 @@ def substitute(graph: Graph, tree: Tree, ids: I64, wildfire_threshold: float, qu
                 body += 1
                 child, above = clique[c, tl.C_NEXT], clique[c, tl.C_PARENT]
     rg.move_bodies(graph, tree, listed[:count], quiet, delta, lin[2], motion)
-    account[tl.A_LEFT] = max(account[tl.A_LEFT] if wildfire_threshold > 0.0 else 0.0, motion[rg.LEFT])
+    totals[tl.T_LEFT] = max(totals[tl.T_LEFT] if wildfire_threshold > 0.0 else 0.0, motion[rg.LEFT])
 
 
 @inline_kernel
@@ -130,7 +130,7 @@ def has_moved(graph: Graph, tree: Tree, c: int, far: float, delta: F64, weight: 
 @inline_kernel
 def far_of(row: I64, far: float) -> float:
     """The square of (9.17) for a clique, `far` being that of one with NARROW numbers of R a scalar."""
-    return far * max(1.0, (row[tl.C_BORDER] + 0.5 * row[tl.C_PIVOTS]) / NARROW)
+    return far * max(1.0, (row[tl.C_SEPARATOR_SCALARS] + 0.5 * row[tl.C_PIVOTS]) / NARROW)
 
 
 @inline_kernel
@@ -155,7 +155,7 @@ def solve_rows(row: I64, numbers: F64, shares: F64) -> None:
     one in space.
     """
     p, used, ld = row[tl.C_PIVOTS], row[tl.C_USED], row[tl.C_LD]
-    width = p + row[tl.C_BORDER]
+    width = p + row[tl.C_SEPARATOR_SCALARS]
     for i in range(p):
         put(shares, i, 1.0 / load(numbers, row[tl.C_ROWS] + i * (ld + 1)))
     i = 0

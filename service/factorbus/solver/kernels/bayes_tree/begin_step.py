@@ -1,4 +1,4 @@
-"""Before a step of the tree: room, good first values, and whether everything new is held.  MATH §9.2."""
+"""Before a step of the tree: room, good first values, and whether everything new is determined.  MATH §9.2."""
 
 import numpy as np
 
@@ -34,12 +34,12 @@ def begin_step(graph: Graph, tree: Tree) -> int:
     if v1 - v0 <= settings[tl.P_INITIALIZE]:
         settle_new(v0, v1, f0, f1, settings[tl.P_CHI2_EPSILON], table_of(graph))
     if state[tl.S_CHECKED] == 0 and v1 > v0:
-        held = np.empty(v1 - v0, np.int64)
+        determined = np.empty(v1 - v0, np.int64)
         for v in range(v0, v1):
-            held[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
+            determined[v - v0] = 1 if var[v, at.V_COLUMN] < 0 else 0
         if (
-            not are_held_in_turn(v0, f0, f1, var, fac, values, payload, held)
-            and reach(False, v0, f0, f1, table_of(graph), held) >= 0
+            not are_determined_in_order(v0, f0, f1, var, fac, values, payload, determined)
+            and reach(False, v0, f0, f1, table_of(graph), determined) >= 0
         ):
             return tl.UNSURE
     state[tl.S_CHANGED_BEFORE] = state[tl.S_CHANGED]
@@ -51,12 +51,14 @@ def begin_step(graph: Graph, tree: Tree) -> int:
 
 
 @inline_kernel
-def are_held_in_turn(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> bool:
-    """Whether the factors f0 .. f1−1, each once and in their order, hold all: as they do where a robot drives on."""
+def are_determined_in_order(
+    v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, determined: I64
+) -> bool:
+    """Whether the factors f0 .. f1−1, in their order, determine all: as they do where a robot drives on."""
     left = 0
-    for k in range(held.size):
-        left += 1 - held[k]
+    for k in range(determined.size):
+        left += 1 - determined[k]
     for f in range(f0, f1):
-        if left > 0 and follow(False, f, v0, var, fac, values, payload, held) >= 0:
+        if left > 0 and follow(False, f, v0, var, fac, values, payload, determined) >= 0:
             left -= 1
     return left == 0

@@ -24,14 +24,14 @@ def commit(graph: Graph, tree: Tree, affected: Affected, fronts: Fronts, ids: I6
     marked, orphans, factors = affected.cliques, affected.orphans, affected.factors
     records, place, home = fronts.records, fronts.place, fronts.home
     node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
-    state, account = tree.state, tree.account
+    state, totals = tree.state, tree.totals
     for k in range(marked.size):
         state[tl.S_NONZEROS] -= nonzeros(clique[marked[k]])
         if clique[marked[k], tl.C_PARENT] < 0:
-            account[tl.A_MODEL] -= numbers[clique[marked[k], tl.C_UPDATE]]
+            totals[tl.T_MODEL] -= numbers[clique[marked[k], tl.C_UPDATE]]
             state[tl.S_ROOTS] -= 1
     if state[tl.S_ROOTS] == 0:
-        account[tl.A_MODEL] = account[tl.A_CONSTANT]
+        totals[tl.T_MODEL] = totals[tl.T_CONSTANT]
     for e in range(orphans.size):
         if clique[orphans[e], tl.C_MARK] == state[tl.S_STAMP]:
             keep_leading(orphans[e], update[e], var, clique, lists, numbers, state)
@@ -53,9 +53,9 @@ def commit(graph: Graph, tree: Tree, affected: Affected, fronts: Fronts, ids: I6
         above = records[f, fr.PARENT]
         if above < 0:
             state[tl.S_ROOTS] += 1
-            account[tl.A_MODEL] += numbers[row[tl.C_UPDATE]]
+            totals[tl.T_MODEL] += numbers[row[tl.C_UPDATE]]
         else:
-            hang(c, ids[above], fronts.border_of[fronts.border_at[f]] - records[above, fr.VARIABLE], clique)
+            hang(c, ids[above], fronts.separator_of[fronts.separator_at[f]] - records[above, fr.VARIABLE], clique)
     for e in range(orphans.size):
         k = place[lowest[e]]
         hang(orphans[e], ids[home[k]], k - records[home[k], fr.VARIABLE], clique)
@@ -68,19 +68,19 @@ def commit(graph: Graph, tree: Tree, affected: Affected, fronts: Fronts, ids: I6
 @inline_kernel
 def nonzeros(row: I64) -> int:
     """Of R in the rows of a clique, zeros of joined columns among them."""
-    return row[tl.C_PIVOTS] * row[tl.C_BORDER] + row[tl.C_PIVOTS] * (row[tl.C_PIVOTS] + 1) // 2
+    return row[tl.C_PIVOTS] * row[tl.C_SEPARATOR_SCALARS] + row[tl.C_PIVOTS] * (row[tl.C_PIVOTS] + 1) // 2
 
 
 @part
-def add_constants(f0: int, f1: int, var: I64, fac: I64, link: I64, hessian: F64, account: F64) -> None:
+def add_constants(f0: int, f1: int, var: I64, fac: I64, link: I64, hessian: F64, totals: F64) -> None:
     """χ² of the factors f0 .. f1−1 that join fixed variables only."""
     for f in range(f0, f1):
         if not has_free(f, var, fac):
             i, j = fac[f, at.F_I], fac[f, at.F_J]
             dj = dim_of_variable(var, j) if j >= 0 else 0
             chi2 = hessian[link[f, tl.L_AT] + hessian_size(dim_of_variable(var, i), dj) - 1]
-            account[tl.A_CONSTANT] += chi2
-            account[tl.A_MODEL] += chi2
+            totals[tl.T_CONSTANT] += chi2
+            totals[tl.T_MODEL] += chi2
 
 
 @part
@@ -91,7 +91,7 @@ def keep_leading(c: int, update: I64, var: I64, clique: I64, lists: I64, numbers
     lost = row[tl.C_FRONTALS] - row[tl.C_FIRST]
     row[tl.C_FRONTALS] -= lost
     row[tl.C_SEPARATORS] += lost
-    row[tl.C_PIVOTS], row[tl.C_BORDER] = p, m
+    row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS] = p, m
     give_numbers(row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE], numbers, state)
     row[tl.C_UPDATE], row[tl.C_WIDTH_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = (
         update[UPDATE_AT],

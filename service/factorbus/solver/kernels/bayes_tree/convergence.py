@@ -1,7 +1,7 @@
 """Whether a step goes on, and what is left to do after it.  MATH §9.6."""
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.linearization_error import await_all
+from factorbus.solver.kernels.bayes_tree.linearization_error import mark_large_errors
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.bayes_tree.thresholds import LEAST_CHI2
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel
@@ -15,54 +15,61 @@ PASSED_OVER = 0.1  # of the Σ error² that is allowed: what may be left to fact
 
 
 @inline_kernel
-def goes_on(pull: float, settings: F64, state: I64, account: F64) -> bool:
-    """Whether what waits is relinearized and solved for again in the same step; pull: as `measure` gives it."""
+def goes_on(weighted_error: float, settings: F64, state: I64, totals: F64) -> bool:
+    """Whether what waits is relinearized and solved for again in the same step.
+
+    weighted_error: as `measure` gives it
+    """
     rounds = state[tl.S_ROUNDS]
     if state[tl.S_ONCE] != 0:
         return False
-    if account[tl.A_ERROR] > allowed(settings, state, account):
+    if totals[tl.T_ERROR] > allowed(settings, state, totals):
         return rounds < (settings[tl.P_MAX_ROUNDS] if state[tl.S_CONTINUES] != 0 else MOST_ROUNDS)
-    return state[tl.S_CONTINUES] == 0 and pull > settings[tl.P_SAME_STEP_SHARE] and rounds < settings[tl.P_MAX_ROUNDS]
+    return (
+        state[tl.S_CONTINUES] == 0
+        and weighted_error > settings[tl.P_SAME_STEP_SHARE]
+        and rounds < settings[tl.P_MAX_ROUNDS]
+    )
 
 
 @inline_kernel
-def await_bound(graph: Graph, tree: Tree, settings: F64) -> None:
+def mark_unconverged(graph: Graph, tree: Tree, settings: F64) -> None:
     """Where Σ error² is more than is allowed, all variables that have a part in it are relinearized next."""
-    state, account = tree.state, tree.account
-    most = allowed(settings, state, account)
-    if account[tl.A_ERROR] > most:
+    state, totals = tree.state, tree.totals
+    most = allowed(settings, state, totals)
+    if totals[tl.T_ERROR] > most:
         least = PASSED_OVER * most / state[tl.S_FACTORS]
-        await_all(least, graph.var, graph.fac, tree.node, tree.stiff, tree.pending, state)
+        mark_large_errors(least, graph, tree)
         state[tl.S_DUE] = 1
 
 
 @inline_kernel
-def allowed(settings: F64, state: I64, account: F64) -> float:
+def allowed(settings: F64, state: I64, totals: F64) -> float:
     """The Σ error² with which a step ends: what its report calls converged; FINISHED of χ² with nothing new."""
     if state[tl.S_CONTINUES] != 0:
-        return FINISHED * (account[tl.A_CHI2] + LEAST_CHI2)
-    return converged_error(settings, state, account)
+        return FINISHED * (totals[tl.T_CHI2] + LEAST_CHI2)
+    return converged_error(settings, state, totals)
 
 
 @inline_kernel
-def converged_error(settings: F64, state: I64, account: F64) -> float:
+def converged_error(settings: F64, state: I64, totals: F64) -> float:
     """The Σ error² up to which the step has converged.  (9.32)"""
-    chi2 = account[tl.A_CHI2] + LEAST_CHI2
+    chi2 = totals[tl.T_CHI2] + LEAST_CHI2
     share = settings[tl.P_CONVERGED] / max(state[tl.S_ROUNDS], 1)
-    return share * chi2 * (AFTER_LARGE_GAIN if account[tl.A_GAINED] > LARGE_GAIN * chi2 else 1.0)
+    return share * chi2 * (AFTER_LARGE_GAIN if totals[tl.T_GAINED] > LARGE_GAIN * chi2 else 1.0)
 
 
 @inline_kernel
-def note_after(settings: F64, state: I64, account: F64) -> None:
+def note_after(settings: F64, state: I64, totals: F64) -> None:
     """What is to be done after the step, and what the optimum is at least."""
-    chi2 = account[tl.A_CHI2]
-    account[tl.A_ALLOWED] = converged_error(settings, state, account)
+    chi2 = totals[tl.T_CHI2]
+    totals[tl.T_ALLOWED] = converged_error(settings, state, totals)
     state[tl.S_AFTER] = 0
-    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * account[tl.A_BEFORE] + LEAST_CHI2:
+    if not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * totals[tl.T_BEFORE] + LEAST_CHI2:
         state[tl.S_AFTER] += tl.WORSE
     if state[tl.S_RISES] != 0:
         state[tl.S_AFTER] += tl.ROSE
     if state[tl.S_RAISED] != 0:
         state[tl.S_AFTER] += tl.RAISED
     if state[tl.S_AFTER] == 0:
-        account[tl.A_LEAST] = max(chi2 - account[tl.A_ERROR], 0.0)
+        totals[tl.T_LEAST] = max(chi2 - totals[tl.T_ERROR], 0.0)

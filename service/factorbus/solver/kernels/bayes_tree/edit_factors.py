@@ -12,7 +12,7 @@ these factors, as if the factors were new there, and eliminates their cliques fr
 import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
-from factorbus.solver.kernels.bayes_tree.add_to_tree import next_incidence, stiffest_of
+from factorbus.solver.kernels.bayes_tree.add_to_tree import largest_diagonal_of, next_incidence
 from factorbus.solver.kernels.bayes_tree.affected import dim_of_variable, has_free
 from factorbus.solver.kernels.bayes_tree.factor_chi2 import chi2_of_factor, heading_of
 from factorbus.solver.kernels.bayes_tree.hessian import hessian_size, linearize_factor, weigh_factor
@@ -41,14 +41,14 @@ def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log
     var, fac = graph.var, graph.fac
     node = tree.node
     scalars = tree.scalars
-    moved, state, account = tree.moved, tree.state, tree.account
-    stiffest = 0.0
+    moved, state, totals = tree.moved, tree.state, tree.totals
+    largest_diagonal = 0.0
     for k in range(gone.size + renewed.size):
         f = gone[k] if k < gone.size else renewed[k - gone.size]
         for end in range(2):
             v = fac[f, at.F_I + end]
             if v >= 0:
-                stiffest = max(stiffest, stiffest_of(v, var, scalars))
+                largest_diagonal = max(largest_diagonal, largest_diagonal_of(v, var, scalars))
     # 1
     count = 0
     for k in range(gone.size):
@@ -62,13 +62,13 @@ def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log
             v = fac[f, at.F_I + end]
             if v >= 0:
                 sum_factors(graph, tree, v)
-                account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
+                totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(v, var, scalars))
                 note_moved(MODEL, v, node, moved, state)
-    if gone.size + renewed.size > 0 and stiffest >= account[tl.A_STIFFEST]:
-        account[tl.A_STIFFEST] = 0.0
+    if gone.size + renewed.size > 0 and largest_diagonal >= totals[tl.T_LARGEST_DIAGONAL]:
+        totals[tl.T_LARGEST_DIAGONAL] = 0.0
         for v in range(state[tl.S_VARIABLES]):
-            account[tl.A_STIFFEST] = max(account[tl.A_STIFFEST], stiffest_of(v, var, scalars))
-    account[tl.A_LEAST] = 0.0  # without a factor the optimum may be lower
+            totals[tl.T_LARGEST_DIAGONAL] = max(totals[tl.T_LARGEST_DIAGONAL], largest_diagonal_of(v, var, scalars))
+    totals[tl.T_LEAST] = 0.0  # without a factor the optimum may be lower
     state[tl.S_EDITED], state[tl.S_EDITED_AT] = state[tl.S_MOVED], state[tl.S_STEP] + 1
     return count if finite else -1 - count
 
@@ -77,18 +77,18 @@ def edit_factors(gone: I64, renewed: I64, graph_table: I64, tree_table: I64, log
 def detach_factor(graph: Graph, tree: Tree, f: int, log: I64, count: int) -> int:
     """Factor f counts no more; gives how many rows of the log are written then."""
     var, fac = graph.var, graph.fac
-    node, link, hessian, stiff, state = tree.node, tree.link, tree.hessian, tree.stiff, tree.state
-    account = tree.account
+    node, link, hessian, factor_errors, state = tree.node, tree.link, tree.hessian, tree.factor_errors, tree.state
+    totals = tree.totals
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     size = hessian_size(dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0)
     state[tl.S_HOLES] += size
     if link[f, tl.L_KIND] >= tl.EXACT:
         state[tl.S_EXACT] -= 1
         state[tl.S_INACTIVE] -= link[f, tl.L_KIND] - tl.EXACT
-    account[tl.A_CHI2] -= stiff[f, tl.B_CHI2]
-    account[tl.A_ERROR] -= stiff[f, tl.B_ERROR]
-    account[tl.A_COUNTED] -= stiff[f, tl.B_COUNTED]
-    account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + stiff[f, tl.B_ERROR]
+    totals[tl.T_CHI2] -= factor_errors[f, tl.E_CHI2]
+    totals[tl.T_ERROR] -= factor_errors[f, tl.E_ERROR]
+    totals[tl.T_COUNTED] -= factor_errors[f, tl.E_COUNTED]
+    totals[tl.T_ADDED_UP] += factor_errors[f, tl.E_CHI2] + factor_errors[f, tl.E_ERROR]
     count = unlink_incidence(2 * f, i, node, link, log, count)
     if j >= 0:
         count = unlink_incidence(2 * f + 1, j, node, link, log, count)
@@ -96,8 +96,8 @@ def detach_factor(graph: Graph, tree: Tree, f: int, log: I64, count: int) -> int
         done = unlink_own(f, i, node, link, log, count)
         return done if done > count or j < 0 else unlink_own(f, j, node, link, log, count)
     chi2 = hessian[link[f, tl.L_AT] + size - 1]
-    account[tl.A_CONSTANT] -= chi2
-    account[tl.A_MODEL] -= chi2
+    totals[tl.T_CONSTANT] -= chi2
+    totals[tl.T_MODEL] -= chi2
     return count
 
 
@@ -162,27 +162,27 @@ def renew_factors(renewed: I64, graph: Graph, tree: Tree) -> bool:
     var, fac = graph.var, graph.fac
     values = graph.values
     link, hessian = tree.link, tree.hessian
-    scalars, stiff, turns = tree.scalars, tree.stiff, tree.turns
-    state, account = tree.state, tree.account
+    scalars, factor_errors, turns = tree.scalars, tree.factor_errors, tree.turns
+    state, totals = tree.state, tree.totals
     scratch, finite = make_scratch(), True
     for k in range(renewed.size):
         f = renewed[k]
         i, j = fac[f, at.F_I], fac[f, at.F_J]
         di, dj = dim_of_variable(var, i), dim_of_variable(var, j) if j >= 0 else 0
         last = link[f, tl.L_AT] + hessian_size(di, dj) - 1
-        was, linear_was = stiff[f, tl.B_CHI2], hessian[last]
+        was, linear_was = factor_errors[f, tl.E_CHI2], hessian[last]
         if is_bounded(fac[f, at.F_KIND]):
             note_loss(f, fac, link, state)
         linearize_factor(graph, tree, f, scratch)
         weigh_factor(graph, tree, f, scratch)
         c, s = heading_of(i, var[i, at.V_KIND] == at.SE2, var, scalars[0], values, turns)
-        stiff[f, tl.B_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
-        account[tl.A_CHI2] += stiff[f, tl.B_CHI2] - was
-        account[tl.A_ADDED_UP] += stiff[f, tl.B_CHI2] + was
+        factor_errors[f, tl.E_CHI2], _, _ = chi2_of_factor(graph, tree, f, link[f, tl.L_KIND], c, s)
+        totals[tl.T_CHI2] += factor_errors[f, tl.E_CHI2] - was
+        totals[tl.T_ADDED_UP] += factor_errors[f, tl.E_CHI2] + was
         if not has_free(f, var, fac):
-            account[tl.A_CONSTANT] += hessian[last] - linear_was
-            account[tl.A_MODEL] += hessian[last] - linear_was
-        finite &= math.isfinite(hessian[last]) and math.isfinite(stiff[f, tl.B_CHI2])
+            totals[tl.T_CONSTANT] += hessian[last] - linear_was
+            totals[tl.T_MODEL] += hessian[last] - linear_was
+        finite &= math.isfinite(hessian[last]) and math.isfinite(factor_errors[f, tl.E_CHI2])
     return finite
 
 
@@ -199,7 +199,7 @@ def note_loss(f: int, fac: I64, link: I64, state: I64) -> None:
 def sum_factors(graph: Graph, tree: Tree, v: int) -> None:
     """What variable v has of its factors: the sum of the diagonals of their Hessians, and the largest lever."""
     var, fac = graph.var, graph.fac
-    node, link, hessian, scalars, stiff = tree.node, tree.link, tree.hessian, tree.scalars, tree.stiff
+    node, link, hessian, scalars, factor_errors = tree.node, tree.link, tree.hessian, tree.scalars, tree.factor_errors
     turns = tree.turns
     d, dim, lever = var[v, at.V_SCALAR], dim_of_variable(var, v), 0.0
     if d >= 0:
@@ -210,7 +210,7 @@ def sum_factors(graph: Graph, tree: Tree, v: int) -> None:
         f = slot // 2
         h = link[f, tl.L_AT]
         if slot % 2 == 0:
-            lever = max(lever, stiff[f, tl.B_LEVER] * stiff[f, tl.B_ROOT])
+            lever = max(lever, factor_errors[f, tl.E_LEVER] * factor_errors[f, tl.E_ROOT])
         else:
             di = dim_of_variable(var, fac[f, at.F_I])
             h += di * di + di * dim

@@ -163,7 +163,7 @@ def cut_subtrees(records: I64, workers: int) -> I64:
     takes, first = np.zeros(count), np.arange(count)  # with all below
     total = 0.0
     for f in range(count):
-        scalars = records[f, fr.PIVOTS] + records[f, fr.BORDER] + 1
+        scalars = records[f, fr.PIVOTS] + records[f, fr.SEPARATOR] + 1
         own = (records[f, fr.PIVOTS] + ASSEMBLY) * scalars * scalars + BOOKKEEPING
         takes[f] += own
         total += own
@@ -223,7 +223,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
     var, fac = graph.var, graph.fac
     node, clique, lists, numbers = tree.node, tree.clique, tree.lists, tree.numbers
     scalars, stamp = tree.scalars, tree.state[tl.S_STAMP]
-    noise = ROUNDING * tree.account[tl.A_STIFFEST]
+    noise = ROUNDING * tree.totals[tl.T_LARGEST_DIAGONAL]
     ids, records = ints(plan, IDS), int_rows(plan, RECORDS)
     orphans, update = ints(plan, ORPHANS), int_rows(plan, UPDATE)
     first_factor, factor_of = ints(plan, FIRST_FACTOR), ints(plan, FACTORS)
@@ -233,7 +233,7 @@ def eliminate_range(plan: I64, begin: int, end: int, t: int, queue: I64) -> tupl
     flops = 0
     for f in range(begin, end):
         row = clique[ids[f]]
-        p, m, front = row[tl.C_PIVOTS], row[tl.C_BORDER], front_of_clique(row)
+        p, m, front = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], front_of_clique(row)
         number_columns(row, noise, var, node, lists, scalars, column, floors)
         clear_front(numbers, front)
         anchored = 0

@@ -39,19 +39,19 @@ def eliminate_again(
 ) -> tuple[float, int]:
     """Steps 3 to 9; gives Σ error² as `measure` does, and the status."""
     node, link, clique, lists, numbers = tree.node, tree.link, tree.clique, tree.lists, tree.numbers
-    state, account = tree.state, tree.account
+    state, totals = tree.state, tree.totals
     # 3
     now = cycles()
     touched = find_touched(graph, tree, new, moving, settings)
     cliques, orphans, variables, renewed = touched.cliques, touched.orphans, touched.variables, touched.renewed
     if variables.size == 0 and renewed.size == 0:
-        add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, account)
+        add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, totals)
         return substitute_and_measure(graph, tree, renewed[:0], renewed[:0], settings)
     now = lap(now, tl.MARK, state)
     old = np.empty((renewed.size, tl.C_WIDTH), np.int64)
     if renewed.size > 0:
         # Before the others, who take in their update matrices.
-        status = renew(graph, tree, renewed, variables.size, account[tl.A_STIFFEST], old, queue)
+        status = renew(graph, tree, renewed, variables.size, totals[tl.T_LARGEST_DIAGONAL], old, queue)
         if status != tl.DONE:
             return 0.0, status
     now = lap(now, tl.ELIMINATE, state)
@@ -86,10 +86,10 @@ def eliminate_again(
     now = lap(now, tl.ELIMINATE, state)
     # 7
     commit(graph, tree, affected, fronts, ids, lowest, update)
-    tops = commit_renewed(renewed, old, clique, numbers, state, account)
-    add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, account)
+    tops = commit_renewed(renewed, old, clique, numbers, state, totals)
+    add_constants(state[tl.S_TAKEN], new.f1, graph.var, graph.fac, link, tree.hessian, totals)
     if state[tl.S_EDITED] != 0:
-        rescale(new.f1, settings, account)
+        rescale(new.f1, settings, totals)
     if moving.size > 0:
         note_relinearized(moving, state[tl.S_FLOPS] - flops, node, state)
     lap(now, tl.COMMIT, state)
@@ -156,7 +156,7 @@ def find_loose_end(var: I64, moved: I64, state: I64) -> int:
 @inline_kernel
 def substitute_and_measure(graph: Graph, tree: Tree, tops: I64, ids: I64, settings: F64) -> tuple[float, int]:
     """Steps 8 and 9, from the renewed cliques `tops` and the new ones `ids`, or from all roots."""
-    node, clique, state, account = tree.node, tree.clique, tree.state, tree.account
+    node, clique, state, totals = tree.node, tree.clique, tree.state, tree.totals
     now = cycles()
     if state[tl.S_CONTINUES] != 0:
         begins = list_all_roots(node, clique, state)
@@ -166,13 +166,13 @@ def substitute_and_measure(graph: Graph, tree: Tree, tops: I64, ids: I64, settin
             begins[k] = tops[k] if k < tops.size else ids[k - tops.size]
     quiet = QUIET * settings[tl.P_RELINEARIZE_THRESHOLD]
     substitute(graph, tree, begins, settings[tl.P_WILDFIRE_THRESHOLD], quiet, tree.marked)
-    account[tl.A_CHI2] += account[tl.A_ADDED]
-    account[tl.A_BEFORE] += account[tl.A_ADDED]
-    account[tl.A_ADDED_UP] += account[tl.A_ADDED]
-    account[tl.A_ADDED] = 0.0
-    pull = measure(graph, tree, settings)
+    totals[tl.T_CHI2] += totals[tl.T_ADDED]
+    totals[tl.T_BEFORE] += totals[tl.T_ADDED]
+    totals[tl.T_ADDED_UP] += totals[tl.T_ADDED]
+    totals[tl.T_ADDED] = 0.0
+    weighted_error = measure(graph, tree, settings)
     lap(now, tl.SUBSTITUTE, state)
-    return pull, tl.DONE
+    return weighted_error, tl.DONE
 
 
 @part

@@ -85,23 +85,23 @@ def lever_error_of(root: float, d: float, phi: float, shift: float) -> float:
 
 @part
 def add_sighting(
-    kind: int, lever_error: float, root: float, d: float, shift: float, pull: float
+    kind: int, lever_error: float, root: float, d: float, shift: float, gradient: float
 ) -> tuple[float, float]:  # fmt: skip
     """The lever error, with what (9.5) has beside (9.4), and the shift error (9.12) of an observation of a landmark,
-    with √ω |r| as |Ω r| / √ω; pull is |Ω r|.  Of all other kinds the lever error, and 0.
+    with √ω |r| as |Ω r| / √ω; gradient is |Ω r|.  Of all other kinds the lever error, and 0.
     """
     if d > 0.0:
         if kind == at.BEARING_RANGE_SE2:
             return lever_error + root * shift * shift / d, 0.0
         if kind == at.LANDMARK_SE2 or kind == at.LANDMARK_SE3:
-            return lever_error, (pull / root + root * shift) * shift / d
+            return lever_error, (gradient / root + root * shift) * shift / d
     return lever_error, 0.0
 
 
 @inline_kernel
-def shift_error_weight(root: float, d: float, stiff_turn: float) -> float:
+def shift_error_weight(root: float, d: float, turn_information: float) -> float:
     """√ω / √(d² + ω_θ/ω) of poses: times |r(x)| and |sⱼ − sᵢ| it is (9.13)."""
-    return root / math.sqrt(d * d + stiff_turn / (root * root)) if root > 0.0 else 0.0
+    return root / math.sqrt(d * d + turn_information / (root * root)) if root > 0.0 else 0.0
 
 
 @inline_kernel
@@ -114,9 +114,9 @@ def turn_between(i: int, j: int, values: F64, lin: F64) -> float:
 
 
 @inline_kernel
-def turn_error(phi: float, psi: float, stiff_turn: float) -> float:
-    """(9.26), the first pose turned by phi; stiff_turn is ω_θ of the angle."""
-    return math.sqrt(stiff_turn) * psi * (0.5 * phi + psi * psi / 24.0)
+def turn_error(phi: float, psi: float, turn_information: float) -> float:
+    """(9.26), the first pose turned by phi; turn_information is ω_θ of the angle."""
+    return math.sqrt(turn_information) * psi * (0.5 * phi + psi * psi / 24.0)
 
 
 @inline_kernel

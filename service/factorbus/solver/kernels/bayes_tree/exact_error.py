@@ -58,19 +58,19 @@ def force_of(v: int, dim: int, p: int, var: I64, payload: F64, r: F64, J: F64, J
         return 0.0
     total = 0.0
     for c in range(dim_of(var[v, at.V_KIND])):
-        turned = stiff = 0.0
+        turned = diagonal = 0.0
         q = p
         for a in range(dim):
             for b in range(a, dim):
                 w = payload[q]
                 q += 1
                 turned += (J_now[a, c] - J[a, c]) * w * r[b]
-                stiff += J_now[a, c] * w * J_now[b, c]
+                diagonal += J_now[a, c] * w * J_now[b, c]
                 if b > a:
                     turned += (J_now[b, c] - J[b, c]) * w * r[a]
-                    stiff += J_now[a, c] * w * J_now[b, c]
-        if stiff > 0.0:
-            total += turned * turned / stiff
+                    diagonal += J_now[a, c] * w * J_now[b, c]
+        if diagonal > 0.0:
+            total += turned * turned / diagonal
     return total
 
 

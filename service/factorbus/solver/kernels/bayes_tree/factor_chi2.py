@@ -28,9 +28,9 @@ def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: flo
     space the rotation's share of χ².  kind: its `L_KIND`; c, s: cosine and sine of its first, plane pose.
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
-    stiff = tree.stiff
+    factor_errors = tree.factor_errors
     if kind == at.BETWEEN_SE2:
-        return between_se2_chi2(f, c, s, var, fac, values, payload, stiff)
+        return between_se2_chi2(f, c, s, var, fac, values, payload, factor_errors)
     if kind == at.LANDMARK_SE2:
         return landmark_se2_chi2(f, c, s, var, fac, values, payload), 0.0, 0.0
     if kind == at.BETWEEN_SE3:
@@ -40,7 +40,7 @@ def chi2_of_factor(graph: Graph, tree: Tree, f: int, kind: int, c: float, s: flo
 
 @inline_kernel
 def between_se2_chi2(
-    f: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, stiff: F64
+    f: int, c: float, s: float, var: I64, fac: I64, values: F64, payload: F64, factor_errors: F64
 ) -> tuple[float, float, float]:
     """(3.2).  Where Ω is that of a disc and of an angle apart, the frame of the measurement does not matter."""
     x, y, k = var[fac[f, at.F_I], at.V_AT], var[fac[f, at.F_J], at.V_AT], fac[f, at.F_AT]
@@ -48,7 +48,7 @@ def between_se2_chi2(
     ex, ey = c * tx + s * ty - load(payload, k), c * ty - s * tx - load(payload, k + 1)
     turn = wrap(load(values, y + 2) - load(values, x + 2) - load(payload, k + 2))
     gap = ex * ex + ey * ey
-    if stiff[f, tl.B_ROUND] != 0.0:
+    if factor_errors[f, tl.E_ISOTROPIC] != 0.0:
         return load(payload, k + 3) * gap + load(payload, k + 8) * turn * turn, gap, 0.0
     cz, sz = math.cos(load(payload, k + 2)), math.sin(load(payload, k + 2))
     rx, ry = cz * ex + sz * ey, cz * ey - sz * ex
@@ -124,6 +124,6 @@ def heading_of(v: int, planar: bool, var: I64, delta: F64, values: F64, turns: F
 
 
 @inline_kernel
-def is_round(kind: int, k: int, p: F64) -> bool:
+def is_isotropic(kind: int, k: int, p: F64) -> bool:
     """Whether the information of a relative plane pose, behind its measurement at k, is that of a disc and an angle."""
     return kind == at.BETWEEN_SE2 and p[k + 3] == p[k + 6] and p[k + 4] == 0.0 and p[k + 5] == 0.0 and p[k + 7] == 0.0

@@ -22,7 +22,7 @@ from factorbus.solver.kernels.sparse.symbolic import (
     count_rows,
     elimination_tree,
     join_columns,
-    list_borders,
+    list_separators,
     make_records,
 )
 
@@ -38,8 +38,8 @@ def analyze_affected(n: int, perm: I64, affected: I64, var: I64, rows: I64, cols
     variables, scalars = count_rows(n, begin, earlier, parent, dim)
     order, home, tops, records = join_fronts(n, perm, parent, dim, scalars, affected, var, label)
     begin, earlier = by_later(n, label, rows, cols)
-    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
-    return Fronts(order, label, home, records, border_at, border_of)
+    separator_at, separator_of = list_separators(n, begin, earlier, home, tops, variables, records)
+    return Fronts(order, label, home, records, separator_at, separator_of)
 
 
 @part
@@ -100,27 +100,27 @@ def update_layout(m: int) -> tuple:
 def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
     """A record, a list and blocks for every front; gives (ids, whether there was room).  Without it none is taken."""
     clique, lists, numbers, state = tree.clique, tree.lists, tree.numbers, tree.state
-    records, order, border_at, border_of = fronts.records, fronts.order, fronts.border_at, fronts.border_of
+    records, order, separator_at, separator_of = fronts.records, fronts.order, fronts.separator_at, fronts.separator_of
     count = len(records)
     ids, n = np.empty(count, np.int64), order.size
-    if not fronts_fit(records, border_at, n, clique, lists, numbers, state):
+    if not fronts_fit(records, separator_at, n, clique, lists, numbers, state):
         return ids, False
     for f in range(count):
         c = take_clique(clique, state)
         ids[f] = c
-        p, m = records[f, fr.PIVOTS], records[f, fr.BORDER]
+        p, m = records[f, fr.PIVOTS], records[f, fr.SEPARATOR]
         first = records[f, fr.VARIABLE]
         last = records[f + 1, fr.VARIABLE] if f + 1 < count else n
         row = clique[c]
-        row[tl.C_FRONTALS], row[tl.C_SEPARATORS] = last - first, border_at[f + 1] - border_at[f]
-        row[tl.C_PIVOTS], row[tl.C_BORDER] = p, m
+        row[tl.C_FRONTALS], row[tl.C_SEPARATORS] = last - first, separator_at[f + 1] - separator_at[f]
+        row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS] = p, m
         start, row[tl.C_LIST_SIZE] = take_list(row[tl.C_FRONTALS] + row[tl.C_SEPARATORS], lists, state)
         row[tl.C_LIST] = start
         for k in range(first, last):
             lists[start] = affected[order[k]]
             start += 1
-        for e in range(border_at[f], border_at[f + 1]):
-            lists[start] = affected[order[border_of[e]]]
+        for e in range(separator_at[f], separator_at[f + 1]):
+            lists[start] = affected[order[separator_of[e]]]
             start += 1
         lead, row[tl.C_LD], used, size = row_layout(p, m)
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
@@ -134,13 +134,13 @@ def place_fronts(tree: Tree, fronts: Fronts, affected: I64) -> tuple:
 
 
 @part
-def fronts_fit(records: I64, border_at: I64, n: int, clique: I64, lists: I64, numbers: F64, state: I64) -> bool:
+def fronts_fit(records: I64, separator_at: I64, n: int, clique: I64, lists: I64, numbers: F64, state: I64) -> bool:
     """Whether the arenas have room behind what is in use for all fronts; else `state` says what is needed."""
     count, listed, doubles = len(records), 0, 0
     for f in range(count):
-        p, m = records[f, fr.PIVOTS], records[f, fr.BORDER]
+        p, m = records[f, fr.PIVOTS], records[f, fr.SEPARATOR]
         last = records[f + 1, fr.VARIABLE] if f + 1 < count else n
-        listed += size_class(last - records[f, fr.VARIABLE] + border_at[f + 1] - border_at[f])[1]
+        listed += size_class(last - records[f, fr.VARIABLE] + separator_at[f + 1] - separator_at[f])[1]
         doubles += size_class(row_layout(p, m)[3])[1] + size_class(update_layout(m)[1])[1]
     cliques = state[tl.S_CLIQUES] + count
     listed += state[tl.S_LISTS]

@@ -4,7 +4,7 @@ import math
 
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.error_terms import lever_of, root_weight, shift_error_weight
-from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_round
+from factorbus.solver.kernels.bayes_tree.factor_chi2 import is_isotropic
 from factorbus.solver.kernels.bayes_tree.records import Tree
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
 from factorbus.solver.kernels.jit.simd import Panel, put, six
@@ -26,21 +26,21 @@ def hessian_size(di: int, dj: int) -> int:
 @part
 def linearize_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     """Write the Hessian of factor f at the linearization points, and what its shift error depends on there."""
-    kind, hessian, stiff, h = graph.fac[f, at.F_KIND], tree.hessian, tree.stiff, tree.link[f, tl.L_AT]
+    kind, hessian, factor_errors, h = graph.fac[f, at.F_KIND], tree.hessian, tree.factor_errors, tree.link[f, tl.L_AT]
     more = evaluate_apart(f, graph.var, graph.fac, tree.lin[0], graph.payload, scratch.r, scratch.H[0], scratch.H[1])
     # Sizes as constants, so that each call becomes straight code.
     if kind == at.BETWEEN_SE2:
         _write(graph, tree, f, 3, 3, 3, more, scratch)
-        stiff[f, tl.B_TURN] = hessian[h + 9 + 9 + 8]
+        factor_errors[f, tl.E_TURN] = hessian[h + 9 + 9 + 8]
     elif kind == at.LANDMARK_SE2 or kind == at.BEARING_RANGE_SE2:
         _write(graph, tree, f, 2, 3, 2, more, scratch)
-        stiff[f, tl.B_PULL] = gradient_norm(2, h + 9 + 6 + 4, hessian)
+        factor_errors[f, tl.E_SHIFT] = gradient_norm(2, h + 9 + 6 + 4, hessian)
     elif kind == at.BETWEEN_SE3:
         _write_between_se3(graph, tree, f, more, scratch)
-        stiff[f, tl.B_TURN] = hessian[h + 36 + 36 + 35]
+        factor_errors[f, tl.E_TURN] = hessian[h + 36 + 36 + 35]
     elif kind == at.LANDMARK_SE3:
         _write(graph, tree, f, 3, 6, 3, more, scratch)
-        stiff[f, tl.B_PULL] = gradient_norm(3, h + 36 + 18 + 9, hessian)
+        factor_errors[f, tl.E_SHIFT] = gradient_norm(3, h + 36 + 18 + 9, hessian)
     else:
         _write_other(graph, tree, f, more, scratch)
         if is_camera(kind):
@@ -166,7 +166,7 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
     scratch.W holds its information, as `linearize_factor` left it.
     """
     var, fac, payload = graph.var, graph.fac, graph.payload
-    link, hessian, scalars, stiff, turns = tree.link, tree.hessian, tree.scalars, tree.stiff, tree.turns
+    link, hessian, scalars, factor_errors, turns = tree.link, tree.hessian, tree.scalars, tree.factor_errors, tree.turns
     kind, h = fac[f, at.F_KIND], link[f, tl.L_AT]
     i, j = fac[f, at.F_I], fac[f, at.F_J]
     di = dim_of(var[i, at.V_KIND])
@@ -183,7 +183,7 @@ def weigh_factor(graph: Graph, tree: Tree, f: int, scratch: Scratch) -> None:
         if s >= 0:
             for a in range(dj):
                 scalars[1, s + a] += hessian[h + di * di + di * dj + a * dj + a]
-    stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT] = distance, root
+    factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT] = distance, root
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        stiff[f, tl.B_PULL] = shift_error_weight(root, distance, stiff[f, tl.B_TURN])
-    stiff[f, tl.B_ROUND] = 1.0 if is_round(kind, fac[f, at.F_AT], payload) else 0.0
+        factor_errors[f, tl.E_SHIFT] = shift_error_weight(root, distance, factor_errors[f, tl.E_TURN])
+    factor_errors[f, tl.E_ISOTROPIC] = 1.0 if is_isotropic(kind, fac[f, at.F_AT], payload) else 0.0

@@ -29,9 +29,9 @@ N_NEAR = 12  # the last elimination that looked whether to bring it near the roo
 N_RING = 13  # and the ring in which it did so; 0: the outermost; −1: it did not
 N_WIDTH = 16
 
-# Columns of `stiff`: d, √ω, |Ω r| or what (9.13) is by the shift and |r|, ω_θ, 1 for an Ω of a disc and an angle; χ² at
-# the estimate, error² in full, and as it counts.
-B_LEVER, B_ROOT, B_PULL, B_TURN, B_ROUND, B_CHI2, B_ERROR, B_COUNTED, B_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# Columns of `factor_errors`: d, √ω, |Ω r| or what (9.13) is by the shift and |r|, ω_θ, 1 for a translation whose Ω is
+# isotropic and not coupled to the angle; χ² at the estimate, error² in full, and as it counts.
+E_LEVER, E_ROOT, E_SHIFT, E_TURN, E_ISOTROPIC, E_CHI2, E_ERROR, E_COUNTED, E_WIDTH = 0, 1, 2, 3, 4, 5, 6, 7, 8
 
 # Columns of `turns`.
 U_LEVER, U_COS, U_SIN, U_WIDTH = 0, 1, 2, 4
@@ -62,7 +62,7 @@ C_PARENT = 7  # -1: a root
 C_FIRST = 8  # the first place touched by the elimination C_MARK; -1: not solved yet
 C_ANCHORED = 9  # 1: a factor in it or below says where in the world its variables are
 C_MOVES = 10  # 1: it has moved as a whole since it was solved
-C_BORDER = 11  # m
+C_SEPARATOR_SCALARS = 11  # m
 C_ROWS = 12  # column j of row i of R is at ROWS + i · LD + j
 C_LD = 13
 C_UPDATE = 14  # column j of row i of U is at UPDATE + update_row(i, WIDTH_UPDATE) + j, see `fronts`
@@ -98,7 +98,7 @@ S_NEED_CLIQUES = 11  # what the last call lacked
 S_NEED_LISTS = 12
 S_NEED_NUMBERS = 13
 S_FAILED = 14  # variable whose pivot failed, or -1
-# The account of the last step, from S_REPORT_BEGIN to before S_REPORT_END.
+# The report of the last step, from S_REPORT_BEGIN to before S_REPORT_END.
 S_REPORT_BEGIN = 15
 S_NONZEROS = 15  # of R, doubles of rows on and above the diagonal
 S_INACTIVE = 16  # observations that had no pixel where they were linearized
@@ -181,20 +181,20 @@ P_SIZE = 23
 PHASES = ("linearize", "mark", "order", "symbolic", "eliminate", "commit", "substitute")
 LINEARIZE, MARK, ORDER, SYMBOLIC, ELIMINATE, COMMIT, SUBSTITUTE = range(7)
 
-# Entries of `account`.
-A_MODEL = 0  # χ² of the linear problem at its solution
-A_CHI2 = 1  # χ² at the estimate
-A_CONSTANT = 2  # in A_MODEL: χ² of factors between fixed variables
-A_ERROR = 3  # Σ error² of all factors, which bounds what a Gauss–Newton step would take off χ²
-A_ALLOWED = 4  # the Σ error² up to which the last step has converged, (9.32)
-A_BEFORE = 5  # χ² at the estimate before the step, new factors and first values of new variables included
-A_ADDED = 6  # of that: of the new factors
-A_LEFT = 7  # by how much back-substitution left something undone, σ², the largest of all scalars
-A_ADDED_UP = 8  # what A_CHI2 and A_ERROR have gained and lost since they were summed
-A_COUNTED = 9  # Σ error² as it counts for what is relinearized
-A_STIFFEST = 10  # the largest sum of the diagonals of Hessians of any scalar,
-A_STIFFEST_BEFORE = 11  # and before the step
-A_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
-A_GAINED = 13  # by how much a round of the last step lowered χ², or all of it, at most
-A_UNIT = 14  # (9.6), as it was before the step
-A_SIZE = 15
+# Entries of `totals`.
+T_MODEL = 0  # χ² of the linear problem at its solution
+T_CHI2 = 1  # χ² at the estimate
+T_CONSTANT = 2  # in T_MODEL: χ² of factors between fixed variables
+T_ERROR = 3  # Σ error² of all factors, which bounds what a Gauss–Newton step would take off χ²
+T_ALLOWED = 4  # the Σ error² up to which the last step has converged, (9.32)
+T_BEFORE = 5  # χ² at the estimate before the step, new factors and first values of new variables included
+T_ADDED = 6  # of that: of the new factors
+T_LEFT = 7  # by how much back-substitution left something undone, σ², the largest of all scalars
+T_ADDED_UP = 8  # what T_CHI2 and T_ERROR have gained and lost since they were summed
+T_COUNTED = 9  # Σ error² as it counts for what is relinearized
+T_LARGEST_DIAGONAL = 10  # the largest sum of the diagonals of Hessians of any scalar,
+T_LARGEST_DIAGONAL_BEFORE = 11  # and before the step
+T_LEAST = 12  # what the optimum's χ² cannot be below, (9.29)
+T_GAINED = 13  # by how much a round of the last step lowered χ², or all of it, at most
+T_UNIT = 14  # (9.6), as it was before the step
+T_SIZE = 15

@@ -31,7 +31,7 @@ from factorbus.solver.kernels.model import layout as at
 from factorbus.solver.kernels.model.kinds import is_bounded
 from factorbus.solver.kernels.model.records import Graph
 
-LEAST_BURDEN = 0.02
+LEAST_REQUIRED_SHARE = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
 MUCH = 8  # where more than one variable in so many has moved, all factors are gone through
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
@@ -49,19 +49,23 @@ def measure(graph: Graph, tree: Tree, settings: F64) -> float:
     Gives Σ error² of what waits, as a multiple of (9.22).
     """
     var = graph.var
-    stiff, pending, state, account = tree.stiff, tree.pending, tree.state, tree.account
+    factor_errors, pending, state, totals = tree.factor_errors, tree.pending, tree.state, tree.totals
     if state[tl.S_PENDING] == 0:
         state[tl.S_WAITING] = state[tl.S_STEP]
     most = 0.0
     if state[tl.S_MOVED] > 0:
         most = evaluate_moved(graph, tree, settings[tl.P_RELINEARIZE_THRESHOLD])
-        if not account[tl.A_ADDED_UP] <= CANCELLED * (account[tl.A_CHI2] + NOTHING):
-            sum_anew(stiff, state, account)
-    scaled = weighed(account[tl.A_COUNTED], settings, var, pending, state)
+        if not totals[tl.T_ADDED_UP] <= CANCELLED * (totals[tl.T_CHI2] + NOTHING):
+            sum_anew(factor_errors, state, totals)
+    weighted_error = weigh_error(totals[tl.T_COUNTED], settings, var, pending, state)
     waited = state[tl.S_STEP] - state[tl.S_WAITING]
-    if scaled > settings[tl.P_NEXT_STEP_SHARE] or most > settings[tl.P_MAX_ERROR] or waited >= settings[tl.P_MAX_WAIT]:
+    if (
+        weighted_error > settings[tl.P_NEXT_STEP_SHARE]
+        or most > settings[tl.P_MAX_ERROR]
+        or waited >= settings[tl.P_MAX_WAIT]
+    ):
         state[tl.S_DUE] = 1
-    return scaled
+    return weighted_error
 
 
 @part
@@ -72,9 +76,9 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
     """
     var, fac, values = graph.var, graph.fac, graph.values
     node, link, scalars, turns, moved = tree.node, tree.link, tree.scalars, tree.turns, tree.moved
-    state, account = tree.state, tree.account
+    state, totals = tree.state, tree.totals
     delta, most = scalars[0], 0.0
-    chi2, sizes, full, counted = account[tl.A_CHI2], account[tl.A_ADDED_UP], account[tl.A_ERROR], account[tl.A_COUNTED]
+    chi2, sizes, full, counted = totals[tl.T_CHI2], totals[tl.T_ADDED_UP], totals[tl.T_ERROR], totals[tl.T_COUNTED]
     if state[tl.S_MOVED] * MUCH > state[tl.S_VARIABLES]:
         last, c, s = -1, 1.0, 0.0
         for f in range(state[tl.S_FACTORS]):
@@ -106,8 +110,8 @@ def evaluate_moved(graph: Graph, tree: Tree, threshold: float) -> float:
                     most, chi2, sizes = max(most, error), chi2 + more, sizes + size
                     full, counted = full + more_full, counted + more_counted
                 slot = next_incidence(slot, link)
-    account[tl.A_CHI2], account[tl.A_ADDED_UP] = chi2, sizes
-    account[tl.A_ERROR], account[tl.A_COUNTED] = max(full, 0.0), max(counted, 0.0)
+    totals[tl.T_CHI2], totals[tl.T_ADDED_UP] = chi2, sizes
+    totals[tl.T_ERROR], totals[tl.T_COUNTED] = max(full, 0.0), max(counted, 0.0)
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = STAYED
     state[tl.S_MOVED] = 0
@@ -133,7 +137,7 @@ def evaluate_factor(
     full and as it counts is more.
     """
     var, fac, values, payload = graph.var, graph.fac, graph.values, graph.payload
-    node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
+    node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     lin, delta, error, full = tree.lin[0], tree.scalars[0], 0.0, 0.0
     kind, second = fac[f, at.F_KIND], fac[f, at.F_J]
     if not is_bounded(kind) or kind == at.PRIOR_SE3 or fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS:
@@ -145,18 +149,18 @@ def evaluate_factor(
             full = min(error + force, MOST_ERROR)
             full = ROBUST * full if fac[f, at.F_FLAGS] >> at.LOSS_SHIFT != at.NO_LOSS else full
             if error > threshold:
-                await_ends(f, fac, var, node, pending, state)
+                mark_ends_pending(f, fac, var, node, pending, state)
     else:
         chi2, gap, turned = chi2_of_factor(graph, tree, f, kind, c, s)
         if second >= 0 and how == MODEL:
             error, full = error_of(graph, tree, f, v, threshold, gap, chi2, turned)
-    was = stiff[f, tl.B_CHI2]
-    stiff[f, tl.B_CHI2] = chi2
+    was = factor_errors[f, tl.E_CHI2]
+    factor_errors[f, tl.E_CHI2] = chi2
     if how < MODEL:
         return error, chi2 - was, chi2 + was, 0.0, 0.0
     full, counted = full * full, error * error if error > threshold else 0.0
-    full_before, counted_before = stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED]
-    stiff[f, tl.B_ERROR], stiff[f, tl.B_COUNTED] = full, counted
+    full_before, counted_before = factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED]
+    factor_errors[f, tl.E_ERROR], factor_errors[f, tl.E_COUNTED] = full, counted
     size = chi2 + was + full + full_before
     return error, chi2 - was, size, full - full_before, counted - counted_before
 
@@ -169,17 +173,17 @@ def error_of(
     that is more than `relinearize_threshold`, v waits.  (9.4), (9.5), (9.12), (9.13), (9.26)
     """
     var, values, kind, second = graph.var, graph.values, graph.fac[f, at.F_KIND], graph.fac[f, at.F_J]
-    node, stiff, pending, state = tree.node, tree.stiff, tree.pending, tree.state
+    node, factor_errors, pending, state = tree.node, tree.factor_errors, tree.pending, tree.state
     lin, delta = tree.lin[0], tree.scalars[0]
     x, y, planar, free = var[v, at.V_AT], var[second, at.V_AT], var[v, at.V_KIND] == at.SE2, var[v, at.V_COLUMN] >= 0
     phi = turn_of(var[v, at.V_KIND], delta, var[v, at.V_SCALAR]) if free else 0.0
-    d, root, shift = stiff[f, tl.B_LEVER], stiff[f, tl.B_ROOT], shift_between(planar, x, y, values, lin)
+    d, root, shift = factor_errors[f, tl.E_LEVER], factor_errors[f, tl.E_ROOT], shift_between(planar, x, y, values, lin)
     lever_error = lever_error_of(root, d, phi, shift)
     if kind == at.BETWEEN_SE2 or kind == at.BETWEEN_SE3:
-        shift_error, force = stiff[f, tl.B_PULL] * math.sqrt(gap) * shift, 0.0
+        shift_error, force = factor_errors[f, tl.E_SHIFT] * math.sqrt(gap) * shift, 0.0
         if kind == at.BETWEEN_SE3:
             psi = turn_between(x, y, values, lin)
-            lever_error += turn_error(phi, psi, stiff[f, tl.B_TURN])
+            lever_error += turn_error(phi, psi, factor_errors[f, tl.E_TURN])
             force = FORCE * (phi * math.sqrt(chi2) + psi * math.sqrt(max(turned, 0.0)))
         full, error = (
             min(lever_error + shift_error + force, MOST_ERROR),
@@ -187,36 +191,36 @@ def error_of(
         )
         both = LINKS * shift_error > lever_error
     else:
-        lever_error, shift_error = add_sighting(kind, lever_error, root, d, shift, stiff[f, tl.B_PULL])
+        lever_error, shift_error = add_sighting(kind, lever_error, root, d, shift, factor_errors[f, tl.E_SHIFT])
         full = error = min(SEEN * (lever_error + shift_error), MOST_ERROR)
         both = kind == at.BEARING_RANGE_SE2 or shift_error > lever_error
     if error > threshold:
         if free:
-            await_move(v, node, pending, state)
+            mark_pending(v, node, pending, state)
         if (both or not free) and var[second, at.V_COLUMN] >= 0:
-            await_move(second, node, pending, state)
+            mark_pending(second, node, pending, state)
     return error, full
 
 
 @part
-def await_all(least: float, var: I64, fac: I64, node: I64, stiff: F64, pending: I64, state: I64) -> None:
+def mark_large_errors(least: float, graph: Graph, tree: Tree) -> None:
     """The variables of all factors whose error² in full is more than `least` wait."""
-    for f in range(state[tl.S_FACTORS]):
-        if stiff[f, tl.B_ERROR] > least:
-            await_ends(f, fac, var, node, pending, state)
+    for f in range(tree.state[tl.S_FACTORS]):
+        if tree.factor_errors[f, tl.E_ERROR] > least:
+            mark_ends_pending(f, graph.fac, graph.var, tree.node, tree.pending, tree.state)
 
 
 @inline_kernel
-def await_ends(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
+def mark_ends_pending(f: int, fac: I64, var: I64, node: I64, pending: I64, state: I64) -> None:
     """The variables of factor f that are free are to be relinearized."""
     for end in range(2):
         v = fac[f, at.F_I + end]
         if v >= 0 and var[v, at.V_COLUMN] >= 0:
-            await_move(v, node, pending, state)
+            mark_pending(v, node, pending, state)
 
 
 @inline_kernel
-def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
+def mark_pending(v: int, node: I64, pending: I64, state: I64) -> None:
     """Variable v is to be relinearized."""
     if node[v, tl.N_FLAGS] == 0:
         node[v, tl.N_FLAGS] = WAITS
@@ -225,39 +229,39 @@ def await_move(v: int, node: I64, pending: I64, state: I64) -> None:
 
 
 @inline_kernel
-def weighed(total: float, settings: F64, var: I64, pending: I64, state: I64) -> float:
+def weigh_error(total: float, settings: F64, var: I64, pending: I64, state: I64) -> float:
     """Σ error² as a multiple of what it has to be worth, (9.22)."""
-    if total <= LEAST_BURDEN * min(settings[tl.P_NEXT_STEP_SHARE], settings[tl.P_SAME_STEP_SHARE]):
+    if total <= LEAST_REQUIRED_SHARE * min(settings[tl.P_NEXT_STEP_SHARE], settings[tl.P_SAME_STEP_SHARE]):
         return 0.0
-    scalars, dearest = 0, 1.0
+    scalars, highest_cost = 0, 1.0
     for k in range(state[tl.S_PENDING]):
         scalars += dim_of_variable(var, pending[k])
-        dearest = max(dearest, dearness(var[pending[k], at.V_KIND]))
-    return total / (dearest * burden(scalars, settings))
+        highest_cost = max(highest_cost, relinearize_cost(var[pending[k], at.V_KIND]))
+    return total / (highest_cost * required_share(scalars, settings))
 
 
 @part
-def sum_anew(stiff: F64, state: I64, account: F64) -> None:
+def sum_anew(factor_errors: F64, state: I64, totals: F64) -> None:
     """χ² and Σ error² from what is kept of each factor: running sums lose digits."""
     chi2 = full = counted = 0.0
     for f in range(state[tl.S_FACTORS]):
-        chi2 += stiff[f, tl.B_CHI2]
-        full += stiff[f, tl.B_ERROR]
-        counted += stiff[f, tl.B_COUNTED]
-    account[tl.A_CHI2], account[tl.A_ADDED_UP] = chi2, 0.0
-    account[tl.A_ERROR], account[tl.A_COUNTED] = full, counted
+        chi2 += factor_errors[f, tl.E_CHI2]
+        full += factor_errors[f, tl.E_ERROR]
+        counted += factor_errors[f, tl.E_COUNTED]
+    totals[tl.T_CHI2], totals[tl.T_ADDED_UP] = chi2, 0.0
+    totals[tl.T_ERROR], totals[tl.T_COUNTED] = full, counted
 
 
 @inline_kernel
-def burden(count: int, settings: F64) -> float:
-    """The share that so many scalars have to be worth of what `many` have to, to be relinearized.  (9.22)"""
+def required_share(count: int, settings: F64) -> float:
+    """The share of the error of a full batch that `count` scalars must have to be relinearized.  (9.22)"""
     share = count / settings[tl.P_FULL_BATCH]
-    return min(max(share * share * share, LEAST_BURDEN), 1.0)
+    return min(max(share * share * share, LEAST_REQUIRED_SHARE), 1.0)
 
 
 @inline_kernel
-def dearness(kind: int) -> float:
-    """How many times as much as planar poses a variable has to be worth, with all that wait beside it.  (9.22)"""
+def relinearize_cost(kind: int) -> float:
+    """How many times the error of planar poses must be reached where a variable of this kind waits.  (9.22)"""
     if kind == at.SE2:
         return 1.0
     return IN_SPACE if kind == at.SE3 else WITH_LANDMARKS

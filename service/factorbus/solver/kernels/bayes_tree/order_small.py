@@ -124,18 +124,18 @@ def scalars_in(word: int, planes: I64) -> int:
 def analyze_few(n: int, perm: I64, row: I64, planes: I64, hung: I64, affected: I64, var: I64) -> tuple[Fronts, I64]:
     """As `analyze_affected`, and lowest: each orphan's first variable to go."""
     label, dim, parent = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    border = np.empty(n, np.int64)
+    separator = np.empty(n, np.int64)
     for k in range(n):
         label[perm[k]], dim[k] = k, dim_of_variable(var, affected[perm[k]])
     for k in range(n):
-        border[k] = scalars_in(row[k], planes)
+        separator[k] = scalars_in(row[k], planes)
         parent[k] = label[first_to_go(row[k], label)] if row[k] != 0 else NONE
-    order, home, tops, records = join_fronts(n, perm, parent, dim, border, affected, var, label)
-    border_at, border_of = list_few_borders(tops, row, label)
+    order, home, tops, records = join_fronts(n, perm, parent, dim, separator, affected, var, label)
+    separator_at, separator_of = list_small_separators(tops, row, label)
     lowest = np.empty(hung.size, np.int64)
     for e in range(hung.size):
         lowest[e] = first_to_go(hung[e], label)
-    return Fronts(order, label, home, records, border_at, border_of), lowest
+    return Fronts(order, label, home, records, separator_at, separator_of), lowest
 
 
 @inline_kernel
@@ -152,19 +152,19 @@ def first_to_go(word: int, label: I64) -> int:
 
 
 @inline_kernel
-def list_few_borders(tops: I64, row: I64, label: I64) -> tuple:
-    """border_at, border_of: the labels of each front's border, ascending."""
-    border_at = np.zeros(tops.size + 1, np.int64)
+def list_small_separators(tops: I64, row: I64, label: I64) -> tuple:
+    """separator_at, separator_of: the labels of each front's separator, ascending."""
+    separator_at = np.zeros(tops.size + 1, np.int64)
     for f in range(tops.size):
-        border_at[f + 1] = border_at[f] + count_bits(row[tops[f]])
-    border_of, put = np.empty(border_at[tops.size], np.int64), 0
+        separator_at[f + 1] = separator_at[f] + count_bits(row[tops[f]])
+    separator_of, put = np.empty(separator_at[tops.size], np.int64), 0
     for f in range(tops.size):
         rest, there = row[tops[f]], 0
         while rest != 0:
             there |= 1 << label[lowest_bit(rest)]
             rest &= rest - 1
         while there != 0:
-            border_of[put] = lowest_bit(there)
+            separator_of[put] = lowest_bit(there)
             put += 1
             there &= there - 1
-    return border_at, border_of
+    return separator_at, separator_of

@@ -20,9 +20,9 @@ class Tree(NamedTuple):
                              before the step, of what it changes
     scalars (3, s) float64   δ; the sum of the diagonals of the factors' Hessians, which measures δ in sigmas; δ to go
                              back to while variables are relinearized
-    stiff   (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearized, (9.12);
-                             between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is that of a
-                             disc and an angle; at the estimate χ², error² in full, and as it counts
+    factor_errors (m, 8) float64   of each factor d and √ω, (9.4); of a landmark |Ω r| where it was linearized, (9.12);
+                             between poses ω_θ, and what (9.13) is by |r| and the shift; whether its Ω is isotropic for
+                             the translation; at the estimate χ², error² in full, and as it counts
     turns   (n, 4) float64   of each variable: the largest d √ω of what it sees; cosine and sine where a plane pose is
                              linearized
     pending, changed, moved  (n,) int64   variables: that wait to be relinearized; that the step changed; that moved
@@ -31,7 +31,7 @@ class Tree(NamedTuple):
     motions (8 c,) float64   of each clique how it has moved as a whole since it was solved
     saved   (2 k, 8) float64 what the k factors of a step under way change of their variables, for when it fails
     state   int64            counters and the heads of free lists
-    account (15,) float64    what a step found
+    totals  (15,) float64    χ² and sums of errors over all factors, and bounds that follow from them
     """
 
     settings: Floats
@@ -43,7 +43,7 @@ class Tree(NamedTuple):
     hessian: Floats
     lin: FloatRows
     scalars: FloatRows
-    stiff: FloatRows
+    factor_errors: FloatRows
     turns: FloatRows
     pending: Ints
     changed: Ints
@@ -52,7 +52,7 @@ class Tree(NamedTuple):
     motions: Floats
     saved: FloatRows
     state: Ints
-    account: Floats
+    totals: Floats
 
 
 class Affected(NamedTuple):
@@ -75,15 +75,15 @@ class Fronts(NamedTuple):
     order (n,)   local numbers in the order of elimination;  place (n,): its inverse
     home  (n,)   the front where the variable at a place is a pivot
     records      one row per front, as `fronts` has it
-    border_at, border_of   the separators of front f are border_of[border_at[f] : border_at[f + 1]], by their places
+    separator_at, separator_of   the separator of front f is separator_of[separator_at[f] : separator_at[f + 1]]; places
     """
 
     order: I64
     place: I64
     home: I64
     records: I64
-    border_at: I64
-    border_of: I64
+    separator_at: I64
+    separator_of: I64
 
 
 tree_at = opener(Tree)

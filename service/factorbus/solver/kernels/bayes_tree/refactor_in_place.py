@@ -96,7 +96,7 @@ def still_renewed(renewed: I64, clique: I64, state: I64) -> I64:
 
 
 @part
-def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: I64, queue: I64) -> int:
+def renew(graph: Graph, tree: Tree, renewed: I64, n: int, largest_diagonal: float, old: I64, queue: I64) -> int:
     """Eliminate the frontals of the cliques `renewed` again, in new blocks; gives the status.
 
     old (renewed, C_WIDTH): gets their present rows.  Local numbers of affected variables are below n.  queue: see
@@ -121,8 +121,8 @@ def renew(graph: Graph, tree: Tree, renewed: I64, n: int, stiffest: float, old: 
     column, floors, runs = np.empty(total, np.int64), np.empty(widest), np.empty((most + 1, fr.RUN), np.int64)
     for k in range(renewed.size):
         row = clique[renewed[k]]
-        p, m, front = row[tl.C_PIVOTS], row[tl.C_BORDER], front_of_clique(row)
-        number_columns(row, ROUNDING * stiffest, var, node, lists, scalars, column, floors)
+        p, m, front = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], front_of_clique(row)
+        number_columns(row, ROUNDING * largest_diagonal, var, node, lists, scalars, column, floors)
         clear_front(numbers, front)
         for s in range(row[tl.C_LIST], row[tl.C_LIST] + row[tl.C_FRONTALS]):
             f = node[lists[s], tl.N_OWN]
@@ -152,18 +152,18 @@ def take_blocks(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64) -
     need = state[tl.S_NUMBERS]
     for k in range(renewed.size):
         row = clique[renewed[k]]
-        need += size_class(row_layout(row[tl.C_PIVOTS], row[tl.C_BORDER])[3])[1]
-        need += size_class(update_layout(row[tl.C_BORDER])[1])[1]
+        need += size_class(row_layout(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS])[3])[1]
+        need += size_class(update_layout(row[tl.C_SEPARATOR_SCALARS])[1])[1]
     if need > numbers.size:
         state[tl.S_NEED_NUMBERS] = need
         return False
     for k in range(renewed.size):
         row = clique[renewed[k]]
         old[k] = row
-        lead, row[tl.C_LD], used, size = row_layout(row[tl.C_PIVOTS], row[tl.C_BORDER])
+        lead, row[tl.C_LD], used, size = row_layout(row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS])
         row[tl.C_BLOCK], row[tl.C_BLOCK_SIZE] = take_numbers(size, numbers, state)
         row[tl.C_ROWS], row[tl.C_USED] = row[tl.C_BLOCK] + lead, row[tl.C_BLOCK] + used
-        row[tl.C_WIDTH_UPDATE], size = update_layout(row[tl.C_BORDER])
+        row[tl.C_WIDTH_UPDATE], size = update_layout(row[tl.C_SEPARATOR_SCALARS])
         row[tl.C_UPDATE], row[tl.C_UPDATE_BLOCK_SIZE] = take_numbers(size, numbers, state)
     return True
 
@@ -186,7 +186,7 @@ def give_back_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: 
 
 
 @part
-def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64, account: F64) -> I64:
+def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64, totals: F64) -> I64:
     """The old blocks are free, and the cliques to be solved; gives those of them that are roots."""
     roots, count = np.empty(renewed.size, np.int64), 0
     for k in range(renewed.size):
@@ -194,13 +194,13 @@ def commit_renewed(renewed: I64, old: I64, clique: I64, numbers: F64, state: I64
         if row[tl.C_PARENT] < 0:
             roots[count] = renewed[k]
             count += 1
-            account[tl.A_MODEL] -= numbers[old[k, tl.C_UPDATE]]
+            totals[tl.T_MODEL] -= numbers[old[k, tl.C_UPDATE]]
         row[tl.C_FIRST], row[tl.C_MARK] = -1, state[tl.S_STAMP]
         state[tl.S_ELIMINATED] += row[tl.C_FRONTALS]
     if count == state[tl.S_ROOTS]:
-        account[tl.A_MODEL] = account[tl.A_CONSTANT]
+        totals[tl.T_MODEL] = totals[tl.T_CONSTANT]
     for k in range(count):
-        account[tl.A_MODEL] += numbers[clique[roots[k], tl.C_UPDATE]]
+        totals[tl.T_MODEL] += numbers[clique[roots[k], tl.C_UPDATE]]
     for k in range(renewed.size):
         give_numbers(old[k, tl.C_BLOCK], old[k, tl.C_BLOCK_SIZE], numbers, state)
         give_numbers(old[k, tl.C_UPDATE], old[k, tl.C_UPDATE_BLOCK_SIZE], numbers, state)

@@ -21,7 +21,7 @@ def close_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
     """
     graph, tree = graph_at(graph_table), tree_at(tree_table)
     fac, counts = graph.fac, graph.counts
-    link, stiff, state = tree.link, tree.stiff, tree.state
+    link, factor_errors, state = tree.link, tree.factor_errors, tree.state
     first, count, taken = gone[0], counts[at.FACTORS], state[tl.S_FACTORS]
     rows = np.empty(count - first, np.int64)
     k = 0
@@ -40,8 +40,8 @@ def close_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
         if f < taken:
             for c in range(tl.L_WIDTH):
                 link[f - k, c] = link[f, c]
-            for c in range(tl.B_WIDTH):
-                stiff[f - k, c] = stiff[f, c]
+            for c in range(tl.E_WIDTH):
+                factor_errors[f - k, c] = factor_errors[f, c]
     counts[at.FACTORS] -= gone.size
     state[tl.S_FACTORS] -= gone.size
     state[tl.S_TAKEN] -= gone.size
@@ -52,7 +52,7 @@ def open_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
     """Undo `close_gaps`: the rows `gone` are there again, to be filled and linked by the caller."""
     graph, tree = graph_at(graph_table), tree_at(tree_table)
     fac, counts = graph.fac, graph.counts
-    link, stiff, state = tree.link, tree.stiff, tree.state
+    link, factor_errors, state = tree.link, tree.factor_errors, tree.state
     first, count, taken = gone[0], counts[at.FACTORS], state[tl.S_FACTORS]
     rows = np.empty(count - first, np.int64)
     k = 0
@@ -68,8 +68,8 @@ def open_gaps(gone: I64, graph_table: I64, tree_table: I64) -> None:
         if f < taken:
             for c in range(tl.L_WIDTH):
                 link[to, c] = link[f, c]
-            for c in range(tl.B_WIDTH):
-                stiff[to, c] = stiff[f, c]
+            for c in range(tl.E_WIDTH):
+                factor_errors[to, c] = factor_errors[f, c]
     counts[at.FACTORS] += gone.size
     state[tl.S_FACTORS] += gone.size
     state[tl.S_TAKEN] += gone.size

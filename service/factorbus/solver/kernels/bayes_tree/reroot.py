@@ -31,7 +31,7 @@ def flops_of(cliques: I64, clique: I64) -> float:
 @inline_kernel
 def flops_of_clique(row: I64) -> float:
     """The same of one."""
-    width = row[tl.C_PIVOTS] + row[tl.C_BORDER] + 1
+    width = row[tl.C_PIVOTS] + row[tl.C_SEPARATOR_SCALARS] + 1
     return float(row[tl.C_PIVOTS] * width * width)
 
 

@@ -15,7 +15,7 @@ from factorbus.solver.kernels.model.sizes import size_of
 
 
 @kernel("void(int64[::1], int64[::1])")
-def hold_at_linearization(graph_table: I64, tree_table: I64) -> None:
+def reset_to_linearization(graph_table: I64, tree_table: I64) -> None:
     """δ = 0 everywhere, as if every clique had been solved so; the next back-substitution from a root moves on.
 
     graph_table, tree_table: of their arrays (`records`).  χ² and linearization errors are measured anew.
@@ -27,7 +27,7 @@ def hold_at_linearization(graph_table: I64, tree_table: I64) -> None:
     numbers, motions = tree.numbers, tree.motions
     lin, scalars = tree.lin, tree.scalars
     moved = tree.moved
-    state, account = tree.state, tree.account
+    state, totals = tree.state, tree.totals
     for v in range(state[tl.S_VARIABLES]):
         x, d, c = var[v, at.V_AT], var[v, at.V_SCALAR], node[v, tl.N_CLIQUE]
         note_moved(MODEL, v, node, moved, state)
@@ -38,10 +38,10 @@ def hold_at_linearization(graph_table: I64, tree_table: I64) -> None:
         for a in range(dim_of_variable(var, v)):
             scalars[0, d + a] = 0.0
         if c >= 0 and node[v, tl.N_PLACE] == 0:
-            for k in range(clique[c, tl.C_PIVOTS] + clique[c, tl.C_BORDER]):
+            for k in range(clique[c, tl.C_PIVOTS] + clique[c, tl.C_SEPARATOR_SCALARS]):
                 put(numbers, clique[c, tl.C_USED] + k, 0.0)
             for k in range(tl.M_WIDTH):
                 motions[c * tl.M_WIDTH + k] = 0.0
             clique[c, tl.C_MOVES] = 0
     measure(graph, tree, settings)
-    account[tl.A_LEFT] = np.inf
+    totals[tl.T_LEFT] = np.inf

@@ -81,7 +81,7 @@ def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
     var = graph.var
     lists, numbers, lin, turns = tree.lists, tree.numbers, tree.lin[0], tree.turns
     x0, y0 = load(lin, var[lists[first], at.V_AT]), load(lin, var[lists[first], at.V_AT] + 1)
-    mass = px = py = ux = uy = inertia = pull = 0.0
+    mass = px = py = ux = uy = inertia = torque = 0.0
     for s in range(first, last):
         v = lists[s]
         d, x = var[v, at.V_SCALAR], var[v, at.V_AT]
@@ -89,10 +89,10 @@ def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
         gx, gy = load(delta, d) - load(numbers, used), load(delta, d + 1) - load(numbers, used + 1)
         used += 2
         if var[v, at.V_KIND] == at.SE2:
-            c, z, stiff = turns[v, tl.U_COS], turns[v, tl.U_SIN], load(weight, d + 2)
+            c, z, turn_weight = turns[v, tl.U_COS], turns[v, tl.U_SIN], load(weight, d + 2)
             gx, gy = c * gx - z * gy, z * gx + c * gy
-            inertia += stiff
-            pull += stiff * (load(delta, d + 2) - load(numbers, used))
+            inertia += turn_weight
+            torque += turn_weight * (load(delta, d + 2) - load(numbers, used))
             used += 1
         mass += w
         px += w * dx
@@ -100,10 +100,10 @@ def fit_plane(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
         ux += w * gx
         uy += w * gy
         inertia += w * (dx * dx + dy * dy)
-        pull += w * (dx * gy - dy * gx)
+        torque += w * (dx * gy - dy * gx)
     inertia -= (px * px + py * py) / mass
-    pull -= (px * uy - py * ux) / mass
-    turn = pull / inertia if inertia > 0.0 else 0.0
+    torque -= (px * uy - py * ux) / mass
+    turn = torque / inertia if inertia > 0.0 else 0.0
     px, py = px / mass + x0, py / mass + y0
     motion[WHOLE], motion[WHOLE + 1], motion[WHOLE + 2] = ux / mass + turn * py, uy / mass - turn * px, 0.0
     motion[WHOLE + 3], motion[WHOLE + 4], motion[WHOLE + 5] = 0.0, 0.0, turn
@@ -142,7 +142,7 @@ def fit_space(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
         v = lists[s]
         d, x, w = var[v, at.V_SCALAR], var[v, at.V_AT], load(weight, var[v, at.V_SCALAR])
         gx, gy, gz, hx, hy, hz = moved_in_space(d, used, x, var[v, at.V_KIND], numbers, delta, lin)
-        stiff = load(weight, d + 3) if var[v, at.V_KIND] == at.SE3 else 0.0
+        turn_weight = load(weight, d + 3) if var[v, at.V_KIND] == at.SE3 else 0.0
         used += dim_of_variable(var, v)
         qx, qy, qz = load(lin, x) - x0, load(lin, x + 1) - y0, load(lin, x + 2) - z0
         mass += w
@@ -152,15 +152,15 @@ def fit_space(graph: Graph, tree: Tree, first: int, last: int, used: int, delta:
         ux += w * gx
         uy += w * gy
         uz += w * gz
-        xx += w * (qy * qy + qz * qz) + stiff
-        yy += w * (qx * qx + qz * qz) + stiff
-        zz += w * (qx * qx + qy * qy) + stiff
+        xx += w * (qy * qy + qz * qz) + turn_weight
+        yy += w * (qx * qx + qz * qz) + turn_weight
+        zz += w * (qx * qx + qy * qy) + turn_weight
         xy -= w * qx * qy
         xz -= w * qx * qz
         yz -= w * qy * qz
-        bx += w * (qy * gz - qz * gy) + stiff * hx
-        by += w * (qz * gx - qx * gz) + stiff * hy
-        bz += w * (qx * gy - qy * gx) + stiff * hz
+        bx += w * (qy * gz - qz * gy) + turn_weight * hx
+        by += w * (qz * gx - qx * gz) + turn_weight * hy
+        bz += w * (qx * gy - qy * gx) + turn_weight * hz
     # About the centre.
     xx, yy, zz = xx - (py * py + pz * pz) / mass, yy - (px * px + pz * pz) / mass, zz - (px * px + py * py) / mass
     xy, xz, yz = xy + px * py / mass, xz + px * pz / mass, yz + py * pz / mass

@@ -19,7 +19,7 @@ from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.add_to_tree import take_in_factors, take_in_variables, take_out
 from factorbus.solver.kernels.bayes_tree.begin_step import begin_step
 from factorbus.solver.kernels.bayes_tree.changed_variables import count_differing
-from factorbus.solver.kernels.bayes_tree.convergence import await_bound, goes_on, note_after
+from factorbus.solver.kernels.bayes_tree.convergence import goes_on, mark_unconverged, note_after
 from factorbus.solver.kernels.bayes_tree.eliminate_again import eliminate_again, lap
 from factorbus.solver.kernels.bayes_tree.records import Tree, tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import go_back, relinearize
@@ -48,7 +48,7 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         return tl.DONE
     began = cycles()
     graph, tree = graph_at(graph_table), tree_at(tree_table)
-    settings, state, account = tree.settings, tree.state, tree.account
+    settings, state, totals = tree.settings, tree.state, tree.totals
     v1, f1 = graph.counts[at.VARIABLES], graph.counts[at.FACTORS]
     if state[tl.S_BEGUN] == 0:
         if len(tree.clique) > tree.marked.size:
@@ -56,10 +56,10 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         status = begin_step(graph, tree)
         if status != tl.DONE:
             return status
-        note_before(v1, f1, state, account)
-    scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, account)
+        note_before(v1, f1, state, totals)
+    scaled = scale_thresholds(f1, graph.counts[at.SCALARS], settings, state, totals)
     if state[tl.S_CONTINUES] != 0:
-        await_bound(graph, tree, scaled)
+        mark_unconverged(graph, tree, scaled)
     v0 = state[tl.S_FIRST_NEW]
     take_in_variables(v1, graph.var, graph.values, tree.node, tree.lin, tree.scalars, tree.turns, state)
     if not take_in_factors(graph, tree, f1):
@@ -70,8 +70,8 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         if moving.size > 0:
             relinearize(graph, tree, moving)
         lap(began, tl.LINEARIZE, state)
-        before = account[tl.A_CHI2]
-        pull, status = eliminate_again(graph, tree, NewRows(v0, v1, f1), moving, scaled, queue)
+        before = totals[tl.T_CHI2]
+        weighted_error, status = eliminate_again(graph, tree, NewRows(v0, v1, f1), moving, scaled, queue)
         if status == tl.NO_ROOM:
             return tl.NO_ROOM
         began = cycles()
@@ -88,29 +88,29 @@ def tree_step(graph_table: I64, tree_table: I64, queue: I64, worker: int) -> int
         v0 = v1
         state[tl.S_TAKEN], state[tl.S_FIRST_NEW], state[tl.S_EDITED] = f1, v1, 0
         state[tl.S_ROUNDS] += 1
-        chi2 = account[tl.A_CHI2]
+        chi2 = totals[tl.T_CHI2]
         if state[tl.S_ROUNDS] > 1:
-            account[tl.A_GAINED] = max(account[tl.A_GAINED], before - chi2)
-        account[tl.A_GAINED] = max(account[tl.A_GAINED], account[tl.A_BEFORE] - chi2)
+            totals[tl.T_GAINED] = max(totals[tl.T_GAINED], before - chi2)
+        totals[tl.T_GAINED] = max(totals[tl.T_GAINED], totals[tl.T_BEFORE] - chi2)
         if state[tl.S_ROUNDS] > 1 and not chi2 <= (1.0 + settings[tl.P_CONVERGED]) * before + LEAST_CHI2:
             state[tl.S_RISES] = 1
             break
-        if state[tl.S_WAIT] != 0 or not goes_on(pull, scaled, state, account):
+        if state[tl.S_WAIT] != 0 or not goes_on(weighted_error, scaled, state, totals):
             break
-        await_bound(graph, tree, scaled)
+        mark_unconverged(graph, tree, scaled)
     changed = tree.changed[: state[tl.S_CHANGED]]
     state[tl.S_DIFFERING] = count_differing(state[tl.S_OLD], v1, changed, graph.var, tree.lin, graph.values)
     state[tl.S_WAIT] = state[tl.S_BEGUN] = state[tl.S_CHECKED] = state[tl.S_ONCE] = 0
-    note_after(settings, state, account)
+    note_after(settings, state, totals)
     return tl.DONE
 
 
 @inline_kernel
-def note_before(v1: int, f1: int, state: I64, account: F64) -> None:
+def note_before(v1: int, f1: int, state: I64, totals: F64) -> None:
     """How things are when a step begins that is up to v1 variables and f1 factors."""
-    account[tl.A_STIFFEST_BEFORE] = account[tl.A_STIFFEST]
-    account[tl.A_UNIT], account[tl.A_BEFORE] = residual_unit(f1, account), account[tl.A_CHI2]
-    account[tl.A_GAINED] = 0.0
+    totals[tl.T_LARGEST_DIAGONAL_BEFORE] = totals[tl.T_LARGEST_DIAGONAL]
+    totals[tl.T_UNIT], totals[tl.T_BEFORE] = residual_unit(f1, totals), totals[tl.T_CHI2]
+    totals[tl.T_GAINED] = 0.0
     state[tl.S_OLD], state[tl.S_RISES] = state[tl.S_FIRST_NEW], 0
     nothing_new = v1 == state[tl.S_FIRST_NEW] and f1 == state[tl.S_TAKEN] and state[tl.S_EDITED] == 0
     state[tl.S_CONTINUES] = 1 if nothing_new else 0
@@ -126,11 +126,11 @@ def count_due(state: I64) -> int:
 @part
 def undo(graph: Graph, tree: Tree, v0: int) -> None:
     """The tree is as it was before the step."""
-    node, moved, state, account = tree.node, tree.moved, tree.state, tree.account
+    node, moved, state, totals = tree.node, tree.moved, tree.state, tree.totals
     for k in range(state[tl.S_MOVED]):
         node[moved[k], tl.N_LISTED] = 0
-    state[tl.S_MOVED], account[tl.A_ADDED] = 0, 0.0
-    account[tl.A_STIFFEST] = account[tl.A_STIFFEST_BEFORE]
+    state[tl.S_MOVED], totals[tl.T_ADDED] = 0, 0.0
+    totals[tl.T_LARGEST_DIAGONAL] = totals[tl.T_LARGEST_DIAGONAL_BEFORE]
     take_out(graph, tree, v0, state[tl.S_TAKEN])
     state[tl.S_STEP] -= 1
     state[tl.S_CHANGED] = state[tl.S_CHANGED_BEFORE]

@@ -9,9 +9,9 @@ LEAST_CHI2 = 1e-2
 
 
 @inline_kernel
-def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64, account: F64) -> F64:
+def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64, totals: F64) -> F64:
     """The settings of the tree with their thresholds for a graph with this number of factors and of scalars."""
-    unit, scaled = account[tl.A_UNIT], tree_settings.copy()
+    unit, scaled = totals[tl.T_UNIT], tree_settings.copy()
     continues = state[tl.S_CONTINUES] != 0
     per_scalar = unit * math.sqrt(factors / max(scalars, 1))  # (9.17)
     scaled[tl.P_WILDFIRE_THRESHOLD] = 0.0 if continues else scaled[tl.P_WILDFIRE_THRESHOLD] * per_scalar
@@ -26,17 +26,17 @@ def scale_thresholds(factors: int, scalars: int, tree_settings: F64, state: I64,
 
 
 @inline_kernel
-def residual_unit(factors: int, account: F64) -> float:
+def residual_unit(factors: int, totals: F64) -> float:
     """What a residual is like in this map, in its σ: √(χ² per factor), as far as known.  (9.6)"""
-    return math.sqrt((max(account[tl.A_MODEL], 0.0) + LEAST_CHI2) / max(factors, 1))
+    return math.sqrt((max(totals[tl.T_MODEL], 0.0) + LEAST_CHI2) / max(factors, 1))
 
 
 @part
-def rescale(factors: int, settings: F64, account: F64) -> None:
+def rescale(factors: int, settings: F64, totals: F64) -> None:
     """The thresholds in what a residual is like without the factors that were taken out, or with their new weights."""
-    unit = residual_unit(factors, account)
-    times = unit / account[tl.A_UNIT]
-    account[tl.A_UNIT] = unit
+    unit = residual_unit(factors, totals)
+    times = unit / totals[tl.T_UNIT]
+    totals[tl.T_UNIT] = unit
     for each in (tl.P_WILDFIRE_THRESHOLD, tl.P_RELINEARIZE_THRESHOLD, tl.P_MAX_ERROR):
         settings[each] *= times
     for each in (tl.P_SAME_STEP_SHARE, tl.P_NEXT_STEP_SHARE):
@@ -46,6 +46,6 @@ def rescale(factors: int, settings: F64, account: F64) -> None:
 @inline_kernel
 def cooldown_share(settings: F64, state: I64) -> float:
     """The factor on both shares so soon after the last relinearization.  (9.19)"""
-    dear = settings[tl.P_COOLDOWN_FLOPS]
-    rested = settings[tl.P_COOLDOWN_STEPS] * dear / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
-    return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(dear))
+    cost_ratio = settings[tl.P_COOLDOWN_FLOPS]
+    rested = settings[tl.P_COOLDOWN_STEPS] * cost_ratio / max(state[tl.S_STEP] - state[tl.S_RELINEARIZED_AT], 1)
+    return min(max(rested * rested, 1.0), settings[tl.P_COOLDOWN_FACTOR] * math.sqrt(cost_ratio))

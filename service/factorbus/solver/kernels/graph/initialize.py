@@ -1,4 +1,4 @@
-"""What follows from what: values composed along factors, and variables held by factors.  MATH §2.4, §5.4.
+"""What follows from what: values composed along factors, and variables determined by factors.  MATH §2.4, §5.4.
 
 Both walk the new factors in their order; a factor that comes before what it could follow from waits on its ends.
 Every factor is looked at no more than three times, in whatever order they come.

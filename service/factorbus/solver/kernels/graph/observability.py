@@ -1,7 +1,7 @@
-"""New variables that several factors hold together: a point by two pixels, a camera by those of known points.  MATH §7.
+"""New variables that several factors determine: a point by two pixels, a camera by those of known points.  MATH §7.
 
-A variable is held where the Hessian of its own factors, with all that they join it to held already, is positive
-definite with room to spare.  What that does not show, the numbers of the whole system may.
+A variable is determined where the Hessian of its own factors, with all that they join it to determined already, is
+positive definite with room to spare.  What that does not show, the numbers of the whole system may.
 """
 
 import numpy as np
@@ -17,18 +17,18 @@ _ROOM = 1e-8
 
 
 @kernel("int64(int64, int64, int64, int64[:,::1], int64[:,::1], float64[::1], float64[::1], int64[::1])")
-def mark_held(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, held: I64) -> int:
-    """Mark in `held` (one entry per variable from v0 on, 1: held) what factors f0 .. f1−1 hold; gives how many."""
+def mark_determined(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payload: F64, determined: I64) -> int:
+    """Set to 1 in `determined` (an entry a variable from v0 on) what factors f0 .. f1−1 determine; gives the count."""
     r, H, z = np.zeros(at.R_SIZE), np.zeros((2, 6, 6)), np.zeros(6)
-    place, count = np.full(held.size, -1), 0
-    for k in range(held.size):
-        if held[k] == 0:
+    place, count = np.full(determined.size, -1), 0
+    for k in range(determined.size):
+        if determined[k] == 0:
             place[k] = count
             count += 1
     M = np.zeros((count, 6, 6))
     for f in range(f0, f1):
         i, j = fac[f, at.F_I] - v0, fac[f, at.F_J] - v0
-        loose_i, loose_j = i >= 0 and held[i] == 0, j >= 0 and held[j] == 0
+        loose_i, loose_j = i >= 0 and determined[i] == 0, j >= 0 and determined[j] == 0
         if loose_i == loose_j:
             continue
         evaluate_apart(f, var, fac, values, payload, r, H[0], H[1])
@@ -45,7 +45,7 @@ def mark_held(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payloa
                         M[place[k], c, e] += payload[p] * both
                 p += 1
     found, diagonal = 0, np.empty(6)
-    for k in range(held.size):
+    for k in range(determined.size):
         if place[k] < 0:
             continue
         dim, good, block = dim_of(var[v0 + k, at.V_KIND]), True, M[place[k]]
@@ -56,6 +56,6 @@ def mark_held(v0: int, f0: int, f1: int, var: I64, fac: I64, values: F64, payloa
             for a in range(dim):
                 good &= block[a, a] * block[a, a] > _ROOM * diagonal[a]
             if good:
-                held[k] = 1
+                determined[k] = 1
                 found += 1
     return found

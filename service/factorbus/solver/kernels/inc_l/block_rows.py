@@ -67,7 +67,7 @@ def append_rows(v0: int, v1: int, graph_table: I64, rows_table: I64) -> None:
 
 
 @kernel("void(int64[::1], int64[::1], int64[::1], int64[:,::1], int64[::1], float64[::1], int64[::1])")
-def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, border: I64, arena: F64, rows_table: I64) -> None:
+def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, separator: I64, arena: F64, rows_table: I64) -> None:
     """Copy R from the fronts of a factorization, block by block.
 
     The zeros of joined fronts come along: the lists are those of the fronts.
@@ -87,7 +87,7 @@ def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, border: I64, ar
     put_list, put_row = 0, 0
     for f in range(fronts.shape[0]):
         front = fronts[f]
-        p, m, ld, b = front[fr.PIVOTS], front[fr.BORDER], front[fr.LD_ROWS], front[fr.BORDER_AT]
+        p, m, ld, b = front[fr.PIVOTS], front[fr.SEPARATOR], front[fr.LD_ROWS], front[fr.SEPARATOR_AT]
         first = front[fr.VARIABLE]
         last = fronts[f + 1, fr.VARIABLE] if f + 1 < fronts.shape[0] else n
         for k in range(first, last):
@@ -100,7 +100,7 @@ def take_fronts(order: I64, dims: I64, starts: I64, fronts: I64, border: I64, ar
                 put_list += 1
             j = 0
             while j < m:
-                index[put_list] = position[border[b + j]]
+                index[put_list] = position[separator[b + j]]
                 j += rec[index[put_list], DIM]
                 put_list += 1
             row[COUNT] = row[ROOM] = put_list - row[LIST]

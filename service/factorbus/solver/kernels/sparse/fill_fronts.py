@@ -6,14 +6,14 @@ from factorbus.solver.kernels.sparse import fronts as fr
 
 
 @kernel("void(int64[:,::1], int64[::1], int64[::1], int64[::1], float64[::1], float64[::1])")
-def fill_fronts(fronts: I64, border: I64, begin: I64, rows: I64, values: F64, arena: F64) -> None:
+def fill_fronts(fronts: I64, separator: I64, begin: I64, rows: I64, values: F64, arena: F64) -> None:
     """The rows of R into `arena`: row k is column k of L, values[begin[k] : begin[k+1]] at `rows`, ascending.
 
     Columns of a front that L has no entry in are zero.
     """
     for f in range(fronts.shape[0]):
         front = fronts[f]
-        p, m, ld, first = front[fr.PIVOTS], front[fr.BORDER], front[fr.LD_ROWS], front[fr.COLUMN]
+        p, m, ld, first = front[fr.PIVOTS], front[fr.SEPARATOR], front[fr.LD_ROWS], front[fr.COLUMN]
         for i in range(p):
             line = front[fr.ROWS] + i * ld
             zero(arena, line + i, p + m - i)
@@ -23,6 +23,6 @@ def fill_fronts(fronts: I64, border: I64, begin: I64, rows: I64, values: F64, ar
                 if row < first + p:
                     put(arena, line + row - first, values[e])
                 else:
-                    while border[front[fr.BORDER_AT] + j] != row:
+                    while separator[front[fr.SEPARATOR_AT] + j] != row:
                         j += 1
                     put(arena, line + p + j, values[e])

@@ -1,8 +1,8 @@
 """What a front is: the record that the multifrontal kernels share, and how its numbers lie in the arena.
 
-A front holds p pivot scalars and a border of m scalars, in elimination order.  Its rows of R are p rows over p + m
+A front holds p pivot scalars and a separator of m scalars, in elimination order.  Its rows of R are p rows over p + m
 columns, column j of row i at `ROWS + i·LD_ROWS + j`; its update matrix is m x m, upper triangle, column j of row i at
-`UPDATE + update_row(i, WIDTH_UPDATE) + j`.  Both start their border columns at a multiple of LANES doubles
+`UPDATE + update_row(i, WIDTH_UPDATE) + j`.  Both start their separator columns at a multiple of LANES doubles
 and pad rows to one, so that whole vectors cover them and none lies across a cache line; what a row of R has before
 its first column, and behind its last, belongs to nobody.
 
@@ -16,7 +16,7 @@ from factorbus.solver.kernels.jit.compile import I64, inline_kernel, vector_lane
 
 COLUMN = 0  # first pivot scalar, in elimination order
 PIVOTS = 1  # p
-BORDER = 2  # m
+SEPARATOR = 2  # m
 ROWS = 3
 LD_ROWS = 4
 UPDATE = 5
@@ -26,14 +26,14 @@ CHILD = 8  # first child, -1: none
 SIBLING = 9  # next child of the same parent
 RUNS = 10  # its runs are runs[RUNS : RUNS_END]
 RUNS_END = 11
-BORDER_AT = 12  # its border scalars, in elimination order, are border[BORDER_AT : BORDER_AT + m]
+SEPARATOR_AT = 12  # its separator scalars, in elimination order, are separator[SEPARATOR_AT : SEPARATOR_AT + m]
 BLOCKS = 13  # the blocks of Λ that it takes in are blocks[BLOCKS : BLOCKS_END]
 BLOCKS_END = 14
 VARIABLE = 15  # first pivot variable, in elimination order
 FRONT = 16  # int64 in a record: 128 bytes
 
-# A run: border columns [first, first + count) of a child are columns [into, into + count) of its parent; a run lies
-# wholly among the parent's pivots or wholly in its border.
+# A run: separator columns [first, first + count) of a child are columns [into, into + count) of its parent; a run lies
+# wholly among the parent's pivots or wholly in its separator.
 RUN = 3
 RUN_FIRST, RUN_COUNT, RUN_INTO = range(RUN)
 
@@ -52,13 +52,13 @@ GROUP = 8  # a multiple of LANES, and of the rows that `dense` makes at a time
 
 
 class Front(NamedTuple):
-    """Where a front is in its arena: its `pivots` rows of R begin at `rows`, `ld` apart, over `pivots` + `border`
+    """Where a front is in its arena: its `pivots` rows of R begin at `rows`, `ld` apart, over `pivots` + `separator`
     columns; its update matrix begins at `update`, the first rows `width` wide."""
 
     rows: int
     ld: int
     pivots: int
-    border: int
+    separator: int
     update: int
     width: int
 
@@ -66,7 +66,7 @@ class Front(NamedTuple):
 @inline_kernel
 def front_of(record: I64) -> Front:
     """The front of a record."""
-    return Front(record[ROWS], record[LD_ROWS], record[PIVOTS], record[BORDER], record[UPDATE], record[WIDTH_UPDATE])
+    return Front(record[ROWS], record[LD_ROWS], record[PIVOTS], record[SEPARATOR], record[UPDATE], record[WIDTH_UPDATE])
 
 
 @inline_kernel

@@ -46,7 +46,7 @@ def factorize(
 def clear_front(a: F64, front: fr.Front) -> None:
     """Zero the rows of R, their padding too, and the update matrix."""
     zero(a, front.rows - (fr.padded_size(front.pivots) - front.pivots), front.pivots * front.ld)
-    zero(a, front.update, fr.update_size(front.border, front.width))
+    zero(a, front.update, fr.update_size(front.separator, front.width))
 
 
 @inline_kernel

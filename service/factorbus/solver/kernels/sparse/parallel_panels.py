@@ -35,7 +35,7 @@ def take_panel_off_together(queue: I64, a: F64, front: Front, top: int, end: int
     put_entry(queue, AT, address_of(a), a.size, 1)
     queue[R], queue[LD], queue[P], queue[M], queue[U], queue[WIDTH] = front
     queue[TOP], queue[END] = top, end
-    post(queue, PANEL, _chunks(front.pivots - end) + _chunks(front.border))
+    post(queue, PANEL, _chunks(front.pivots - end) + _chunks(front.separator))
     chunk = take_chunk(queue)
     while chunk >= 0:
         make_panel_chunk(queue, chunk)

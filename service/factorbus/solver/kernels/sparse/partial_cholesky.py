@@ -36,7 +36,7 @@ def factor_front(a: F64, front: Front, floors: F64, t: int, queue: I64) -> int:
          queue: for worker threads, see `task_queue`
     out  rows: R and S   update matrix: U
     """
-    r, ld, p, m = front.rows, front.ld, front.pivots, front.border
+    r, ld, p, m = front.rows, front.ld, front.pivots, front.separator
     raised, lead = False, padded_size(p) - p
     for top in range(0, p, DEPTH):
         end = min(top + DEPTH, p)

@@ -24,7 +24,7 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
 
     in   dims (n,)   rows, cols (nb,): blocks, diagonal ones included   perm (n,)
     out  order (n,): variables as eliminated   place (n,): first scalar of each variable in elimination order
-         fronts, runs, blocks: records (see `fronts`)   border: scalars in elimination order
+         fronts, runs, blocks: records (see `fronts`)   separator: scalars in elimination order
          sizes (2,): doubles of R, doubles of the arena   work (2,): nonzeros of R, flops
     """
     n = dims.size
@@ -46,13 +46,13 @@ def analyze_pattern(dims: I64, rows: I64, cols: I64, perm: I64) -> tuple:
     records = make_records(tops, home, parent, front_of, pivots, scalars, first_scalar)
     sizes = _place(records)
     begin, earlier = by_later(n, label, rows, cols)
-    border_at, border_of = list_borders(n, begin, earlier, home, tops, variables, records)
-    border = _border_scalars(records, border_at, border_of, dim, first_scalar)
-    runs, blocks = _maps(label, rows, cols, dim, first_scalar, border_at, border_of, records)
+    separator_at, separator_of = list_separators(n, begin, earlier, home, tops, variables, records)
+    separator = _separator_scalars(records, separator_at, separator_of, dim, first_scalar)
+    runs, blocks = _maps(label, rows, cols, dim, first_scalar, separator_at, separator_of, records)
     place = np.empty(n, np.int64)
     for v in range(n):
         place[v] = first_scalar[label[v]]
-    return order, place, records, runs, border, blocks, sizes, work
+    return order, place, records, runs, separator, blocks, sizes, work
 
 
 @part
@@ -106,19 +106,19 @@ def count_rows(n: int, begin: I64, earlier: I64, parent: I64, dim: I64) -> tuple
 
 
 @part
-def join_columns(n: int, parent: I64, dim: I64, border: I64) -> tuple[I64, I64]:
+def join_columns(n: int, parent: I64, dim: I64, separator: I64) -> tuple[I64, I64]:
     """Join columns into fronts: the last column of each column's front, and the pivot scalars of that front."""
     into, pivots, entries = np.empty(n, np.int64), dim.copy(), np.empty(n, np.int64)
     for k in range(n):
         into[k] = k
-        entries[k] = dim[k] * (dim[k] + 1) // 2 + dim[k] * border[k]
+        entries[k] = dim[k] * (dim[k] + 1) // 2 + dim[k] * separator[k]
     for relaxed in range(2):
         for k in range(n):
             if into[k] != k or parent[k] == NONE:
                 continue
             q = _top(into, parent[k])
             both = pivots[k] + pivots[q]
-            room, true = both * (both + 1) // 2 + both * border[q], entries[k] + entries[q]
+            room, true = both * (both + 1) // 2 + both * separator[q], entries[k] + entries[q]
             zeros = room - true
             if zeros == 0 or (
                 relaxed == 1 and (zeros <= ZEROS * room or (both <= SMALL_PIVOTS and zeros <= SMALL_ZEROS * room))
@@ -175,26 +175,28 @@ def arrange_fronts(n: int, perm: I64, parent: I64, top_of: I64) -> tuple[I64, I6
 
 
 @part
-def _work(n: int, dim: I64, border: I64) -> F64:
+def _work(n: int, dim: I64, separator: I64) -> F64:
     """Nonzeros of R and the flops to make it (the sum of squared row lengths), zeros of joined fronts not counted."""
     work = np.zeros(2)
     for k in range(n):
         for i in range(dim[k]):
-            row = float(border[k] + dim[k] - i)
+            row = float(separator[k] + dim[k] - i)
             work[0] += row
             work[1] += row * row
     return work
 
 
 @part
-def make_records(tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, border: I64, first_scalar: I64) -> I64:
+def make_records(
+    tops: I64, home: I64, parent: I64, front_of: I64, pivots: I64, separator: I64, first_scalar: I64
+) -> I64:
     """The front records without places and maps."""
     records = np.zeros((tops.size, fr.FRONT), np.int64)
     for k in range(home.size - 1, -1, -1):
         records[home[k], fr.VARIABLE], records[home[k], fr.COLUMN] = k, first_scalar[k]
     for f in range(tops.size - 1, -1, -1):
         front, above = records[f], parent[tops[f]]
-        front[fr.PIVOTS], front[fr.BORDER] = pivots[tops[f]], border[tops[f]]
+        front[fr.PIVOTS], front[fr.SEPARATOR] = pivots[tops[f]], separator[tops[f]]
         front[fr.PARENT] = front_of[above] if above != NONE else NONE
         front[fr.CHILD] = front[fr.SIBLING] = NONE
         if above != NONE:
@@ -218,7 +220,7 @@ def _place(records: I64) -> I64:
     top, peak, end = np.zeros(2, np.int64), np.zeros(2, np.int64), fr.SCRATCH
     for f in range(fronts):
         front = records[f]
-        p, m = front[fr.PIVOTS], front[fr.BORDER]
+        p, m = front[fr.PIVOTS], front[fr.SEPARATOR]
         front[fr.LD_ROWS], front[fr.WIDTH_UPDATE] = fr.row_stride(fr.padded_size(p) + m), fr.padded_size(m)
         front[fr.ROWS] = end + fr.padded_size(p) - p
         end += p * front[fr.LD_ROWS]
@@ -235,10 +237,10 @@ def _place(records: I64) -> I64:
 
 
 @part
-def list_borders(
+def list_separators(
     n: int, begin: I64, earlier: I64, home: I64, tops: I64, variables: I64, records: I64
 ) -> tuple[I64, I64]:
-    """The border variables of each front, ascending: walk the tree of fronts from every entry of every row."""
+    """The separator variables of each front, ascending: walk the tree of fronts from every entry of every row."""
     fronts = tops.size
     at = np.zeros(fronts + 1, np.int64)
     for f in range(fronts):
@@ -257,29 +259,29 @@ def list_borders(
 
 
 @part
-def _border_scalars(records: I64, border_at: I64, border_of: I64, dim: I64, first_scalar: I64) -> I64:
-    """The border scalars of each front, ascending."""
+def _separator_scalars(records: I64, separator_at: I64, separator_of: I64, dim: I64, first_scalar: I64) -> I64:
+    """The separator scalars of each front, ascending."""
     total = 0
     for f in range(records.shape[0]):
-        records[f, fr.BORDER_AT] = total
-        total += records[f, fr.BORDER]
-    border, put = np.empty(total, np.int64), 0
-    for e in range(border_at[-1]):
-        for i in range(dim[border_of[e]]):
-            border[put] = first_scalar[border_of[e]] + i
+        records[f, fr.SEPARATOR_AT] = total
+        total += records[f, fr.SEPARATOR]
+    separator, put = np.empty(total, np.int64), 0
+    for e in range(separator_at[-1]):
+        for i in range(dim[separator_of[e]]):
+            separator[put] = first_scalar[separator_of[e]] + i
             put += 1
-    return border
+    return separator
 
 
 @part
 def _maps(
-    label: I64, rows: I64, cols: I64, dim: I64, first_scalar: I64, border_at: I64, border_of: I64, records: I64
+    label: I64, rows: I64, cols: I64, dim: I64, first_scalar: I64, separator_at: I64, separator_of: I64, records: I64
 ) -> tuple[I64, I64]:
     """Where the blocks of Λ and the update matrices of the children go, front by front."""
     n, fronts = dim.size, records.shape[0]
     begin, block_of = _by_earlier(n, label, rows, cols)
     column = np.empty(n, np.int64)  # of the variables of the present front
-    runs, blocks = np.empty((border_of.size, fr.RUN), np.int64), np.empty((rows.size, fr.BLOCK), np.int64)
+    runs, blocks = np.empty((separator_of.size, fr.RUN), np.int64), np.empty((rows.size, fr.BLOCK), np.int64)
     run, block = 0, 0
     for f in range(fronts):
         front = records[f]
@@ -288,9 +290,9 @@ def _maps(
         for k in range(first, last):
             column[k] = width
             width += dim[k]
-        for e in range(border_at[f], border_at[f + 1]):
-            column[border_of[e]] = width
-            width += dim[border_of[e]]
+        for e in range(separator_at[f], separator_at[f + 1]):
+            column[separator_of[e]] = width
+            width += dim[separator_of[e]]
         front[fr.BLOCKS] = block
         for e in range(begin[first], begin[last]):
             b = block_of[e]
@@ -300,7 +302,7 @@ def _maps(
         c = front[fr.CHILD]
         while c != NONE:
             records[c, fr.RUNS] = run
-            run = _runs(runs, run, border_of, border_at[c], border_at[c + 1], dim, column, front[fr.PIVOTS])
+            run = _runs(runs, run, separator_of, separator_at[c], separator_at[c + 1], dim, column, front[fr.PIVOTS])
             records[c, fr.RUNS_END] = run
             c = records[c, fr.SIBLING]
     return runs[:run].copy(), blocks
@@ -333,11 +335,11 @@ def _block(out: I64, b: int, i: int, j: int, dim: I64, column: I64, front: I64) 
 
 
 @inline_kernel
-def _runs(runs: I64, run: int, border_of: I64, begin: int, end: int, dim: I64, column: I64, pivots: int) -> int:
-    """Join neighbours of a child's border that stay neighbours in the parent; gives the next free run."""
+def _runs(runs: I64, run: int, separator_of: I64, begin: int, end: int, dim: I64, column: I64, pivots: int) -> int:
+    """Join neighbours of a child's separator that stay neighbours in the parent; gives the next free run."""
     first, stop = 0, NONE
     for e in range(begin, end):
-        v = border_of[e]
+        v = separator_of[e]
         if column[v] == stop and stop != pivots:
             runs[run - 1, fr.RUN_COUNT] += dim[v]
         else:

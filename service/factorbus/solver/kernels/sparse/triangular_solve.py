@@ -6,29 +6,29 @@ from factorbus.solver.kernels.sparse import fronts as fr
 
 
 @kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
-def solve_fronts_transposed(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+def solve_fronts_transposed(fronts: I64, separator: I64, arena: F64, x: F64, room: F64) -> None:
     """x = R⁻ᵀx in place, from the leaves to the roots; scalars in elimination order.
 
-    room: at least as long as the longest border
+    room: at least as long as the longest separator
     """
     for f in range(fronts.shape[0]):
         front = fronts[f]
-        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.BORDER], front[fr.COLUMN]
+        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.SEPARATOR], front[fr.COLUMN]
         forward_front(arena, r, ld, p, m, x, k, room)
-        b = front[fr.BORDER_AT]
+        b = front[fr.SEPARATOR_AT]
         for j in range(m):
-            x[border[b + j]] -= at(room, j)
+            x[separator[b + j]] -= at(room, j)
 
 
 @kernel("void(int64[:,::1], int64[::1], float64[::1], float64[::1], float64[::1])")
-def solve_fronts(fronts: I64, border: I64, arena: F64, x: F64, room: F64) -> None:
+def solve_fronts(fronts: I64, separator: I64, arena: F64, x: F64, room: F64) -> None:
     """x = R⁻¹x in place, from the roots to the leaves; otherwise as `solve_fronts_transposed`."""
     for f in range(fronts.shape[0] - 1, -1, -1):
         front = fronts[f]
-        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.BORDER], front[fr.COLUMN]
-        b = front[fr.BORDER_AT]
+        r, ld, p, m, k = front[fr.ROWS], front[fr.LD_ROWS], front[fr.PIVOTS], front[fr.SEPARATOR], front[fr.COLUMN]
+        b = front[fr.SEPARATOR_AT]
         for j in range(m):
-            put(room, j, x[border[b + j]])
+            put(room, j, x[separator[b + j]])
         backward_front(arena, r, ld, p, m, x, k, room)
 
 
