@@ -195,8 +195,8 @@ def _about_uncertainty(solver: Solver, report: dict[str, Any]) -> dict[str, byte
     ask = asking.AskRepair(np.array([2, FALSE]), 0.95, values=True)
     found = repair(solver.content(), ask.factors, ask.probability)
     repaired = asking.Repaired(
-        EPOCH, 3, found.false, found.distance, found.suspects, found.before, found.after, _SECONDS,
-        _variables(found.groups),
+        EPOCH, 3, found.false, found.distance, found.suspects, found.before, found.after,
+        found.chi2_left, _SECONDS, _variables(found.groups),
     )  # fmt: skip
     return made | {"ask_repair": repairs.encode_ask_repair(ask), "repaired": repairs.encode_repaired(repaired)}
 

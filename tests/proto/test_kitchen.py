@@ -239,6 +239,7 @@ def test_what_is_repaired_is_false(dense: DenseGraph) -> None:
     after, s = cost(repaired)
     assert told.after == pytest.approx(after, rel=1e-7)
     assert told.distance.tolist() == pytest.approx([s], rel=1e-7)
+    assert told.chi2_left == pytest.approx(after - bound, rel=1e-7)
     best = inserted("insert", "insert_without_values", "insert_loop")
     best.factors.pop(FALSE), best.losses.pop(FALSE)
     best.gauss_newton(200)

@@ -71,6 +71,9 @@ def test_three_of_ten_closures_false_are_found_and_the_drive_is_as_good_as_witho
     assert (found.distance > 0).all()
     placed = [Change("place", keys=g.keys, kind=g.kind, values=g.values) for g in found.groups]
     repaired, *_ = with_changes(solver, [Change("remove_factors", found.false), *placed], settle=True)
+    assert found.chi2_left == pytest.approx(repaired.chi2(), rel=1e-6), (
+        "of what stays, where it is optimal without them"
+    )
     assert error_of(repaired, truth) < 1.2 * right
 
 

@@ -194,7 +194,8 @@ class Repaired:
     """factors (n,): ids of those that are false; distance (n,): s of each at the repaired estimate.
 
     suspects: how many were looked at.  before, after: what the map costs as it is and repaired, each suspect no more
-    than its bound.  variables: the repaired estimate, if it was asked for.
+    than its bound.  chi2_left: χ² of all factors but the false ones, repaired.  variables: the repaired estimate, if it
+    was asked for.
     """
 
     epoch: int
@@ -204,5 +205,6 @@ class Repaired:
     suspects: int
     before: float
     after: float
+    chi2_left: float
     seconds: float
     variables: tuple[Variables, ...] = ()

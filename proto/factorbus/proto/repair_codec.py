@@ -43,6 +43,7 @@ def encode_repaired(message: Repaired) -> bytes:
         "suspects": message.suspects,
         "before": message.before,
         "after": message.after,
+        "chi2_left": message.chi2_left,
         "seconds": message.seconds,
     }
     if message.variables:
@@ -63,6 +64,7 @@ def decode_repaired(data: bytes, limits: MessageLimits = ANSWER_LIMITS) -> Repai
         fields.integer("", content, "suspects"),
         fields.number("", content, "before"),
         fields.number("", content, "after"),
+        fields.number("", content, "chi2_left"),
         fields.number("", content, "seconds"),
         read_values(content),
     )

@@ -286,13 +286,15 @@ def repair_command(
     rows = list(zip(found.factors.tolist(), found.distance.tolist(), strict=True))
     if as_json:
         content = {"revision": found.revision, "suspects": found.suspects, "before": found.before, "after": found.after}
+        content["chi2_left"] = found.chi2_left
         document(content | {"false": [{"factor": factor, "distance": s} for factor, s in rows], "applied": applied})
         return OK
     table(
         [
             ("looked at", str(found.suspects)),
             ("false", f"{len(rows)}{', taken care of' if applied and rows else ''}"),
-            ("cost", f"{found.before:.6g}, without them {found.after:.6g}"),
+            ("χ², each suspect up to its bound", f"{found.before:.6g}, repaired {found.after:.6g}"),
+            ("χ² without the false ones", f"{found.chi2_left:.6g}"),
             *((str(factor), f"rᵀΩr {s:.4g}") for factor, s in rows[:_SHOWN]),
         ],
         title=f"At revision {found.revision}, in {found.seconds:.2f} s",

@@ -246,6 +246,7 @@ def _repaired(taken: QuestionCopies, ask: AskRepair) -> bytes:
             found.suspects,
             found.before,
             found.after,
+            found.chi2_left,
             time.perf_counter() - started,
             variables,
         )

@@ -48,8 +48,8 @@ class Repair:
     """What a map would be without its false factors.
 
     false (n,): their ids   distance (n,): s of each at the repaired estimate   suspects: how many were looked at
-    before, after: Σ min(s, c²) over the suspects and χ² of the others, as the map is and repaired   rounds: solved for
-    groups: the repaired estimate
+    before, after: Σ min(s, c²) over the suspects and χ² of the others, as the map is and repaired
+    chi2_left: χ² of all factors but the false ones, repaired   rounds: solved for   groups: the repaired estimate
     """
 
     false: I64
@@ -57,6 +57,7 @@ class Repair:
     suspects: int
     before: float
     after: float
+    chi2_left: float
     rounds: int
     groups: list[Group]
 
@@ -82,7 +83,8 @@ def repair(graph: FactorGraph, factors: I64 | None = None, probability: float = 
     repaired = graph.copied()
     repaired.values = best
     ids = graph.ids_of(rows[false])
-    return Repair(ids, distance[false], rows.size, before, after, rounds, repaired.variables())
+    left = after - float(problem.bound[false].sum())
+    return Repair(ids, distance[false], rows.size, before, after, left, rounds, repaired.variables())
 
 
 def find_loops(graph: FactorGraph) -> I64:
