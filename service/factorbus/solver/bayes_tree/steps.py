@@ -6,6 +6,7 @@ linear model (MATH §9.6).  One that raises χ² is replaced by Levenberg-Marqua
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,7 +38,7 @@ _NOTHING_TO_RELINEARIZE = "no linearization error above its threshold"
 # hundred times what it comes to.
 _FINISHED_LEFT = 1e-7
 # By what share of χ² a step of Levenberg-Marquardt may lower it that is the last one, where pivots were raised.
-_AT_END = 1e-6
+_AT_END = 1e-7
 # Of `converged_share`: what a step that follows one that had not converged may gain, and say that it has.
 _STILL = 0.1
 _ASKED = "asked to settle"
@@ -59,6 +60,7 @@ class TreeSteps:
         self._mark = graph.mark()
         self._first_new, self._batched, self._at_linearization = 0, False, False
         self._bounded = True  # whether the last step ended within its bound
+        self._damping = 0.0  # with which a batch ended that had not converged: the next one goes on from it
         self._moved: I64 = np.empty(0, np.int64)  # by a batch
         self.before_batch: F64 = np.empty(0)  # the values before the last step that was a batch
 
@@ -92,6 +94,7 @@ class TreeSteps:
         compiled = clock() if clock else 0.0
         self._at_linearization = False
         if not settle and not tree.state.item(tl.S_AFTER) and not self._stalls:
+            self._damping = 0.0
             return self._account(started, compiled, None, because)
         result, because = self._complete(settle and bool(self._graph.counts[at.COLUMNS]), because)
         return self._account(started, compiled, result, because)
@@ -145,11 +148,21 @@ class TreeSteps:
 
     @property
     def _stalls(self) -> bool:
-        """Whether the tree's last step, with nothing new, left more to do and lowered χ² by less than that."""
-        if not self._tree.state.item(tl.S_CONTINUES) or not self.unfinished:
+        """Whether the tree's last step, with nothing new, raised χ², or left more to do and lowered it by less."""
+        if not self._tree.state.item(tl.S_CONTINUES):
             return False
-        chi2, before = self._tree.totals.item(tl.T_CHI2), self._tree.totals.item(tl.T_BEFORE)
-        return before - chi2 <= FINISHED * (max(chi2, 0.0) + LEAST_CHI2)
+        least = FINISHED * self._share
+        return self._gained < -least or (self._gained <= least and self.unfinished)
+
+    @property
+    def _gained(self) -> float:
+        """By how much the tree's last step lowered χ²."""
+        return self._tree.totals.item(tl.T_BEFORE) - self._tree.totals.item(tl.T_CHI2)
+
+    @property
+    def _share(self) -> float:
+        """What shares of χ² are of."""
+        return max(self._tree.totals.item(tl.T_CHI2), 0.0) + LEAST_CHI2
 
     def _is_within(self, share: float, chi2: float) -> bool:
         """Whether χ² is known to be within a share of its optimum where R is not that of Λ, (9.29)."""
@@ -186,7 +199,7 @@ class TreeSteps:
         if settle or worse or rises or goes_on or self._stalls:
             tree.exchange()
             before = self._graph.values.copy()
-            if not worse:
+            if not worse and not (continues and self._gained < 0.0):
                 tree.exchange()
             result = self._batch(before, settle, continues)
             reasons = (settle, _ASKED), (worse, _WOULD_RISE), (rises, _ROSE), (goes_on, _GOES_ON), (True, _STALLS)
@@ -194,8 +207,9 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - result.chi2 <= _AT_END * (result.chi2 + LEAST_CHI2):
                 result.converged = True
-            if result and result.converged:
-                tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2]
+            # Of the optimum of a batch that has not converged nothing is known.
+            tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
+            self._damping = 0.0 if result.converged else result.damping
             # The tree's own step followed, and what it was before is that of the step.
             tree.totals[tl.T_BEFORE] = chi2_before
         if not math.isfinite(tree.totals[tl.T_CHI2]):
@@ -238,9 +252,12 @@ class TreeSteps:
         system.begin(np.empty(0, np.int64), Stopwatch(None))
         chi2 = self._sum_chi2(int(self._graph.counts[at.FACTORS]))
         rule = (further_rule if continues else ordinary_rule)(options, options.batch_tolerance)
+        damping = self._damping if continues and not settle else 0.0
         if settle:
             rule = settling_rule(options)
-        result = minimize(system, chi2, 0.0, rule)
+        elif damping:
+            rule = replace(rule, nonmonotone=0)
+        result = minimize(system, chi2, damping, rule)
         if result.iterations or not settle:
             self._tree.move_all()
             self._tree.step()
@@ -273,6 +290,7 @@ class TreeSteps:
         bounded = converged
         if not result and not self._bounded:  # in a long valley a step gains hardly less than the one before
             converged &= chi2_before - chi2 <= _STILL * share * (chi2 + LEAST_CHI2)
+        converged = converged or (not result and not self.unfinished)
         self._bounded = bounded
         # In the order of the fields, and by no call that Python would have to bind them for: that takes longer than all
         # the rest.
@@ -291,7 +309,7 @@ class TreeSteps:
             inactive,
             nonzeros,
             float(flops),
-            0.0,  # damping
+            self._damping,
             converged,
             PhaseShares(tl.PHASES, reported[_COUNTS:], compiled_ms),
             1e3 * (clock() - started) if clock else 0.0,

@@ -107,7 +107,8 @@ def minimize(
     3. linearize at its end; 4. accept it if χ² does not rise there, else factorize with more damping, or go over the
     hill where `rule` has non-monotone steps.  5. After an undamped step the old factor with the new gradient gives, for
     the price of one solve, what another step would gain: nothing, and the loop ends; little, and that step is tried as
-    it is; else Λ has changed and is factorized anew.
+    it is; else Λ has changed and is factorized anew.  6. After a damped step that gained nothing an undamped factor
+    tells what is left: where residuals are large, undamped steps may lead away from the very optimum.
     With `have_factor` the loop begins with a factor that is there, as after an undamped step.  With non-monotone steps
     it begins without `damping`, which counts once they have been taken back.
     """
@@ -150,6 +151,9 @@ def minimize(
         problem.accept()
         result.iterations += 1
         gained, result.chi2 = result.chi2 - reached, reached
+        if not undamped and rule.is_negligible(gained, reached) and _is_optimum(problem, result, rule):
+            result.converged = True
+            break
         _damp_less(result, gained, expected=decrease)
         if undamped:
             decrease, fresh = problem.decrease(), False
@@ -179,6 +183,15 @@ def try_linear_step(problem: LinearizedLeastSquares, chi2: float, rule: Stopping
     problem.accept_linear()
     result.chi2, result.iterations = reached, 1
     return result
+
+
+def _is_optimum(problem: LeastSquares, result: Minimization, rule: StoppingRule) -> bool:
+    """Whether an undamped step would gain nothing, by a factor that is made for that."""
+    result.factorizations += 1
+    if problem.factorize(0.0) >= 0:
+        return False
+    result.left = problem.decrease()
+    return rule.is_negligible(result.left, result.chi2)
 
 
 def _go_over_hill(problem: LeastSquares, result: Minimization, reached: float, most: int) -> int:
