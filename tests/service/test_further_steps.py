@@ -120,7 +120,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
         late.apply_whole((), further=True)
     assert values(again) == values(map_.map_solver) == values(late)
     assert not again.unfinished
-    # Nothing is left to do, whoever insists.
+    # Nothing is left to do, also when asked again.
     before = values(map_.map_solver)
     map_.apply(further=True)
     assert values(map_.map_solver) == before

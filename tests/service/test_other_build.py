@@ -266,7 +266,7 @@ def test_a_long_replay_is_made_once(
 
 
 @pytest.mark.parametrize("processor", ["", "elsewhere"])
-def test_a_damaged_checkpoint_is_not_read_whoever_wrote_it(
+def test_a_damaged_checkpoint_is_not_read_whichever_build_wrote_it(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, processor: str
 ) -> None:
     if processor:

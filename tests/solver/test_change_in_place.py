@@ -309,8 +309,8 @@ def test_a_false_loop_taken_out_of_a_large_map_leaves_its_optimum() -> None:
     ends = np.array([[int(solver._graph.keys[20]), int(solver._graph.keys[380])]])
     false = Factors("between_se2", ends, np.array([[30.0, -40.0, 1.0]]), np.array([[400.0, 0, 0, 400, 0, 4000]]))
     first = solver.stage(Batch(factors=(false,)))
-    bent = solver.step()
-    assert bent.chi2 > 10 * settled.chi2()
+    deformed = solver.step()
+    assert deformed.chi2 > 10 * settled.chi2()
     came = try_change(solver, [Change("remove_factors", np.array([first]))])
     assert came is not None
     report = came[1]

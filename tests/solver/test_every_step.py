@@ -29,7 +29,7 @@ from factorbus.solver.kernels.inc_l import block_rows as br
 RELATIVE = 1e-9
 ROUNDING = 100  # times what refining changes of CHOLMOD's own: 37 has been seen, and it depends on the BLAS
 PROBES = 4
-ENTRYWISE = 50  # every so many steps
+ENTRYWISE = 50  # steps from one check of all entries to the next
 # "omega" and "lambda" update R the one way for as long as it lives, and never move the linearization point.
 WAYS = {
     "omega": {

@@ -110,9 +110,9 @@ def drives(draw: st.DrawFn) -> list[Batch]:
 
 
 @settings(max_examples=200)
-@given(steps=drives(), way=st.sampled_from(sorted(WAYS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
-def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, bent: float) -> None:
-    solver = follow(steps, **WAYS[way], relinearize_threshold=bent, converged_share=1e9)
+@given(steps=drives(), way=st.sampled_from(sorted(WAYS)), threshold=st.sampled_from([0.0, 0.05, 1e9]))
+def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, threshold: float) -> None:
+    solver = follow(steps, **WAYS[way], relinearize_threshold=threshold, converged_share=1e9)
     settled = solver.step(settle=True).chi2
     assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
 
@@ -193,7 +193,7 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, 
 
 
 def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
-    """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.16)."""
+    """Where many small linearization errors add up, a step solves again before it ends, MATH (9.16)."""
     solver, ratios = Solver(Options(mode="bayes-tree")), []
     for n, step in enumerate(manhattan(600, 11)):
         solver.stage(step.batch)

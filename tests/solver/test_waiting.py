@@ -1,4 +1,4 @@
-"""When bent variables are relinearized: all that wait together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
+"""When waiting variables are relinearized: all together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
 
 from collections.abc import Iterator
 
@@ -106,7 +106,7 @@ def test_nothing_waits_longer_than_patience() -> None:
     assert patience // 2 < longest <= patience + 1
 
 
-def test_what_is_bent_far_does_not_wait() -> None:
+def test_what_has_a_large_error_does_not_wait() -> None:
     """By itself it is nothing in the χ² of a large map, and much where it is."""
     limit = 0.2
     solver, found = Solver(Options.of(**{**NEVER, "relinearize_max_error": limit})), 0
