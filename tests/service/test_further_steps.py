@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from turned import closing, optimum
 from unconverged import DEGREES, EPOCH, FEW, POSES, arrived, inserts
 
@@ -232,7 +233,7 @@ def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
         goes_on = solver._stepper._goes_on
         report = true_step(solver, settle)
         if goes_on:
-            solver._graph.values[0] = 2 * MOST_NUMBER
+            graph_in(solver).values[0] = 2 * MOST_NUMBER
             solver._stepper._changed = np.arange(solver.variable_count)
         return report
 

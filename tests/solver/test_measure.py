@@ -4,10 +4,11 @@ import copy
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
+from naive.tree_records import tree_of
 
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.linearization_error import MUCH, evaluate_moved
@@ -32,8 +33,7 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
     for step in WORLDS[world](poses, 3):
         solver.stage(step.batch)
         solver.step()
-    assert isinstance(solver._stepper, TreeSteps)
-    graph, tree = solver._graph, solver._stepper.tree
+    graph, tree = graph_in(solver), tree_of(solver)
     count = int(tree.state[tl.S_VARIABLES])
     free = np.flatnonzero(graph.var[:count, at.V_COLUMN] >= 0)
     for share, threshold in ((0.3, 1e-3), (0.6, 1e-2), (1.0, 0.1)):
@@ -51,7 +51,7 @@ def test_both_ways_find_the_same(world: str, poses: int) -> None:
 
 def found(solver: Solver, tree: CliqueTree, moved: np.ndarray, threshold: float, variables: int) -> tuple:
     """The largest error, Σ error² by factor, who waits, ascending, how each is marked, and χ² by factor."""
-    graph, state, node, totals = solver._graph, tree.state.copy(), tree.node.copy(), tree.totals.copy()
+    graph, state, node, totals = graph_in(solver), tree.state.copy(), tree.node.copy(), tree.totals.copy()
     pending, listed, factor_errors = tree.pending.copy(), np.zeros_like(tree.moved), tree.factor_errors.copy()
     node[:, tl.N_FLAGS] = node[:, tl.N_LISTED] = 0
     node[moved, tl.N_LISTED], listed[: moved.size] = MODEL, moved

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from naive.dense_factors import boxplus
 from naive.dense_least_squares import DenseGraph, distance
 from naive.random_graphs import factor, random_steps
+from naive.solver_parts import graph_in
 from naive.tree_records import assert_is_a_tree, tree_of
 from naive.tree_solution import assert_is_solution, assert_solves
 
@@ -40,7 +41,7 @@ class Whole:
 
 def linearized(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
     """A dense graph at the linearization points, which shares no code with the solver, and δ."""
-    tree, graph, dense = tree_of(solver), solver._graph, DenseGraph()
+    tree, graph, dense = tree_of(solver), graph_in(solver), DenseGraph()
     variables, factors = solver.graph()
     dense.add(Whole(variables, factors))
     dense.kinds, delta = {}, []
@@ -214,9 +215,9 @@ def test_a_long_drive_does_not_drift() -> None:
         tree_of(solver),
         Solver(Options.of(**EXACT, relinearize_threshold=1e9, converged_share=1e9, initialize_locally=False)),
     )
-    delta = tree.scalars[0, : solver._graph.counts[at.SCALARS]].copy()
+    delta = tree.scalars[0, : graph_in(solver).counts[at.SCALARS]].copy()
     variables, factors = solver.graph()
-    graph = solver._graph
+    graph = graph_in(solver)
     for group in variables:
         rows = [int(graph.find(int(key))) for key in group.keys]
         for row, v in enumerate(rows):
@@ -224,13 +225,13 @@ def test_a_long_drive_does_not_drift() -> None:
             group.values[row] = tree.lin[0, x : x + group.values.shape[1]]
     fresh.stage(Whole(variables, factors))
     fresh.step()
-    order = {int(key): v for v, key in enumerate(fresh._graph.keys[: fresh.variable_count])}
+    order = {int(key): v for v, key in enumerate(graph_in(fresh).keys[: fresh.variable_count])}
     again = np.concatenate(
         [
             tree_of(fresh).scalars[0, d : d + 3]
             for v in range(solver.variable_count)
             if graph.var[v, at.V_SCALAR] >= 0
-            and (d := int(fresh._graph.var[order[int(graph.keys[v])], at.V_SCALAR])) >= 0
+            and (d := int(graph_in(fresh).var[order[int(graph.keys[v])], at.V_SCALAR])) >= 0
         ]
     )
     np.testing.assert_allclose(delta, again, rtol=0, atol=1e-9 * np.abs(again).max())
