@@ -89,7 +89,7 @@ _WAYS = {
 class Answer:
     """length: what Content-Length says, where it is not that of the body; None leaves it out.
 
-    released: waited for before the answer, or, with `head`, after so many bytes of the body.
+    released: waited for before the answer, or, with `head`, after that number of bytes of the body.
     """
 
     body: bytes = b""

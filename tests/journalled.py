@@ -107,11 +107,11 @@ class Stream(threading.Thread):
         self._allowed, self._more = threading.Semaphore(0), threading.Condition()
 
     def allow(self, more: int) -> None:
-        """Let it send so many more."""
+        """Let it send that number more."""
         self._allowed.release(more)
 
     def wait_for(self, answered: int) -> None:
-        """Until so many are answered."""
+        """Until that number is answered."""
         with self._more:
             enough = self._more.wait_for(lambda: len(self.acknowledged) >= answered or self.fault, PATIENCE_S)
         assert enough, f"{len(self.acknowledged)} of {answered} answered in {PATIENCE_S} s"

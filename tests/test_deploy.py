@@ -136,7 +136,7 @@ def test_compose_is_of_one_piece() -> None:
         assert set(service.get("depends_on", ())) <= set(compose["services"])
         for volume in service.get("volumes", ()):
             source = volume.split(":")[0]
-            if source.startswith("."):  # certificates are made by whoever runs it
+            if source.startswith("."):  # certificates are made where it is run
                 assert source == "./certificates" or (DEPLOY / "docker" / source).exists(), source
             else:
                 assert source in compose["volumes"]

@@ -32,7 +32,7 @@ def test_the_rest_of_the_readme(tmp_path: Path) -> None:
         assert {"town.g2o", "town.png", "town.tum"} == {path.name for path in tmp_path.iterdir()}
         assert len((tmp_path / "town.tum").read_text().splitlines()) == 1000
         run(*serve)
-        for _ in range(2):  # whoever tries it twice is not met with an error
+        for _ in range(2):  # a second try is not met with an error
             before, after = (line.split("at", 1)[1] for line in run(*program).splitlines())
             assert distance(before) > 0.05
             assert distance(after) < distance(before) / 10

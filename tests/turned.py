@@ -49,7 +49,7 @@ def turn(joined: Map, size: tuple[int, float]) -> Deltas:
 
 
 def drive(poses: int, degrees: float) -> Iterator[Batch]:
-    """A circle of so many poses, one a step, which ends `degrees` too far round."""
+    """A circle of a number of poses, one a step, which ends `degrees` too far round."""
     yield _first(Draft()).batch()
     for n in range(1, poses):
         yield _next(Draft(), n, poses, degrees).batch()

@@ -49,7 +49,7 @@ from factorbus.solver.options import MODES
 
 
 class Drive(NamedTuple):
-    """One drive to follow.  poses 0: all; every: judge each so many-th step; check: so many by SciPy too."""
+    """One drive to follow.  poses 0: all; every: judge its multiples; check: how many by SciPy too."""
 
     world: str
     seed: int
@@ -134,7 +134,7 @@ def _drives(world: World, seeds: Sequence[int], asked: argparse.Namespace, setti
 
 
 def _measured(drives: Sequence[Drive], jobs: int) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
-    """In this process, or in so many of their own."""
+    """In this process, or in a number of others."""
     if jobs == 1:
         yield from map(measure, drives)
         return

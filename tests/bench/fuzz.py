@@ -51,7 +51,7 @@ DECODERS: tuple[Callable[[bytes], Any], ...] = (
 LIMITS = Limits(message_bytes=1 << 20)
 SMALL = MessageLimits(1 << 20, 10_000, 10_000)
 EPOCH = 7
-_POSES = 60  # a map is compared and begun anew at so many
+_POSES = 60  # a map is compared and begun anew at this number
 _MESSAGES = 500  # or messages: an accepted mutant may have spoilt it for all that follow
 _IN_FLIGHT = 64
 _PATIENCE_S = 60.0

@@ -53,7 +53,7 @@ def measure() -> dict[str, Any]:
 
 @contextmanager
 def front(workers: int) -> Iterator["Front"]:
-    """A filter front end of a service of its own with so many workers, the way to all of which is known."""
+    """A filter front end of a service of its own with a number of workers, the way to all of which is known."""
     with ExitStack() as stack:
         endpoint = stack.enter_context(process("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--no-warm"))
         for number in range(workers):

@@ -32,7 +32,7 @@ def tables() -> dict[str, Any]:
 
 
 def counted(n: int, existing: int = 0) -> dict[str, int]:
-    """Multiplications of the three for n new features and so many existing ones."""
+    """Multiplications of the three for n new features and a number of existing ones."""
     sighting, P = random_sighting(1, n, existing)
     seen = idp.see(sighting)
     A, B = idp.jacobians(sighting, seen)

@@ -209,7 +209,7 @@ class Account:
 
 
 def run(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Until so many inserts are answered, or time is up."""
+    """Until this number of inserts is answered, or time is up."""
     letters, account, began = LETTERS[: options.clients], Account(), time.monotonic()
     with ExitStack() as stack:
         start = stack.enter_context(processes(folder))

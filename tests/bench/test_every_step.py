@@ -88,7 +88,7 @@ def test_a_ratio_is_a_share_of_the_optimum_or_below_one_the_excess() -> None:
     assert Look(199.0, 200.0, 0.0, 1).ratio == 1.0
 
 
-def test_odometry_that_is_bent_away_from_its_fit_is_told_in_standard_deviations() -> None:
+def test_odometry_off_its_fit_is_reported_in_standard_deviations() -> None:
     steps = steps_of("manhattan", 3)
     solver, judged = Solver(), Judge()
     for batch in steps:
@@ -96,8 +96,8 @@ def test_odometry_that_is_bent_away_from_its_fit_is_told_in_standard_deviations(
         solver.step()
         judged.take_in(batch)
     sigma = 0.0225
-    bent = [_shifted(group, 2 * sigma) for group in solver.estimate()]
-    look = judged.look(bent)
+    shifted = [_shifted(group, 2 * sigma) for group in solver.estimate()]
+    look = judged.look(shifted)
     assert look.odometry == pytest.approx(2.0, rel=1e-6)
     assert look.chi2 == pytest.approx(4.0, rel=1e-6)
     assert look.optimum == pytest.approx(0.0, abs=1e-9)

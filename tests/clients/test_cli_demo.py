@@ -80,7 +80,7 @@ def test_an_optimum_that_had_not_converged_is_told_at_the_end() -> None:
         (signal.SIGKILL, "robot", FAILED),
     ],
 )
-def test_no_process_is_left_whoever_is_killed(number: int, whom: str, code: int, tmp_path: Path) -> None:
+def test_no_process_is_left_whichever_is_killed(number: int, whom: str, code: int, tmp_path: Path) -> None:
     with subprocess.Popen(
         [FACTORBUS, "demo", "--poses", "100000"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

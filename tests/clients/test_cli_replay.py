@@ -174,7 +174,7 @@ def test_a_data_set_over_the_bus_ends_at_the_reference_optimum(datasets: Path, n
         (signal.SIGKILL, "solver", FAILED, "the solver process ended with exit code -9"),
     ],
 )
-def test_no_process_is_left_whoever_is_killed(number: int, whom: str, code: int, said: str, long_drive: Path) -> None:
+def test_no_process_is_left_whichever_is_killed(number: int, whom: str, code: int, said: str, long_drive: Path) -> None:
     with subprocess.Popen(
         [FACTORBUS, "replay", str(long_drive)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

@@ -73,7 +73,7 @@ def test_inserts_that_overtook_are_sent_again_behind_the_first(start: Callable[.
         assert same(kitchen.estimate, service)
 
 
-def test_a_refusal_reaches_whoever_looks(start: Callable[..., Service], endpoint: str) -> None:
+def test_a_refusal_reaches_every_reader(start: Callable[..., Service], endpoint: str) -> None:
     service = start()
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
         with pytest.raises(Refused, match="NaN"):

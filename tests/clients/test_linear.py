@@ -7,6 +7,7 @@ import pytest
 from naive.dense_factors import TANGENT, boxminus, boxplus
 from naive.dense_least_squares import distance, full
 from naive.random_graphs import random_value
+from naive.solver_parts import graph_in
 
 from factorbus.client import Draft
 from factorbus.pieces import MOST
@@ -195,11 +196,11 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
         if n % 10 == 9:
             gone = [symbol(c, k) for c in "xvag" for k in range(n - 9, n - 4) if n > 9]
             gone += [symbol(c, k) for c in "xvag" for k in range(5) if n == 9]
-            gone = [key for key in gone if window._graph.find(key) >= 0]
+            gone = [key for key in gone if graph_in(window).find(key) >= 0]
             window, *_ = with_changes(window, [Change("marginalize", keys=np.array(gone))])
-    assert [len(joint.variables) for joint in find_joints(solver._graph)] == [8] * (count - 1)
+    assert [len(joint.variables) for joint in find_joints(graph_in(solver))] == [8] * (count - 1)
     assert window.factor_count < solver.factor_count
-    assert max(len(joint.variables) for joint in find_joints(window._graph)) <= 8
+    assert max(len(joint.variables) for joint in find_joints(graph_in(window))) <= 8
     for of in (solver, window):
         of.step(settle=True)
     # The newest is undone, its variables with it; the one in the middle of all leaves its neighbours what they are.
@@ -208,18 +209,18 @@ def test_a_chain_of_them_is_told_apart_undone_and_slides(mode: str) -> None:
     undone, *_ = with_changes(
         solver, [Change("remove_factors", ids), Change("remove_variables", keys=last, alone=True)]
     )
-    assert len(find_joints(undone._graph)) == count - 2
+    assert len(find_joints(graph_in(undone))) == count - 2
     # Sent on to another map they are still told apart.
     variables, factors = solver.graph()
     other = Solver(Options(mode=mode))
     other.stage(Batch(tuple(variables), tuple(factors)))
     other.step(settle=True)
-    assert len(find_joints(other._graph)) == count - 1
+    assert len(find_joints(graph_in(other))) == count - 1
     for key, row in values(other).items():
         assert np.abs(row - values(solver)[key]).max() < 1e-7  # the last is known to half a metre
     # A marginal of one state has the next one in its border, and nothing else.
     slid, *_ = with_changes(solver, [Change("marginalize", keys=np.array([symbol(c, 0) for c in "xvag"]))], settle=True)
-    widths = sorted(len(joint.variables) for joint in find_joints(slid._graph))
+    widths = sorted(len(joint.variables) for joint in find_joints(graph_in(slid)))
     assert widths == [4] + [8] * (count - 2)
     for key, row in values(slid).items():
         assert np.abs(row - values(solver)[key]).max() < 1e-7

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from naive.random_sightings import CAMERAS
 
-from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
+from factorbus.cli.demo.evaluate_filter import FilterEvaluator, verdict
 from factorbus.client.filter_state import Grown
 from factorbus.idp import lenses, minimal, see
 from factorbus.proto.camera import Camera
@@ -86,9 +86,9 @@ class Near:
 def test_rays_become_points_and_the_filter_knows_how_well(camera: str) -> None:
     """200 frames, 300 points, 1 pixel of noise, 5 % outliers."""
     world: MonocularWorld = monocular(200, 4, camera=CAMERAS[camera])
-    sightseer = Sightseer(world, Near(world.camera, rho=0.28, sigma_rho=0.2, sigma_pixel=1.0), 40)  # type: ignore[arg-type]
-    frames = list(sightseer.run())
-    result = verdict(frames, sightseer)
+    evaluator = FilterEvaluator(world, Near(world.camera, rho=0.28, sigma_rho=0.2, sigma_pixel=1.0), 40)  # type: ignore[arg-type]
+    frames = list(evaluator.run())
+    result = verdict(frames, evaluator)
     assert result["relative_depth"]["first"] > 0.5
     assert result["relative_depth"]["last"] < 0.02
     assert result["inverse_depth_within_3_sigma"] >= 0.99

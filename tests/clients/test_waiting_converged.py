@@ -138,7 +138,7 @@ def test_a_map_that_has_converged_and_gave_up_to_be_polished_is_as_good_as_it_ge
 
 @pytest.mark.parametrize("converged", [True, False])
 def test_who_joins_later_is_told_with_the_estimate(service: Service, tmp_path: Path, converged: bool) -> None:
-    """Only deltas carry a report; whoever began with the whole estimate has seen none."""
+    """Only deltas carry a report; a mirror that began with the whole estimate has seen none."""
     service.step({1: (1.0, 2.0)})
     service.says = {"converged": converged, "converging": False, "gave_up": "" if converged else "it is told to"}
     with connect(endpoint_in(tmp_path), client="late") as bus, bus.map(MAP) as joined:

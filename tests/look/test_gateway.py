@@ -219,7 +219,7 @@ def test_the_page_in_a_browser(endpoint: str, gateway: str, tmp_path: Path) -> N
             assert "last step of the map: batch: asked to settle" in panel
             factors = sum(int((g.keys == keys_of(name)).any(axis=1).sum()) for g in joined.graph().batch.factors)
             assert page.locator("#panel tr").count() == factors + 1
-            page.screenshot(path=tmp_path / "page.png")  # for whoever wants to look
+            page.screenshot(path=tmp_path / "page.png")  # for a person to look at
             assert failures == []
 
 

@@ -99,7 +99,7 @@ def test_a_browser_shows_the_served_view(endpoint: str, spawn: Callable[..., Pro
             while not is_drawn(picture_of(page)) and time.monotonic() < end:
                 page.wait_for_timeout(500)  # the viewer draws into a canvas: there is nothing else to wait on
             assert is_drawn(picture_of(page)), "the way, and the ellipses around it"
-            page.screenshot(path=tmp_path / "watch.png")  # for whoever wants to look
+            page.screenshot(path=tmp_path / "watch.png")  # for a person to look at
         watcher.signal(signal.SIGINT)
         assert watcher.wait() == OK
 
@@ -136,7 +136,7 @@ def test_a_map_that_is_yet_to_come_is_waited_for(endpoint: str, spawn: Callable[
     assert "stopped before there was a map never" in waiting.errors()
 
 
-def test_the_viewer_listens_on_this_machine_alone_and_ends_with_whoever_started_it() -> None:
+def test_the_viewer_listens_on_this_machine_alone_and_ends_with_the_process_that_started_it() -> None:
     from factorbus.viz.viewer_process import Viewer
 
     data, web = free_port(), free_port()

@@ -7,12 +7,21 @@ from factorbus.solver import Solver
 from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.graph.factor_graph import FactorGraph
 from factorbus.solver.graph.variables import VARIABLE_KIND_OF_CODE
+from factorbus.solver.inc_l.incremental import Incremental
+from factorbus.solver.inc_l.steps import IncrementalSteps
 from factorbus.solver.kernels.model import layout as at
+from factorbus.solver.optimize.system import System
 
 
 def graph_in(solver: Solver) -> FactorGraph:
     """The factor graph of a solver."""
     return solver._graph
+
+
+def system_in(solver: Solver) -> System[Incremental]:
+    """The normal equations of a solver that has not the mode "bayes-tree", with their factor."""
+    assert isinstance(solver._stepper, IncrementalSteps)
+    return solver._stepper.system
 
 
 def keys_in(solver: Solver) -> list[int]:

@@ -29,6 +29,12 @@ def tree_of(solver: Solver) -> CliqueTree:
     return solver._stepper.tree
 
 
+def stays_at_linearization(solver: Solver) -> bool:
+    """Whether its estimate was left where the tree is linearized: R waits for the next step to be used."""
+    assert isinstance(solver._stepper, TreeSteps)
+    return solver._stepper._at_linearization
+
+
 def cliques(solver: Solver) -> dict[int, Clique]:
     """The cliques that hold the free variables."""
     tree, var = tree_of(solver), solver._graph.var

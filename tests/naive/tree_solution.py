@@ -29,7 +29,7 @@ def assert_is_solution(
         tell = max(least, 1e-15 * np.linalg.cond(unit))
         np.testing.assert_allclose(delta * scale, right, rtol=0, atol=tell * max(np.abs(right).max(), 1.0))
     model = chi2 - (delta @ eta if delta.size else 0.0)
-    assert tree_of(solver).account[tl.T_MODEL] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
+    assert tree_of(solver).totals[tl.T_MODEL] == pytest.approx(model, rel=1e-9, abs=1e-9 * max(chi2, 1.0))
 
 
 def normal_equations(solver: Solver) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

@@ -67,7 +67,7 @@ class RosNode:
         return []
 
     def wait_for_endpoints(self, count: int, timeout_s: float = 30.0) -> list[str]:
-        """The tokens of nodes, publishers and subscriptions, once a node and so many others are seen.
+        """The tokens of nodes, publishers and subscriptions, once a node and a number of others are seen.
 
         A token comes after what it stands for; in what order they come is not said.
         """

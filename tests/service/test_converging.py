@@ -259,7 +259,7 @@ def test_steps_that_move_to_and_fro_end_it(driven: Driven) -> None:
 def test_slow_ones_that_lower_it_go_on_and_there_is_an_end_to_them_too(
     driven: Driven, took_s: float, most: int
 ) -> None:
-    """After so many, or when they took too much of a core: the one step more was begun before that was known."""
+    """After some steps, or when they took too much of a core: the one step more was begun before that was known."""
     driven.insert(converged=False)
     assert chain(driven, lambda n: {"chi2": 1e3 * (1 - 1e-8 * n), "took_s": took_s}) == most + (took_s > 0)
     assert driven.says() == GAVE_UP

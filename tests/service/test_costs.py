@@ -161,7 +161,7 @@ def test_the_cost_is_not_below_the_answer() -> None:
 
 
 def many(solver: Callable[[], Solver], landmarks: int) -> Solver:
-    """A pose that sees so many landmarks at one place."""
+    """A pose that sees a number of landmarks at one place."""
     made = solver()
     keys = np.arange(1, landmarks + 1)
     ends = np.column_stack([np.zeros_like(keys), keys])

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from turned import closing, optimum
 from unconverged import DEGREES, EPOCH, FEW, POSES, arrived, inserts
 
@@ -120,7 +121,7 @@ def test_a_map_that_has_converged_is_polished_to_its_optimum_and_made_again(tmp_
         late.apply_whole((), further=True)
     assert values(again) == values(map_.map_solver) == values(late)
     assert not again.unfinished
-    # Nothing is left to do, whoever insists.
+    # Nothing is left to do, also when asked again.
     before = values(map_.map_solver)
     map_.apply(further=True)
     assert values(map_.map_solver) == before
@@ -232,7 +233,7 @@ def escaping(monkeypatch: pytest.MonkeyPatch) -> None:
         goes_on = solver._stepper._goes_on
         report = true_step(solver, settle)
         if goes_on:
-            solver._graph.values[0] = 2 * MOST_NUMBER
+            graph_in(solver).values[0] = 2 * MOST_NUMBER
             solver._stepper._changed = np.arange(solver.variable_count)
         return report
 

@@ -68,7 +68,7 @@ class Map:
 
 
 def fuzz(mode: str, seed: int, inserts: int) -> Counter[str]:
-    """One map with so many inserts; how they were answered."""
+    """One map with these inserts; how they were answered."""
     rng = np.random.default_rng(seed)
     world, tried, codes = Extremes(rng), Map(mode), Counter[str]()
     batch = world.begin()

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 
 from factorbus.journal.checkpoints import file_of
 from factorbus.journal.problems import JournalDiffers, JournalFailed
@@ -127,8 +128,8 @@ def rounding_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def step(solver: Solver, settle: bool = False) -> Any:
         report = true_step(solver, settle)
-        last = int(solver._graph.counts[at.VALUES]) - 1
-        solver._graph.values[last] = np.nextafter(solver._graph.values[last], 9.0)
+        last = int(graph_in(solver).counts[at.VALUES]) - 1
+        graph_in(solver).values[last] = np.nextafter(graph_in(solver).values[last], 9.0)
         return report
 
     monkeypatch.setattr(Solver, "step", step)
@@ -266,7 +267,7 @@ def test_a_long_replay_is_made_once(
 
 
 @pytest.mark.parametrize("processor", ["", "elsewhere"])
-def test_a_damaged_checkpoint_is_not_read_whoever_wrote_it(
+def test_a_damaged_checkpoint_is_not_read_whichever_build_wrote_it(
     values: dict[int, bytes], reopen: Callable[[], Session], tmp_path: Path, processor: str
 ) -> None:
     if processor:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.random_graphs import camera_steps, random_steps
+from naive.solver_parts import graph_in
 
 from factorbus.proto import codec
 from factorbus.proto.kinds import LOSSES
@@ -22,7 +23,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def arenas(solver: Solver) -> list[bytes]:
     """All that is in use."""
-    graph = solver._graph
+    graph = graph_in(solver)
     variables, factors, values, payload, columns, *_ = graph.counts.tolist()
     return [
         part.tobytes()
@@ -114,6 +115,6 @@ def test_what_the_solver_refuses_leaves_no_trace(seed: int) -> None:
     for bad in damaged(last, np.random.default_rng(seed)):
         codes.add(stage_both(quick, usual, bad))
         for solver in (quick, usual):
-            solver._graph.forget(held)
+            graph_in(solver).forget(held)
     assert len(codes) > 2
     assert stage_both(quick, usual, last) == ""

@@ -29,7 +29,7 @@ together._take_turns(Path(sys.argv[1]), print)
 """
 
 
-def test_every_kernel_is_compiled_once_whoever_does_it(tmp_path: Path) -> None:
+def test_every_kernel_is_compiled_once_by_any_process(tmp_path: Path) -> None:
     claims, done, log = tmp_path / "claims", tmp_path / "done", tmp_path / "log"
     claims.mkdir()
     done.mkdir()
@@ -39,7 +39,7 @@ def test_every_kernel_is_compiled_once_whoever_does_it(tmp_path: Path) -> None:
     assert sorted(log.read_text().split()) == sorted(f"k{n}" for n in range(200))
 
 
-def test_those_that_die_leave_their_kernels_to_whoever_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_those_that_die_leave_their_kernels_to_the_process_that_needs_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(together.sys, "executable", "/bin/false")
     told: list[str] = []
     together._share_out(2, told.append)

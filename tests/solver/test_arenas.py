@@ -5,9 +5,10 @@ import pickle
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
+from naive.tree_records import tree_of
 
 from factorbus.solver import Solver
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.graph.arenas import Arenas, lines
 from factorbus.solver.kernels.bayes_tree import records as bayes_tree
 from factorbus.solver.kernels.jit.array_table import WIDTH
@@ -65,12 +66,11 @@ def test_what_no_kernel_could_work_on_is_refused(wrong: np.ndarray) -> None:
 
 def test_those_of_a_solver_are_there_and_as_its_kernels_read_them() -> None:
     solver = Solver()
-    assert isinstance(solver._stepper, TreeSteps)
-    tree = solver._stepper.tree
-    for thing, names in ((solver._graph, model.Graph._fields), (tree, bayes_tree.Tree._fields)):
+    tree = tree_of(solver)
+    for thing, names in ((graph_in(solver), model.Graph._fields), (tree, bayes_tree.Tree._fields)):
         assert rows(thing) == [of(getattr(thing, name)) for name in names]
-    graph, looked_up = model.graph_at(solver._graph.array_table), bayes_tree.tree_at(tree.array_table)
-    assert all(np.shares_memory(getattr(graph, name), getattr(solver._graph, name)) for name in graph._fields)
+    graph, looked_up = model.graph_at(graph_in(solver).array_table), bayes_tree.tree_at(tree.array_table)
+    assert all(np.shares_memory(getattr(graph, name), getattr(graph_in(solver), name)) for name in graph._fields)
     assert all(np.shares_memory(getattr(looked_up, name), getattr(tree, name)) for name in looked_up._fields)
 
 
@@ -86,8 +86,8 @@ def test_rows_begin_with_cache_lines() -> None:
 def test_what_grew_still_does(few: bool) -> None:
     solver = Solver()
     if not few:
-        solver._graph.reserve_variables(5000, 15000)
-        solver._graph.reserve_factors(5000, 45000)
-    graph = solver._graph
+        graph_in(solver).reserve_variables(5000, 15000)
+        graph_in(solver).reserve_factors(5000, 45000)
+    graph = graph_in(solver)
     assert graph.var.ctypes.data % 64 == 0
     assert graph.fac.ctypes.data % 64 == 0

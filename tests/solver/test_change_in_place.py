@@ -9,13 +9,13 @@ from naive.dense_least_squares import DenseGraph
 from naive.estimates import apart, values
 from naive.random_graphs import camera_steps, random_steps
 from naive.random_others import other_steps
-from naive.tree_records import tree_of
+from naive.solver_parts import graph_in
+from naive.tree_records import stays_at_linearization, tree_of
 from naive.tree_solution import assert_is_solution, normal_equations
 
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver, errors
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.changing import try_change, with_changes
 from factorbus.solver.covariance.blocks import CovarianceBlocks
 from factorbus.solver.covariance.why import why_factor
@@ -63,7 +63,7 @@ def twin_of(solver: Solver) -> DenseGraph:
 
 def assert_is_whole(solver: Solver, chi2: float) -> None:
     """χ², what is kept of each factor and variable, R and covariances are those of the factors that are left."""
-    tree, graph, count = tree_of(solver), solver._graph, solver.factor_count
+    tree, graph, count = tree_of(solver), graph_in(solver), solver.factor_count
     wanted = twin_of(solver).chi2()
     assert chi2 == pytest.approx(wanted, rel=1e-9, abs=1e-12)
     assert solver.chi2() == pytest.approx(wanted, rel=1e-9, abs=1e-12)
@@ -80,12 +80,10 @@ def assert_is_whole(solver: Solver, chi2: float) -> None:
             found.append(slot)
             slot = int(tree.link[slot // 2, tl.L_I + slot % 2])
         assert sorted(found) == sorted(2 * f + e for f, e in np.argwhere(ends == v).tolist())
-    assert isinstance(solver._stepper, TreeSteps)
     information, eta, model, delta = normal_equations(solver)
-    if solver._stepper.tree.raised:  # then R is not quite that of Λ
+    if tree_of(solver).raised:  # then R is not quite that of Λ
         return
-    # Else the estimate is where the tree is linearized, and R waits for the next step.
-    if not solver._stepper._at_linearization:
+    if not stays_at_linearization(solver):
         assert_is_solution(solver, information, eta, model, delta, least=2e-8)
     scale = np.sqrt(np.diag(information))
     unit = information / scale / scale[:, None]
@@ -104,12 +102,12 @@ def assert_is_said(problem: errors.SolverError, wanted: str) -> None:
 
 def random_change(solver: Solver, rng: np.random.Generator, weighed: list[Change]) -> list[Change]:
     """One to three changes of factors; `weighed` are those of weights, which may be taken back."""
-    fac = solver._graph.fac[: solver.factor_count]
+    fac = graph_in(solver).fac[: solver.factor_count]
     able = np.flatnonzero(~LINEAR[fac[:, at.F_KIND]])
     changes: list[Change] = []
     for _ in range(int(rng.integers(1, 4))):
         rows = rng.choice(able, size=min(int(rng.integers(1, 4)), able.size), replace=False)
-        ids, what = solver._graph.ids_of(rows), rng.integers(5)
+        ids, what = graph_in(solver).ids_of(rows), rng.integers(5)
         if what == 0 and not any(change.change == "remove_factors" for change in changes):
             changes.append(Change("remove_factors", ids))
         elif what == 1:
@@ -155,7 +153,7 @@ def test_after_any_changes_the_map_is_that_of_the_factors_that_are_left(seed: in
                 solver = anew
                 continue
             first, report, told = came
-            assert (first, told) == (solver._graph.next_id, counted)
+            assert (first, told) == (graph_in(solver).next_id, counted)
             assert (report.strategy, report.new_factors, report.new_variables) in {
                 (strategy, 0, 0) for strategy in ("tree", "extend", "batch")
             }
@@ -214,7 +212,7 @@ def test_what_nothing_joins_to_the_map_is_not_changed() -> None:
         for each in (solver, other):
             each.stage(batch)
             each.step()
-    key = int(solver._graph.keys[49])
+    key = int(graph_in(solver).keys[49])
     at_end = [each for each in rows_of(solver) if key in np.frombuffer(rows_of(solver)[each][1], np.int64)]
     assert try_change(solver, [Change("remove_factors", np.array(at_end))]) is None
     with pytest.raises(errors.Underconstrained):
@@ -260,8 +258,7 @@ def test_what_fails_behind_the_step_is_undone(what: str, monkeypatch: pytest.Mon
             broken.setattr("factorbus.solver.changes.in_place._is_sound", lambda *_: False)
             assert try_change(solver, change) is None
         else:
-            assert isinstance(solver._stepper, TreeSteps)
-            broken.setattr(type(solver._stepper.tree), "step", lambda *_: 1 / 0)
+            broken.setattr(type(tree_of(solver)), "step", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
                 try_change(solver, change)
     assert rows_of(solver) == before[1]
@@ -306,11 +303,11 @@ def test_a_false_loop_taken_out_of_a_large_map_leaves_its_optimum() -> None:
     solver, _ = drive(400, 6)
     settled = copied(solver)
     settled.step(settle=True)
-    ends = np.array([[int(solver._graph.keys[20]), int(solver._graph.keys[380])]])
+    ends = np.array([[int(graph_in(solver).keys[20]), int(graph_in(solver).keys[380])]])
     false = Factors("between_se2", ends, np.array([[30.0, -40.0, 1.0]]), np.array([[400.0, 0, 0, 400, 0, 4000]]))
     first = solver.stage(Batch(factors=(false,)))
-    bent = solver.step()
-    assert bent.chi2 > 10 * settled.chi2()
+    deformed = solver.step()
+    assert deformed.chi2 > 10 * settled.chi2()
     came = try_change(solver, [Change("remove_factors", np.array([first]))])
     assert came is not None
     report = came[1]
@@ -329,13 +326,13 @@ def test_holes_are_packed_before_they_are_most_of_all() -> None:
     change = Change("loss", np.array(loops[:1]), loss="huber", scale=np.ones(1)), Change("loss", np.array(loops[:1]))
     packed = False
     for n in range(2000):
-        used, holes = int(solver._graph.counts[at.PAYLOAD]), solver._graph.holes
+        used, holes = int(graph_in(solver).counts[at.PAYLOAD]), graph_in(solver).holes
         came = try_change(solver, change[n % 2 : n % 2 + 1])
         if came is None:
             assert holes > 0.5 * used
             solver, *_ = with_changes(solver, change[n % 2 : n % 2 + 1])
             packed = True
-            assert solver._graph.holes == 0
+            assert graph_in(solver).holes == 0
             break
     assert packed
     again = Solver(Options())

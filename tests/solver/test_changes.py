@@ -8,6 +8,7 @@ import pytest
 from naive.dense_least_squares import DenseGraph, distance
 from naive.estimates import apart, values
 from naive.random_graphs import camera_steps, random_steps
+from naive.solver_parts import graph_in
 
 from factorbus.proto.kinds import CHANGES as WIRE_CHANGES
 from factorbus.proto.messages import Batch, Change, Factors, Variables
@@ -134,7 +135,7 @@ def test_a_map_goes_on_after_a_change_as_one_that_never_had_it(mode: str) -> Non
     without, _ = fed(batches[:5], mode)
     for batch in [batches[5], *batches[6:]]:
         first = solver.stage(batch)
-        assert first == solver._graph.next_id - batch.factor_count
+        assert first == graph_in(solver).next_id - batch.factor_count
         solver.step()
         without.stage(batch)
         without.step()
@@ -155,7 +156,7 @@ def test_ids_stay_with_their_factors_and_are_not_used_again() -> None:
     rows = factor_rows(solver)
     assert sorted(rows) == [0, 1, 2, 3, 6, 7]
     assert all(rows[each] == before[each] for each in range(4))
-    graph = solver._graph
+    graph = graph_in(solver)
     assert graph.ids_of(np.arange(6)).tolist() == [0, 1, 2, 3, 6, 7]
     assert graph.rows_of(np.arange(-1, 9)).tolist() == [-1, 0, 1, 2, 3, -1, -1, 4, 5, -1]
     assert why_factor(CovarianceBlocks(solver.covariances.factored()), 6).keys == (symbol("x", 0), symbol("x", 3))

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.solver_parts import graph_in
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Solver, errors
@@ -16,7 +17,7 @@ EYE3 = np.array([[1.0, 0, 0, 1, 0, 1]])
 
 def rows(solver: Solver) -> list[bytes]:
     """The graph."""
-    graph = solver._graph
+    graph = graph_in(solver)
     variables, factors, values, payload, *_ = graph.counts.tolist()
     used = graph.keys[:variables], graph.stamps[:variables], graph.var[:variables], graph.fac[:factors, : at.F_AT + 1]
     return [array.tobytes() for array in (graph.counts, *used, graph.values[:values], graph.payload[:payload])]

@@ -15,6 +15,7 @@ import pytest
 from naive.block_rows import dense_lambda, dense_r
 from naive.cholmod import cholmod
 from naive.random_graphs import random_steps
+from naive.solver_parts import system_in
 from naive.sparse_rows import sparse_lambda, sparse_r
 from scipy.sparse import csc_matrix, csr_array
 
@@ -29,7 +30,7 @@ from factorbus.solver.kernels.inc_l import block_rows as br
 RELATIVE = 1e-9
 ROUNDING = 100  # times what refining changes of CHOLMOD's own: 37 has been seen, and it depends on the BLAS
 PROBES = 4
-ENTRYWISE = 50  # every so many steps
+ENTRYWISE = 50  # steps from one check of all entries to the next
 # "omega" and "lambda" update R the one way for as long as it lives, and never move the linearization point.
 WAYS = {
     "omega": {
@@ -72,7 +73,7 @@ def test_sparse_and_dense_twins_agree() -> None:
     for batch in random_steps(1, steps=12):
         solver.stage(batch)
         solver.step()
-    factor = solver._stepper.system.factor
+    factor = system_in(solver).factor
     assert factor._have is Where.ROWS
     for dense, sparse in ((dense_r(factor.rows), sparse_r(factor.rows)), (dense_lambda(solver), sparse_lambda(solver))):
         np.testing.assert_array_equal(dense[0], sparse[0].toarray())
@@ -87,7 +88,7 @@ def test_a_wrong_entry_is_seen() -> None:
         solver.step()
     rng = np.random.default_rng(0)
     assert assert_is_the_factor(solver, rng, entrywise=False)
-    rows = solver._stepper.system.factor.rows
+    rows = system_in(solver).factor.rows
     diagonal = rows.rec[: rows.counts[br.POSITIONS], br.ROW]
     rows.numbers[diagonal[np.abs(rows.numbers[diagonal]).argmax()]] *= 1 + 1e-8
     with pytest.raises(AssertionError):
@@ -125,7 +126,7 @@ def assert_is_the_factor(solver: Solver, rng: np.random.Generator, entrywise: bo
     assert np.abs(R.T @ (R @ x) - permuted @ x).max() <= RELATIVE * scale
     if entrywise:
         assert abs(R.T @ R - permuted).max() <= RELATIVE * scale
-    if rows is not solver._stepper.system.factor.rows or solver._stepper.system.factor._rows_have_d:
+    if rows is not system_in(solver).factor.rows or system_in(solver).factor._rows_have_d:
         assert np.abs(R.T @ d - eta[order]).max() <= RELATIVE * max(np.abs(eta).max(), scale * RELATIVE)
     out = np.empty(len(eta))
     squared = rows.forward(eta, out)
@@ -136,14 +137,14 @@ def assert_is_the_factor(solver: Solver, rng: np.random.Generator, entrywise: bo
 
 def rows_of(solver: Solver) -> BlockFactor | None:
     """R in block rows; a copy when it is in the fronts of a full factorization."""
-    factor = solver._stepper.system.factor
+    factor = system_in(solver).factor
     if factor._have is Where.NOWHERE:
         return None
     if factor._have is Where.ROWS:
         return factor.rows
     symbolic, arena = factor.elimination.fronts()
     copy = BlockFactor()
-    copy.take(symbolic, arena, factor.elimination.forward(solver._stepper.system.blocks.eta[: symbolic.size]))
+    copy.take(symbolic, arena, factor.elimination.forward(system_in(solver).blocks.eta[: symbolic.size]))
     return copy
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from naive.block_rows import dense_lambda
 from naive.cholmod import cholmod
+from naive.solver_parts import graph_in, system_in
 from naive.tree_records import tree_of
 from scipy.sparse import csc_matrix
 
@@ -40,7 +41,7 @@ def assert_fills_little(name: str, steps: Iterable[Batch]) -> None:
     for batch in steps:
         solver.stage(batch)
     solver.step()
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     dims = graph.dims[: graph.counts[at.COLUMNS]]
     free, last, recent = (
         fill_in(dims, blocks.rows, blocks.cols, group)[0]

@@ -8,6 +8,7 @@ import pytest
 from naive.dense_least_squares import full
 from naive.random_graphs import camera_steps
 from naive.random_others import other_steps
+from naive.solver_parts import graph_in
 from naive.tree_records import tree_of
 
 from factorbus.solver import Options, Solver
@@ -32,7 +33,7 @@ def test_error_and_force_are_those_of_the_definition(world: str) -> None:
     for batch in steps:
         solver.stage(batch)
         solver.step()
-    graph, tree, seen = solver._graph, tree_of(solver), 0
+    graph, tree, seen = graph_in(solver), tree_of(solver), 0
     for f in range(solver.factor_count):
         kind = int(graph.fac[f, at.F_KIND])
         dim = residual_dim(kind)

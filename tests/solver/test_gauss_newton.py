@@ -68,16 +68,16 @@ def arctan(x: list[float]) -> Curve:
 def test_a_linear_problem_takes_one_step_and_one_factorization() -> None:
     A, b = np.array([[2.0, 1], [0, 3], [1, 1]]), np.array([1.0, 2, 4])
     problem = Curve(lambda x: A @ x - b, lambda x: A, [0.0, 0.0])
-    course = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
-    assert (course.iterations, course.factorizations, course.converged) == (1, 1, True)
+    result = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert (result.iterations, result.factorizations, result.converged) == (1, 1, True)
     np.testing.assert_allclose(problem.x, np.linalg.lstsq(A, b, rcond=None)[0])
 
 
 @pytest.mark.parametrize("start", [1.0, 3.0, 30.0, -1e3])
 def test_damping_saves_what_gauss_newton_would_lose(start: float) -> None:
     problem = arctan([start])
-    course = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
-    assert course.converged
+    result = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert result.converged
     assert abs(problem.x[0]) < 1e-9
     assert (max(problem.factorized) > 0.0) == (abs(start) > 1.39)
 
@@ -85,11 +85,11 @@ def test_damping_saves_what_gauss_newton_would_lose(start: float) -> None:
 @pytest.mark.parametrize("start", [[-1.2, 1.0], [0.0, 0.0], [-3.0, -4.0], [100.0, -50.0]])
 def test_chi2_never_rises(start: list[float]) -> None:
     problem = rosenbrock(start)
-    course = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
-    assert course.converged
+    result = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert result.converged
     np.testing.assert_allclose(problem.x, [1.0, 1.0], atol=1e-8)
     assert (np.diff(problem.chi2s) <= 0.0).all()
-    assert course.chi2 == problem.chi2s[-1]
+    assert result.chi2 == problem.chi2s[-1]
 
 
 OVER_HILLS = dataclasses.replace(SETTLE, nonmonotone=5)
@@ -99,11 +99,11 @@ def test_over_a_hill_there_are_few_steps_where_damped_ones_go_around_it() -> Non
     """From the classical start Gauss-Newton goes to (1, -3.84), which is a hundred times higher, and then to (1, 1)."""
     around, over = rosenbrock([-1.2, 1.0]), rosenbrock([-1.2, 1.0])
     minimize(around, around.chi2s[0], 0.0, SETTLE)
-    course = minimize(over, over.chi2s[0], 0.0, OVER_HILLS)
+    result = minimize(over, over.chi2s[0], 0.0, OVER_HILLS)
     assert over.chi2s[1] > 50 * over.chi2s[0]
     np.testing.assert_allclose(over.x, [1.0, 1.0], atol=1e-9)
-    assert (course.iterations, course.converged, over.factorized, over.taken_back) == (2, True, [0.0] * 3, [])
-    assert course.chi2 == over.chi2s[-1]
+    assert (result.iterations, result.converged, over.factorized, over.taken_back) == (2, True, [0.0] * 3, [])
+    assert result.chi2 == over.chi2s[-1]
     assert len(around.factorized) > 10
 
 
@@ -111,49 +111,49 @@ def test_over_a_hill_there_are_few_steps_where_damped_ones_go_around_it() -> Non
 def test_steps_that_never_lead_down_are_taken_back(damping: float) -> None:
     """Once; then the damping that was given counts."""
     problem = arctan([3.0])
-    course = minimize(problem, problem.chi2s[0], damping, OVER_HILLS)
-    assert course.converged
+    result = minimize(problem, problem.chi2s[0], damping, OVER_HILLS)
+    assert result.converged
     assert abs(problem.x[0]) < 1e-9
     assert [x.tolist() for x in problem.taken_back] == [[3.0]]
     first_damped = next(n for n, used in enumerate(problem.factorized) if used)
     assert 1 < first_damped <= 1 + OVER_HILLS.nonmonotone
     assert problem.factorized[first_damped] == (damping or 1e-5)
-    assert course.chi2 <= problem.chi2s[0]
+    assert result.chi2 <= problem.chi2s[0]
 
 
 def test_what_another_step_would_take_off_is_told() -> None:
     problem = rosenbrock([0.0, 0.0])
-    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=1))
-    assert course.left == pytest.approx(problem.decrease())
+    result = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=1))
+    assert result.left == pytest.approx(problem.decrease())
     assert minimize(arctan([30.0]), 2.4, 1.0, StoppingRule(1e-6, 1e-12, limit=1)).left == np.inf
 
 
 def test_a_limit_stops_and_the_damping_is_handed_on() -> None:
     problem = arctan([1e3])
-    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=2))
-    assert (course.converged, course.factorizations) == (False, 2)
-    assert course.damping > 0.0
-    again = minimize(problem, problem.chi2s[-1], course.damping, SETTLE)
+    result = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, 1e-12, limit=2))
+    assert (result.converged, result.factorizations) == (False, 2)
+    assert result.damping > 0.0
+    again = minimize(problem, problem.chi2s[-1], result.damping, SETTLE)
     assert again.converged
 
 
 def test_the_loop_ends_where_another_step_would_gain_nothing() -> None:
     problem = rosenbrock([1.0 + 1e-9, 1.0])
-    course = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, floor=1e-12, limit=10))
-    assert (course.iterations, course.converged) == (0, True)
+    result = minimize(problem, problem.chi2s[0], 0.0, StoppingRule(1e-6, floor=1e-12, limit=10))
+    assert (result.iterations, result.converged) == (0, True)
 
 
 def test_a_singular_system_is_reported_not_moved() -> None:
     problem = Curve(lambda x: np.array([x[0] - 1.0]), lambda x: np.array([[1.0, 0.0]]), [5.0, 5.0])
-    course = minimize(problem, 16.0, 0.0, SETTLE)
-    assert (course.failed, course.iterations, course.converged) == (1, 0, False)
-    assert course.damping == 0.0
+    result = minimize(problem, 16.0, 0.0, SETTLE)
+    assert (result.failed, result.iterations, result.converged) == (1, 0, False)
+    assert result.damping == 0.0
     np.testing.assert_array_equal(problem.x, [5.0, 5.0])
 
 
 def test_nan_beyond_the_step_is_a_step_too_far() -> None:
     with np.errstate(invalid="ignore"):
         problem = Curve(lambda x: np.sqrt(x) - 0.1, lambda x: np.array([[0.5 / np.sqrt(x[0])]]), [4.0])
-        course = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
-    assert course.converged
+        result = minimize(problem, problem.chi2s[0], 0.0, SETTLE)
+    assert result.converged
     assert problem.x[0] == pytest.approx(0.01, rel=1e-6)

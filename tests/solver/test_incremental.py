@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from naive.block_rows import dense_lambda, dense_r
 from naive.cholmod import cholmod
 from naive.random_graphs import factor, random_steps
+from naive.solver_parts import graph_in, system_in
 
 from factorbus.cli.process.options import MODES as CLI_MODES
 from factorbus.formats import read
@@ -36,7 +37,7 @@ WAYS = {
 
 def assert_is_the_factor(solver: Solver, relative: float = 1e-9) -> bool:
     """RᵀR = PΛPᵀ, d = R⁻ᵀPη, and δ by blocks is the dense solution; False: there is no R in block rows."""
-    factor = solver._stepper.system.factor
+    factor = system_in(solver).factor
     if factor._have is not Where.ROWS:
         return False
     information, eta = dense_lambda(solver)
@@ -142,7 +143,7 @@ def test_the_old_factor_is_given_up_at_a_new_point_where_the_paper_has_it_so(kee
         report = solver.step()
         counts[report.strategy] += 1
         if report.iterations and not keep:
-            assert not solver._stepper.system.factor.have_r
+            assert not system_in(solver).factor.have_r
     assert counts["full"] >= (1 if keep else 6)
 
 
@@ -231,7 +232,7 @@ def test_orders_by_block_and_by_element_fill_alike(datasets: Path, name: str) ->
     for batch in read(datasets / f"{name}.g2o").steps():
         solver.stage(batch)
     solver.step()
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     dims = graph.dims[: graph.counts[4]]
     free, bound = (
         fill_in(dims, blocks.rows, blocks.cols, group)[0] for group in (None, constraint(graph, recent_poses=1))

@@ -21,6 +21,7 @@ from naive.marginal_windows import (
     values,
     x,
 )
+from naive.solver_parts import graph_in
 
 from factorbus.pieces import MOST, Pieces, cut
 from factorbus.proto import codec
@@ -83,7 +84,7 @@ def test_a_loopy_window_stays_where_it_is_as_certain_as_it_was_and_goes_on_like_
     sure = covariance(solver, *names)
     after, _, report, counted = with_changes(solver, marginalize(*gone), settle=True)
     assert counted["removed_variables"] == 8
-    (joint,) = find_joints(after._graph)
+    (joint,) = find_joints(graph_in(after))
     assert len(joint.variables) >= 3, "else it shows nothing"
     assert all(distance(of, row, estimate[key][1]) < 1e-9 for key, (of, row) in values(after).items())
     np.testing.assert_allclose(covariance(after, *names), sure, rtol=0, atol=1e-8 * np.abs(sure).max())
@@ -127,26 +128,26 @@ def test_step_by_step_is_the_same_as_at_once(kind: str) -> None:
     assert apart(at_once, slowly) < 1e-9
     a, b = covariance(at_once, *range(10, 18)), covariance(slowly, *range(10, 18))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * np.abs(a).max())
-    assert len(find_joints(slowly._graph)) == 1
-    assert negative_rows(slowly._graph).size == len(find_joints(slowly._graph)[0].variables)
+    assert len(find_joints(graph_in(slowly))) == 1
+    assert negative_rows(graph_in(slowly)).size == len(find_joints(graph_in(slowly))[0].variables)
     assert slowly.chi2() == pytest.approx(at_once.chi2(), rel=1e-6)
 
 
 def window() -> tuple[Solver, list[int]]:
     """A map with one form in pieces, and the ids of these."""
     solver, *_ = with_changes(solved(loopy("se2", 16, 1)), marginalize(*range(8)), settle=True)
-    (joint,) = find_joints(solver._graph)
-    return solver, solver._graph.ids_of(np.array(joint.rows)).tolist()
+    (joint,) = find_joints(graph_in(solver))
+    return solver, graph_in(solver).ids_of(np.array(joint.rows)).tolist()
 
 
 def test_pieces_stay_together_or_go_together() -> None:
     solver, ids = window()
     before = values(solver)
-    negative = solver._graph.ids_of(negative_rows(solver._graph)).tolist()
+    negative = graph_in(solver).ids_of(negative_rows(graph_in(solver))).tolist()
     pair = next(f for f in ids if f not in negative)
     for changes in (
         [Change("remove_factors", np.array(ids[:1]))],
-        [Change("remove_variables", keys=solver._graph.keys[[find_joints(solver._graph)[0].variables[0]]])],
+        [Change("remove_variables", keys=graph_in(solver).keys[[find_joints(graph_in(solver))[0].variables[0]]])],
         [Change("weigh", np.array(negative), weight=np.full(len(negative), 2.0))],
         [Change("loss", np.array(negative[:1]), loss="huber", scale=np.ones(1))],
         [Change("loss", np.array([pair]), loss="huber", scale=np.ones(1))],
@@ -159,7 +160,7 @@ def test_pieces_stay_together_or_go_together() -> None:
     heavier, *_ = with_changes(solver, [Change("weigh", np.array(ids), weight=np.full(len(ids), 2.0))])
     assert len(find_joints(heavier._graph)) == 1
     without, *_ = with_changes(solver, [Change("remove_factors", np.array(ids))])
-    assert not find_joints(without._graph)
+    assert not find_joints(graph_in(without))
     held, *_ = with_changes(solver, [Change("fix", keys=x(10))], settle=True)
     freed, *_ = with_changes(held, [Change("free", keys=x(10))], settle=True)
     assert apart(freed, solver) < 1e-9
@@ -167,7 +168,7 @@ def test_pieces_stay_together_or_go_together() -> None:
 
 def test_what_asks_about_pieces_gets_an_answer() -> None:
     solver, ids = window()
-    graph, blocks = solver._graph, CovarianceBlocks(solver.covariances.factored())
+    graph, blocks = graph_in(solver), CovarianceBlocks(solver.covariances.factored())
     total = 0.0
     for v in range(solver.variable_count):
         account = why_variable(blocks, v, True)
@@ -221,7 +222,7 @@ def test_a_form_goes_over_the_wire_and_into_other_maps(kind: str, mode: str) -> 
     other = solved(came, mode)
     assert apart(solver, other) < 1e-9
     assert other.chi2() == pytest.approx(solver.chi2(), rel=1e-6)
-    assert len(find_joints(other._graph)) == 1
+    assert len(find_joints(graph_in(other))) == 1
     # As an insert into a map that is there: the poses first.
     late = Solver(Options(mode=mode))
     late.stage(came._replace(factors=tuple(g for g in came.factors if not g.kind.startswith("linear"))))
@@ -286,7 +287,7 @@ def test_too_many_and_what_is_no_pose_are_refused_and_named() -> None:
         with_changes(solver, marginalize(0))
     assert refused.value.detail["border"] == x(*range(1, count)).tolist()
     after, *_ = with_changes(solver, marginalize(0, 1), settle=True)
-    assert len(find_joints(after._graph)[0].variables) == MOST
+    assert len(find_joints(graph_in(after))[0].variables) == MOST
     assert apart(after, solver) < 1e-9
     l = np.array([symbol("l", 1)])
     seen = [
@@ -314,7 +315,7 @@ def test_a_window_over_manhattan_with_its_loops_takes_constant_memory(poses: int
             solver, *_ = with_changes(solver, marginalize(*range(first, first + every)))
             first += every
             sizes.append(solver.memory_bytes())
-            widest = max([widest, *(len(joint.variables) for joint in find_joints(solver._graph))])
+            widest = max([widest, *(len(joint.variables) for joint in find_joints(graph_in(solver)))])
     assert widest >= 4, "loops make it more than a chain"
     assert loops > poses / 10
     half = len(sizes) // 2

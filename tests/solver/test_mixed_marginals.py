@@ -60,7 +60,7 @@ def assert_same(solver: Solver, after: Solver, gone: list[int], settled: float =
     assert sorted(now) == sorted(set(before) - set(gone))
     for key, (kind, row) in now.items():
         assert distance(kind, row, before[key][1]) < settled
-    free = [key for key in now if after._graph.var[after._graph.find(key), at.V_COLUMN] >= 0]
+    free = [key for key in now if graph_in(after).var[graph_in(after).find(key), at.V_COLUMN] >= 0]
     a, b = covariance(solver, free), covariance(after, free)
     sigma = np.sqrt(np.diag(a))
     np.testing.assert_allclose(b / sigma / sigma[:, None], a / sigma / sigma[:, None], rtol=0, atol=1e-8)
@@ -134,7 +134,7 @@ def test_a_border_is_bounded_and_a_refusal_says_by_what() -> None:
         without(solver, [int(l[0])])
     assert refused.value.detail["border"] == keys.tolist()
     after = without(solver, [int(l[0]), int(keys[0])])
-    assert len(find_joints(after._graph)[0].variables) == MOST
+    assert len(find_joints(graph_in(after))[0].variables) == MOST
     assert_same(solver, after, [int(l[0]), int(keys[0])])
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from naive.tree_records import Clique, assert_is_a_tree, tree_of
 
 from factorbus.proto.messages import Batch
@@ -43,7 +44,7 @@ def drive(solver: Solver, steps: Iterator[Batch]) -> Iterator[Batch]:
 
 def neighbours(solver: Solver) -> dict[int, set[int]]:
     """The free variables that share a factor with each free one."""
-    graph = solver._graph
+    graph = graph_in(solver)
     free = graph.var[: solver.variable_count, at.V_COLUMN] >= 0
     found: dict[int, set[int]] = {v: set() for v in range(solver.variable_count) if free[v]}
     for i, j in graph.fac[: solver.factor_count, [at.F_I, at.F_J]].tolist():
@@ -55,7 +56,7 @@ def neighbours(solver: Solver) -> dict[int, set[int]]:
 
 def ends(solver: Solver, first: int) -> list[int]:
     """Of the factors from `first` on."""
-    return solver._graph.fac[first : solver.factor_count, [at.F_I, at.F_J]].ravel().tolist()
+    return graph_in(solver).fac[first : solver.factor_count, [at.F_I, at.F_J]].ravel().tolist()
 
 
 def nearest(solver: Solver, first: int, count: int) -> set[int]:

@@ -1,4 +1,4 @@
-"""Arrays that grow in place keep what they hold, whoever looks at them."""
+"""Arrays that grow in place keep what they hold, also for views of them."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

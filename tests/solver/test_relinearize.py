@@ -4,10 +4,11 @@ import copy
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
+from naive.tree_records import tree_of
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.records import tree_at
 from factorbus.solver.kernels.bayes_tree.relinearize import SPARSE, linearize_around
@@ -26,8 +27,7 @@ def driven() -> Solver:
 
 @pytest.mark.parametrize("picked", [[3], [5, 390], list(range(40, 60)), list(range(1, 400))])
 def test_the_factors_of_some_variables_are_linearized(driven: Solver, picked: list[int]) -> None:
-    assert isinstance(driven._stepper, TreeSteps)
-    tree, graph = driven._stepper.tree, driven._graph
+    tree, graph = tree_of(driven), graph_in(driven)
     count = int(tree.state[tl.S_FACTORS])
     ends = graph.fac[:count, [at.F_I, at.F_J]]
     around = np.flatnonzero(np.isin(ends, picked).any(axis=1))

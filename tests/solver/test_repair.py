@@ -1,4 +1,4 @@
-"""False loop closures are found and taken out: a map that they have bent gets straight again."""
+"""False loop closures are found and taken out: a map that they have deformed is as before again."""
 
 from collections.abc import Iterator
 from pathlib import Path

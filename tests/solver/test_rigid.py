@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from naive.dense_factors import boxminus, pose_matrix, pose_vector
+from naive.solver_parts import graph_in
 from naive.tree_records import cliques, tree_of
 from scipy.linalg import expm
 
@@ -60,7 +61,7 @@ def displacement(kind: str, x: np.ndarray, motion: np.ndarray) -> np.ndarray:
 
 def motions(solver: Solver) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """Of every clique [R_F R_S d], δ_F, δ_S as the frontals have it without having moved, and ξ."""
-    tree, graph = tree_of(solver), solver._graph
+    tree, graph = tree_of(solver), graph_in(solver)
     for c, clique in cliques(solver).items():
         row = tree.clique[c]
         p, m, used = row[tl.C_PIVOTS], row[tl.C_SEPARATOR_SCALARS], row[tl.C_USED]
@@ -104,7 +105,7 @@ def test_what_has_a_position_below_it_does_not_move_along() -> None:
     for batch in WORLDS["positions"]():
         solver.stage(batch)
         solver.step()
-    tree, graph = tree_of(solver), solver._graph
+    tree, graph = tree_of(solver), graph_in(solver)
     absolute = graph.fac[: solver.factor_count, at.F_KIND] == at.POSITION_SE2
     found, anchored = cliques(solver), set()
     for v in graph.fac[: solver.factor_count][absolute, at.F_I]:

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.solver_parts import graph_in
+from naive.tree_records import tree_of
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Group, Options, Solver, errors
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.graph.factor_graph import FactorGraph, roomy
 from factorbus.solver.kernels.model import layout as at
@@ -23,13 +24,12 @@ TREE |= {"changed": 1, "moved": 1, "marked": 1, "motions": 8}
 def cramped() -> Solver:
     """A solver that has room for one variable and one factor."""
     solver = Solver(Options())
-    assert isinstance(solver._stepper, TreeSteps)
-    for thing, sizes in ((solver._graph, GRAPH), (solver._stepper.tree, TREE)):
+    for thing, sizes in ((graph_in(solver), GRAPH), (tree_of(solver), TREE)):
         for name, size in sizes.items():
             setattr(thing, name, getattr(thing, name)[:size].copy())
     for name in ("lin", "scalars"):
-        setattr(solver._stepper.tree, name, getattr(solver._stepper.tree, name)[:, :7].copy())
-    solver._graph.table = np.zeros(2, np.int64)
+        setattr(tree_of(solver), name, getattr(tree_of(solver), name)[:, :7].copy())
+    graph_in(solver).table = np.zeros(2, np.int64)
     return solver
 
 
@@ -81,7 +81,7 @@ def test_a_copy_of_a_graph_gives_its_own_values(again: Any) -> None:
         solver.stage(batch)
         solver.step()
     solver.estimate()
-    other: FactorGraph = again(solver._graph)
+    other: FactorGraph = again(graph_in(solver))
     other.values += 1.0
     told = np.concatenate([group.values.ravel() for group in other.variables()])
     assert sorted(told) == sorted(other.values[: other.counts[at.VALUES]])
@@ -102,7 +102,7 @@ def test_an_estimate_is_the_callers_own_and_follows_what_is_taken_back() -> None
     assert bits(solver.estimate()) == before
     solver.stage(second)
     assert bits(solver.estimate()) != before
-    solver._graph.forget(solver._stepper._mark)  # type: ignore[union-attr]
+    graph_in(solver).forget(solver._stepper._mark)  # type: ignore[union-attr]
     assert bits(solver.estimate()) == before
     with pytest.raises(errors.DuplicateVariable):
         solver.stage(first)
@@ -112,7 +112,7 @@ def test_a_step_that_finds_no_room_is_admitted_like_any_other() -> None:
     solver, rooms = Solver(), set()
     for step in manhattan(700, 3):
         solver.stage(step.batch)
-        graph = solver._graph
+        graph = graph_in(solver)
         rooms.add((graph.keys.size, graph.table.size, graph.values.size, len(graph.fac), graph.payload.size))
     assert solver.variable_count == 700
     assert len(rooms) > 3

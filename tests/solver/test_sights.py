@@ -9,6 +9,7 @@ from naive.dense_least_squares import DenseGraph, distance, rho, weight
 from naive.random_graphs import camera_steps
 from naive.random_sightings import CAMERAS
 from naive.random_sights import SIGHTS, measurement, random_sight, state_of
+from naive.solver_parts import graph_in
 
 from factorbus.proto.camera import Camera
 from factorbus.proto.kinds import LOSSES
@@ -53,7 +54,7 @@ def sight_map(
 
 def evaluated(solver: Solver, factor: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """r, A, B, whole."""
-    graph = solver._graph
+    graph = graph_in(solver)
     r, A, B, W = (np.zeros((1, *shape)) for shape in ((at.R_SIZE,), (6, 6), (6, 6), (6, 6)))
     evaluate_factors(np.array([factor]), graph.array_table, graph.values, r, A, B, W)
     return r[0], A[0], B[0]
@@ -229,7 +230,7 @@ def test_a_sight_that_is_lost_counts_for_nothing_and_is_reported(mode: str) -> N
     np.testing.assert_allclose(solver.estimate()[-1].values[0], place, atol=1e-6)
     assert solver.chi2() == pytest.approx(INACTIVE_CHI2 + 16.0, rel=1e-3)
     accounts = why_variable(
-        CovarianceBlocks(solver.covariances.factored()), solver._graph.find(P), keeps_steps=False
+        CovarianceBlocks(solver.covariances.factored()), graph_in(solver).find(P), keeps_steps=False
     ).factors
     assert [account.inactive for account in accounts] == ["", why, ""]
     assert (accounts[1].influence, accounts[1].weight, accounts[1].rho) == (0.0, 0.0, INACTIVE_CHI2)

@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.solver_parts import graph_in, system_in
 from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch, Factors, Variables
@@ -162,7 +163,7 @@ def small_map(mode: str = "auto") -> Solver:
 
 def everything(solver: Solver) -> bytes:
     """All there is to see of a solver and of what it keeps, to the bit."""
-    graph = solver._graph
+    graph = graph_in(solver)
     n, m, v, p, _, scalars, _ = graph.counts.tolist()
     return pickle.dumps(
         [
@@ -171,7 +172,7 @@ def everything(solver: Solver) -> bytes:
                 for a in (graph.counts, graph.keys[:n], graph.stamps[:n], graph.values[:v], *rows(solver, n, m))
             ],
             [graph.payload[:p].tobytes(), graph.table.nonzero()[0].size],
-            normal_equations(solver._stepper.system.blocks, scalars)
+            normal_equations(system_in(solver).blocks, scalars)
             if isinstance(solver._stepper, IncrementalSteps)
             else cliques(solver, n, m, v),
             [solver.chi2(), [(g.kind, g.keys.tolist(), g.values.tobytes()) for g in solver.changed()]],
@@ -181,7 +182,7 @@ def everything(solver: Solver) -> bytes:
 
 def rows(solver: Solver, variables: int, factors: int) -> tuple[np.ndarray, np.ndarray]:
     """What the graph says of them; in the mode "bayes-tree" nobody writes where blocks of Λ are."""
-    var, fac = solver._graph.var[:variables], solver._graph.fac[:factors]
+    var, fac = graph_in(solver).var[:variables], graph_in(solver).fac[:factors]
     return (var, fac) if isinstance(solver._stepper, IncrementalSteps) else (var[:, : at.V_DIAGONAL], fac[:, : at.F_II])
 
 
@@ -193,7 +194,7 @@ def normal_equations(blocks: HessianBlocks, scalars: int) -> list[bytes]:
 def cliques(solver: Solver, variables: int, factors: int, values: int) -> list[bytes]:
     tree, scratch = tree_of(solver), (tl.N_STAMP, tl.N_LOCAL, tl.N_COLUMN)
     kept, links = np.delete(tree.node[:variables], scratch, axis=1), tree.link[:factors, [tl.L_OWN, tl.L_I, tl.L_AT]]
-    scalars = tree.scalars[:2, : solver._graph.counts[at.SCALARS]]
+    scalars = tree.scalars[:2, : graph_in(solver).counts[at.SCALARS]]
     return [a.tobytes() for a in (kept, links, tree.lin[0, :values], scalars, tree.turns[:variables, tl.U_LEVER])]
 
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.random_graphs import random_steps
+from naive.solver_parts import graph_in, system_in
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
@@ -13,7 +14,7 @@ BATCH = Options(mode="all-batch")
 
 
 def state(solver: Solver) -> list[bytes]:
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     variables, factors, values, payload, columns, scalars, _ = graph.counts.tolist()
     arrays = [
         *(graph.keys[:variables], graph.var[:variables], graph.fac[:factors], graph.values[:values]),

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from naive.random_graphs import random_steps
+from naive.solver_parts import graph_in
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Options, Solver, errors
@@ -102,7 +103,7 @@ def test_a_state_is_a_copy() -> None:
 def test_what_no_state_can_hold_is_an_error_and_so_is_a_state_of_something_else() -> None:
     solver = Solver()
     state = solver.dump()
-    solver._graph.forgotten = object()  # type: ignore[attr-defined]
+    graph_in(solver).forgotten = object()  # type: ignore[attr-defined]
     with pytest.raises(TypeError, match=r"Graph\.forgotten is a object"):
         dump(solver)
     with pytest.raises(ValueError, match="no state of Solver: _graph"):

@@ -6,6 +6,7 @@ from counting import count_calls
 from naive.dense_factors import boxplus
 from naive.dense_least_squares import DenseGraph, distance
 from naive.random_graphs import measured, random_information, random_steps, random_value
+from naive.solver_parts import graph_in, system_in
 
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.solver import Group, Options, Solver, errors, solve_batch
@@ -53,7 +54,7 @@ def test_the_normal_equations_are_the_twins_and_have_the_bits_of_a_fresh_sum(see
         twin.add(batch)
     solver.step()
     twin.put(solver.estimate())
-    graph, blocks = solver._graph, solver._stepper.system.blocks
+    graph, blocks = graph_in(solver), system_in(solver).blocks
     starts = np.concatenate([[0], np.cumsum(graph.dims[: graph.counts[4]])])
     dense = np.zeros((starts[-1], starts[-1]))
     for row, col, offset in zip(blocks.rows, blocks.cols, blocks.offsets, strict=True):

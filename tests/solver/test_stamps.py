@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive.random_graphs import camera_steps, random_steps
+from naive.solver_parts import graph_in
 
 from factorbus.proto.messages import Batch, Change, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
@@ -37,7 +38,7 @@ def kept(solver: Solver) -> dict[int, int]:
     """As every way to look at a map gives them, which is the same."""
     found = stamps(solver.estimate())
     assert found == stamps(solver.graph()[0]) == stamps(solver.content().variables())
-    assert solver._graph.counts[at.STAMPED] == len(found)
+    assert graph_in(solver).counts[at.STAMPED] == len(found)
     return found
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from naive.tree_records import tree_of
 
 from factorbus.simulate import manhattan
 from factorbus.solver import Options, Solver
-from factorbus.solver.bayes_tree.steps import TreeSteps
 from factorbus.solver.bayes_tree.tree import CliqueTree
 from factorbus.solver.kernels.bayes_tree import layout as tl
 from factorbus.solver.kernels.bayes_tree.allocator import (
@@ -93,8 +93,7 @@ def blocks_of(tree: CliqueTree) -> list[tuple[int, int]]:
 
 def test_what_a_drive_leaves_free_is_used_again() -> None:
     solver = Solver(Options())
-    assert isinstance(solver._stepper, TreeSteps)
-    tree, most = solver._stepper.tree, 0.0
+    tree, most = tree_of(solver), 0.0
     for n, step in enumerate(manhattan(4000, 3), start=1):
         solver.stage(step.batch)
         solver.step()

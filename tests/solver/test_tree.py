@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from naive.dense_factors import boxplus
 from naive.dense_least_squares import DenseGraph, distance
 from naive.random_graphs import factor, random_steps
+from naive.solver_parts import graph_in
 from naive.tree_records import assert_is_a_tree, tree_of
 from naive.tree_solution import assert_is_solution, assert_solves
 
@@ -40,7 +41,7 @@ class Whole:
 
 def linearized(solver: Solver) -> tuple[DenseGraph, np.ndarray]:
     """A dense graph at the linearization points, which shares no code with the solver, and δ."""
-    tree, graph, dense = tree_of(solver), solver._graph, DenseGraph()
+    tree, graph, dense = tree_of(solver), graph_in(solver), DenseGraph()
     variables, factors = solver.graph()
     dense.add(Whole(variables, factors))
     dense.kinds, delta = {}, []
@@ -110,9 +111,9 @@ def drives(draw: st.DrawFn) -> list[Batch]:
 
 
 @settings(max_examples=200)
-@given(steps=drives(), way=st.sampled_from(sorted(WAYS)), bent=st.sampled_from([0.0, 0.05, 1e9]))
-def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, bent: float) -> None:
-    solver = follow(steps, **WAYS[way], relinearize_threshold=bent, converged_share=1e9)
+@given(steps=drives(), way=st.sampled_from(sorted(WAYS)), threshold=st.sampled_from([0.0, 0.05, 1e9]))
+def test_delta_is_the_dense_solution_after_every_step(steps: list[Batch], way: str, threshold: float) -> None:
+    solver = follow(steps, **WAYS[way], relinearize_threshold=threshold, converged_share=1e9)
     settled = solver.step(settle=True).chi2
     assert settled == pytest.approx(solve_batch(*solver.graph()).chi2, rel=1e-6, abs=1e-9)
 
@@ -193,7 +194,7 @@ def test_the_estimate_along_a_drive_is_the_batch_answer(world, noise: dict[str, 
 
 
 def test_no_step_of_a_drive_leaves_the_batch_answer_far() -> None:
-    """Loops bend many factors a little: where that adds up, a step solves again before it ends, MATH (9.16)."""
+    """Where many small linearization errors add up, a step solves again before it ends, MATH (9.16)."""
     solver, ratios = Solver(Options(mode="bayes-tree")), []
     for n, step in enumerate(manhattan(600, 11)):
         solver.stage(step.batch)
@@ -214,9 +215,9 @@ def test_a_long_drive_does_not_drift() -> None:
         tree_of(solver),
         Solver(Options.of(**EXACT, relinearize_threshold=1e9, converged_share=1e9, initialize_locally=False)),
     )
-    delta = tree.scalars[0, : solver._graph.counts[at.SCALARS]].copy()
+    delta = tree.scalars[0, : graph_in(solver).counts[at.SCALARS]].copy()
     variables, factors = solver.graph()
-    graph = solver._graph
+    graph = graph_in(solver)
     for group in variables:
         rows = [int(graph.find(int(key))) for key in group.keys]
         for row, v in enumerate(rows):
@@ -224,13 +225,13 @@ def test_a_long_drive_does_not_drift() -> None:
             group.values[row] = tree.lin[0, x : x + group.values.shape[1]]
     fresh.stage(Whole(variables, factors))
     fresh.step()
-    order = {int(key): v for v, key in enumerate(fresh._graph.keys[: fresh.variable_count])}
+    order = {int(key): v for v, key in enumerate(graph_in(fresh).keys[: fresh.variable_count])}
     again = np.concatenate(
         [
             tree_of(fresh).scalars[0, d : d + 3]
             for v in range(solver.variable_count)
             if graph.var[v, at.V_SCALAR] >= 0
-            and (d := int(fresh._graph.var[order[int(graph.keys[v])], at.V_SCALAR])) >= 0
+            and (d := int(graph_in(fresh).var[order[int(graph.keys[v])], at.V_SCALAR])) >= 0
         ]
     )
     np.testing.assert_allclose(delta, again, rtol=0, atol=1e-9 * np.abs(again).max())

@@ -1,9 +1,10 @@
-"""When bent variables are relinearized: all that wait together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
+"""When waiting variables are relinearized: all together, when it tells in χ², MATH (9.16), (9.19), (9.22)."""
 
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from naive.tree_records import tree_of
 
 from factorbus.proto.messages import Batch
@@ -54,9 +55,9 @@ def test_what_waits_adds_no_more_than_a_share_to_chi2(world) -> None:
         most = options.tuning.relinearize_next_step_share * min(
             max(rested**2, 1.0), options.tuning.relinearize_cooldown_factor
         )
-        scalars = solver._graph.dims[solver._graph.var[waiting(tree), at.V_COLUMN]].sum()
+        scalars = graph_in(solver).dims[graph_in(solver).var[waiting(tree), at.V_COLUMN]].sum()
         most *= min(max((scalars / options.tuning.relinearize_full_batch) ** 3, 0.02), 1.0)
-        most *= 24.0 if (solver._graph.var[waiting(tree), at.V_KIND] == at.POINT2).any() else 1.0
+        most *= 24.0 if (graph_in(solver).var[waiting(tree), at.V_KIND] == at.POINT2).any() else 1.0
         assert share <= 1.5 * most or tree.state[tl.S_DUE]
         if not tree.state[tl.S_DUE]:
             largest = max(largest, share / most)
@@ -106,7 +107,7 @@ def test_nothing_waits_longer_than_patience() -> None:
     assert patience // 2 < longest <= patience + 1
 
 
-def test_what_is_bent_far_does_not_wait() -> None:
+def test_what_has_a_large_error_does_not_wait() -> None:
     """By itself it is nothing in the χ² of a large map, and much where it is."""
     limit = 0.2
     solver, found = Solver(Options.of(**{**NEVER, "relinearize_max_error": limit})), 0

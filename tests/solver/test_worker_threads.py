@@ -39,7 +39,7 @@ POSES = 1500
 
 @contextmanager
 def working(count: int = 1) -> Iterator[list[WorkerThread]]:
-    """So many worker threads meanwhile."""
+    """A number of worker threads meanwhile."""
     workers = [WorkerThread() for _ in range(count)]
     threads = [threading.Thread(target=worker.run) for worker in workers]
     for thread in threads:

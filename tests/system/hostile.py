@@ -35,7 +35,7 @@ class Hostile:
         self.sent = 0
 
     def send(self, key: str, payload: bytes, timeout_s: float = 20.0) -> None:
-        """A query; waits only while so many are out that would be read."""
+        """A query; waits only while as many are out as would be read."""
         if not self.hang:
             self.room.acquire(timeout=5)
 

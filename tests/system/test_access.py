@@ -111,7 +111,7 @@ class Identity:
 
 
 def poke(session: zenoh.Session, name: str) -> None:
-    """Have map `name` make a step: whoever may hear its delta does."""
+    """Have map `name` make a step: every client that may hear its delta does."""
     client = f"ops-{time.monotonic_ns()}"
     payload = codec.encode_insert(Insert(1, Batch(), settle=True))
     list(session.get(keys.insert_key(name, client), payload=payload, timeout=2.0))

@@ -1,4 +1,4 @@
-"""After a crash whoever asks again gets what was answered first, to the byte: accepted or refused, with its report."""
+"""After a crash who asks again gets what was answered first, to the byte: accepted or refused, with its report."""
 
 import signal
 from collections.abc import Callable

@@ -22,7 +22,7 @@ from factorbus.service.journal.recovery import verify
 from factorbus.simulate import WORLDS
 from factorbus.solver import Options, Solver
 
-# With so many further steps, and more, for the map that is LONG and only goes downhill.
+# With this number of further steps, and more, for the map that is LONG and only goes downhill.
 MODES = {"all-batch": 20, "inc-l": 20, "bayes-tree": 0}
 
 
@@ -162,7 +162,7 @@ def test_while_it_goes_on_it_says_so_and_answers_of_its_latest_revision(
 
 
 def test_an_insert_that_comes_in_between_goes_first(services: Callable[..., Services], tmp_path: Path) -> None:
-    """Whoever inserts waits for the one step under way; after it, the map is left alone again."""
+    """An insert waits for the one step under way; after it, the map is left alone again."""
     with alone(services, tmp_path / "j", "all-batch") as (_, joined):
         deltas = turn(joined, LONG)
         deltas.wait_for_further(3)

@@ -84,7 +84,7 @@ def into_memory(question: Question) -> Iterator[tuple[Ask, np.ndarray]]:
         yield Ask(sighting, "rows", memory.segment(PAGE)), memory.array(PAGE, rows.shape)
 
 
-def test_whoever_computes_the_bits_are_the_same(spawn: Spawn, tmp_path: Path, question: Question) -> None:
+def test_every_process_computes_the_same_bits(spawn: Spawn, tmp_path: Path, question: Question) -> None:
     sighting, y, rows = question
     with service(spawn, tmp_path) as (process, endpoint, client):
         workers: list[Process] = []

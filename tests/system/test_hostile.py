@@ -19,7 +19,7 @@ pytestmark = pytest.mark.alone
 Spawn = Callable[..., Process]
 HOSTILE = str(Path(__file__).parent / "hostile.py")
 # Many enough that the patience ends before they have come if each takes a second, which is what one full queue to
-# somebody who does not read costs whoever shares a thread with it.
+# somebody who does not read costs every client that shares a thread with it.
 INSERTS = 2 * int(PATIENCE_S)
 
 
@@ -27,7 +27,7 @@ INSERTS = 2 * int(PATIENCE_S)
 def service(tmp_path: Path, spawn: Spawn) -> str:
     settings = tmp_path / "serve.toml"
     # No front end here inserts 20,000 poses at once, so none may: who may has the solver for as long as that takes.
-    # A flood of questions is refused but for a few, and whoever floods does not take these refusals either.
+    # A flood of questions is refused but for a few, and the flooding client does not take these refusals either.
     settings.write_text("[limits]\nsessions = 200\ninsert_variables = 1000\nquestions = 4\n")
     process = spawn("-m", "factorbus.service", "--listen", "tcp/127.0.0.1:0", "--config", str(settings))
     return process.ready()[0]

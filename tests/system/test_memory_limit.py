@@ -20,7 +20,7 @@ ROOM = 120 << 20
 
 
 def chunk(first: int) -> Batch:
-    """So many poses more, at rest where odometry says."""
+    """A number of poses more, at rest where odometry says."""
     own = np.arange(first, first + POSES)
     edges = np.stack([own - 1, own], axis=1)[first == 0 :]
     measured = np.tile([1.0, 0, 0], (len(edges), 1))

@@ -1,4 +1,4 @@
-"""A batch optimum whose search ended before it had converged: whoever found it, and whoever tells it, says so."""
+"""A batch optimum whose search ended before it had converged: solver, service and client all say so."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Time stamps in a map of a real service: whoever looks, and whatever becomes of the map, sees the same ones."""
+"""Time stamps in a map of a real service: every client sees the same ones, whatever becomes of the map."""
 
 import asyncio
 import signal

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from naive.solver_parts import graph_in
 from processes import Process
 
 from factorbus.client import Draft, Map, Refused, aio, connect
@@ -65,7 +66,7 @@ def square(endpoint: str, request: pytest.FixtureRequest) -> Iterator[tuple[Map,
 
 
 def index(twin: Solver, *names: str) -> np.ndarray:
-    return np.array([twin._graph.find(symbol(name[0], int(name[1:]))) for name in names])
+    return np.array([graph_in(twin).find(symbol(name[0], int(name[1:]))) for name in names])
 
 
 def test_covariances_are_those_of_the_solver(square: tuple[Map, Solver]) -> None:

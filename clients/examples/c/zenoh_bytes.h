@@ -28,7 +28,7 @@ typedef struct {
 uint8_t byte(reader *in);
 /* Seven bits a byte, the least first; the ninth byte has eight. */
 uint64_t number(reader *in);
-/* So many of the next bytes. */
+/* The next bytes, as many as are asked for. */
 reader part(reader *in, uint64_t size);
 void skip_extensions(reader *in, uint8_t header);
 

@@ -33,7 +33,7 @@ def query_all(link: Link, operation: str, timeout_s: float) -> list[bytes]:
         if attempt == 2 and all(isinstance(verdict, Again) for verdict in verdicts):
             refuse_other_protocol(link, max(end - time.monotonic(), 0.001))
         pauses = [verdict.pause_s for verdict in verdicts if isinstance(verdict, Again)]
-        # Whoever was busy has said for how long, and of nobody there is nothing to wait on.
+        # No event tells that a service is free again: a busy one has said for how long it is, and we wait that long.
         time.sleep(min(max(pauses), max(end - time.monotonic(), 0.0)))
     hint = "nobody replies: is it running, and may this client ask?"
     raise Unavailable(what, timeout_s, hint)

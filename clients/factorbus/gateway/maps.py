@@ -12,7 +12,7 @@ from factorbus.proto.messages import MapGraph
 from factorbus.viz import Spread, spread_of
 from factorbus.viz.certainty import blocks_of, chosen
 
-_ELLIPSES = 60  # of so many poses, and so many points
+_ELLIPSES = 60  # at most, of poses and of points alike
 
 
 @dataclass(slots=True)

@@ -21,8 +21,8 @@ _NOBODY = Covariances(0, 0, "diagonal", ())
 
 
 def chosen(variables: Sequence[Variables], most: int) -> I64:
-    """Keys of at most about `most` variables that have a place: the last pose of each robot, and of all poses and all
-    points so many, evenly."""
+    """Keys of at most about `most` variables that have a place: the last pose of each robot, and
+    an even selection of the poses and points."""
     found = [np.empty(0, np.int64)]
     for prefix in ("se", "point"):
         keys = np.sort(np.concatenate([found[0], *(_placed(group, prefix) for group in variables)]))

@@ -34,8 +34,8 @@ def points_of(variables: Sequence[Variables]) -> Track:
 
 
 def feature_rays(variables: Sequence[Variables], horizon_m: float = 50.0) -> Track:
-    """Inverse-depth features as rays: places (n, 2, 3), from the camera of their first sight to where they are thought
-    to be, and no further than the horizon.
+    """Inverse-depth features as rays: places (n, 2, 3), from the camera of their first observation to where they are
+    estimated to be, and no further than the horizon.
 
     A value is x y z θ φ ρ; the ray points along (cos φ sin θ, −sin φ, cos φ cos θ), 1/ρ metres (`workers/MATH.md`).
     """

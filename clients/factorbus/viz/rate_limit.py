@@ -1,4 +1,4 @@
-"""Asking again and again without being a burden: one question at a time, and pauses by how long the answers take."""
+"""Asking repeatedly at a bounded load: one question at a time, and pauses by how long the answers take."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
-# The share of the time that a service spends on answering is at most one in so many.
+# The share of the time that a service spends on answering is at most one in this number.
 _SPARE = 10
 _LEAST_PAUSE_S = 0.5
 

@@ -133,7 +133,7 @@ def cut(
 
 
 def _together(pieces: Sequence[Pieces]) -> list[Pieces]:
-    """Those of a kind that follow each other as one: an insert has room for so many groups only."""
+    """Those of a kind that follow each other as one: the number of groups of an insert is limited."""
     made: list[Pieces] = []
     for each in pieces:
         if made and made[-1].kind == each.kind:

@@ -132,7 +132,7 @@ def _column(numbers: Any) -> memoryview:
 
 
 def _array(content: Map, name: str, multiple: int) -> F64:
-    """The column `name`, of a multiple of so many numbers."""
+    """The column `name`, whose count of numbers is a multiple of `multiple`."""
     value = content.get(name)
     if type(value) is not bytes or len(value) % (8 * multiple) or (multiple == CAMERA_STATE and not value):
         seen = counted(len(value), "byte") if type(value) is bytes else "missing or not a bin"

@@ -63,7 +63,7 @@ def own(
 
 
 def _open(folder: Path) -> int:
-    """Whoever can open the file can take the lock, and keep the service from starting: so it is for this user alone."""
+    """What can open the file can take the lock and keep the service from starting: so only this user may."""
     try:
         make_own(folder)
         descriptor = os.open(folder / NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)

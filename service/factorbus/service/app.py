@@ -276,7 +276,7 @@ class Shell:
         else:
             ignore(query)
 
-    # ---- on the control thread, which sends nothing itself to whoever might not take it -----------------------------
+    # ---- on the control thread, which sends nothing itself to a peer that may not read -----------------------------
 
     def _administer(self, query: Asker) -> None:
         operation, payload = str(query.key_expr).rpartition("/")[2], payload_of(query)

@@ -50,8 +50,8 @@ class Limits:
     insert_factors: int = 1_000_000
     variables: int = 20_000_000
     factors: int = 100_000_000
-    snapshot_steps: int = 1000  # a snapshot after so many steps ...
-    snapshot_bytes: int = 64 << 20  # ... or so many bytes of deltas
+    snapshot_steps: int = 1000  # a snapshot after this number of steps ...
+    snapshot_bytes: int = 64 << 20  # ... or of bytes of deltas
     jobs: int = 64  # batch optima being computed or waiting, in this service
     sessions: int = 1000  # connections to this service
     memory_bytes: int = 0  # of this process, before what would make maps grow is refused; 0: 4/5 of what there is
@@ -91,7 +91,7 @@ class Config:
     cores: int = 2  # that one elimination may be at work on at once, of those that there are
     # From so much memory of a map on; before, each on its own thread alone.  10,000 poses in a plane, 2,000 in space.
     cores_from_bytes: int = 64 << 20
-    standby: bool = False  # wait until whoever owns the journal's folder is gone
+    standby: bool = False  # wait until the process that owns the journal's folder is gone
     limits: Limits = field(default_factory=Limits)
 
 

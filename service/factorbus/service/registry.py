@@ -300,7 +300,7 @@ class Maps:
         self._check_room()
 
     def _answered_again(self, asker: Asker, fork: Fork) -> bool:
-        """Whether this very fork has been made: whoever asks again is answered again."""
+        """Whether this very fork has been made: a repeated request is answered again."""
         done = bool(fork.request) and self._forks.get(fork.target) == fork
         if done:
             row = self._maps[fork.target].host.core.row()

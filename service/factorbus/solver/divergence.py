@@ -42,7 +42,7 @@ def find_diverged(changed: I64, graph: FactorGraph, report: StepReport) -> error
 
 
 def is_usual(solver: Solver, variables: int = 0, factors: int = 0) -> bool:
-    """Whether all numbers are of usual sizes, but for those of the first so many variables and factors."""
+    """Whether all numbers are of usual sizes, but for those of a leading part of the variables and factors."""
     return bool(are_usual(variables, factors, solver._graph.array_table))
 
 
@@ -60,8 +60,8 @@ def copied(solver: Solver) -> Solver:
 
 
 def undone(solver: Solver, report: StepReport, variables: int, factors: int) -> tuple[Solver, StepReport]:
-    """A new solver with the first so many variables and factors of `solver`, and the values they had before its last
-    step, which gave `report`; and the report of its own first step, which eliminates everything at these values.
+    """A new solver with the leading part of the variables and factors of `solver`, and the values they had before its
+    last step, which gave `report`; and the report of its own first step, which eliminates everything at these values.
 
     `solver` is of no use then.  Raises SolverError.
     """

@@ -106,7 +106,7 @@ class Solver:
         return self._graph.keys[find_convertible(self._graph, below)]
 
     def renew(self, other: "Solver", variables: int, factors: int) -> StepReport:
-        """Take over the first so many variables and factors of `other`, as they are; the first step of a new solver."""
+        """Take over the first variables and factors of `other`, as they are; the first step of a new solver."""
         edits = unchanged(other._graph)
         edits.stays[variables:] = False
         edits.kept[factors:] = False
@@ -129,7 +129,7 @@ class Solver:
         """A copy of everything: variables with their present values, and factors by kind in the order of their ids;
         but those that are one factor in pieces behind the others, in their order.
 
-        variables, factors: no more than the first so many.
+        variables, factors: how many of each at most, the first ones.
         """
         count = self.variable_count if variables is None else min(variables, self.variable_count)
         return self._graph.variables(np.arange(count)), self._graph.factors(factors, find_apart(self._graph))

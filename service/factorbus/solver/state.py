@@ -7,7 +7,7 @@ kept unless somebody says otherwise, and one that cannot be written is an error 
 Of an array with room behind what is in use, only that much is kept: the class tells of it in `in_use`.
 
 A state is a dict of arrays, numbers, text, None, lists, and dicts like it.  Which, and what their numbers mean, is its
-`FORMAT`: whoever keeps a state keeps that beside it, and gives a solver only one in its own.
+`FORMAT`: what keeps a state keeps that beside it, and gives a solver only one in its own.
 """
 
 from collections.abc import Mapping

@@ -24,7 +24,7 @@ class Tuning:
                                   much as that, and `relinearize_max_wait` is k times as long
 
     The elimination order of a step (MATH §9.4):
-    constrain_recent_steps        variables that had a factor in the last so many steps are eliminated last
+    constrain_recent_steps        variables that had a factor in this number of last steps are eliminated last
     reroot_min_flops              an elimination of F flops, more than this, brings variables near the root: those that
     reroot_size_linear            surround the newest factors, this times ∛F scalars of them,
     reroot_size_area              or this times F^⅔, whichever is more,
@@ -41,7 +41,7 @@ class Tuning:
     reuse_factor                  R stays in use after a step was made with it, as long as it leads there (MATH §8.6);
                                   False: it is computed anew at every new linearization point, as the paper has it
     constrain_last_pose           constrain the ordering: the last pose last, the landmarks seen from the
-    constrain_recent_poses        last so many poses right before it
+    constrain_recent_poses        this number of last poses right before it
 
     All modes:
     chi2_epsilon                  a χ² below this is nothing: 1e-12 is a millionth of a standard deviation, squared.  A

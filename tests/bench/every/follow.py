@@ -48,9 +48,9 @@ class Followed:
 
 
 def follow(steps: Sequence[Batch], options: Options, every: int = 1, check: int = 0) -> Followed:
-    """Replay; with `every`, judge only each so many-th step, those that say they have not converged, and the last.
+    """Replay; with `every`, judge only its multiples, steps that say they have not converged, and the last.
 
-    check: at so many steps, spread, the oracle has to find the same optimum.
+    check: at this number of steps, spread, the oracle has to find the same optimum.
     """
     solver, judge, oracle, seen, seconds, off = Solver(options), Judge(), Oracle(), [], 0.0, 0.0
     checked = set(sample_steps(len(steps), check)) if check else set()

@@ -88,7 +88,7 @@ class Watched(Isam2):
 def follow_isam2(
     batches: Sequence[Batch], every: int = 1, progress: Callable[[int], None] = lambda _: None
 ) -> tuple[list[Look], str]:
-    """Every so many-th step and the last one judged; then why it gave up, or was replayed with QR, where that is so.
+    """Every `every`-th step and the last one judged; then why it gave up, or was replayed with QR, where that is so.
 
     With Cholesky, GTSAM takes what a weak prior holds for indeterminate.
     """

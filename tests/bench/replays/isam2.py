@@ -113,7 +113,7 @@ class Isam2Alone:
     """What is on the clock: `update`.
 
     iSAM2 leaves the back-substitution of a step to the next `update`, or to the first who asks for an estimate before
-    that.  First values are composed from the estimate, so whoever composes them during the replay takes that work off
+    that.  First values are composed from the estimate, so one who composes them during the replay takes that work off
     the clock.  Hence a rehearsal, with estimates; what it composed is what the replay itself takes in, which asks for
     nothing.
     """

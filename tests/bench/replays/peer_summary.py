@@ -46,7 +46,7 @@ def _peer_of(runs: dict[str, list[Run]]) -> str:
 
 
 def time_until(run: Run, steps: int) -> float:
-    """CPU seconds of the first so many steps; between the points of the curve it is taken as straight."""
+    """CPU seconds of the leading steps; between the points of the curve it is taken as straight."""
     if steps >= run["done"]:
         return float(run["cpu_s"])
     return float(np.interp(steps - 1, *run["cumulative"]))

@@ -102,7 +102,7 @@ def judge_growth(found: dict[str, Any] | None) -> list[Verdict]:
 
 
 def judge_cores(found: dict[str, Any] | None, poses: int) -> list[Verdict]:
-    """A second core for the longest steps of a drive of so many poses."""
+    """A second core for the longest steps of a drive of this number of poses."""
     if found is None:
         return []
     words = (

@@ -18,7 +18,7 @@ class Problem:
 
     name      the file's stem, or the world's name
     title     the name in the paper
-    poses     the first so many poses only; 0: all.  A world has always a number
+    poses     how many first poses only; 0: all.  A world has always a number
     optimum   the lowest χ² known for the whole file (g2o's convention), None where nobody has published it
     seed      of a world; 0: a data set
     """

@@ -8,7 +8,7 @@ _GOLDEN = (math.sqrt(5) - 1) / 2
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """every: each so many steps; 0: `most` steps, spread.  The last step always."""
+    """every: each step that is a multiple of it; 0: `most` steps, spread.  The last step always."""
 
     most: int = 100
     every: int = 0

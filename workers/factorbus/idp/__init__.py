@@ -6,7 +6,7 @@
     minimal.covariance(P, sighting, seen)     P with the new features; or rows of it, its upper half, its factors
     independent.covariance(P, A, B, padd)     the same as the 2011 paper has it, and
     classical.covariance(P, A, B, padd)       as it was before
-    job.do(payload)                           the job of kind `idp`, whoever does it
+    job.do(payload)                           the job of kind `idp`, in any process
 
 Every covariance comes with the number of multiplications that made it, counted where they are made.
 """

@@ -1,4 +1,4 @@
-"""The job of kind `idp`: a shard of a question's features, the same bits whoever does it."""
+"""The job of kind `idp`: a shard of a question's features, the same bits in any process."""
 
 import numpy as np
 

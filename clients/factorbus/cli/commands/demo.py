@@ -161,12 +161,12 @@ def _look_on(request: DemoRequest, solver: Any, robot: Any, viewer: Any) -> None
         while not robot.ended():
             if solver.ended():
                 raise solver.died()
-            revision = viewer.await_news(timeout_s=0.2)
+            revision = viewer.wait_for_delta(timeout_s=0.2)
             show(revision, _word(viewer))
             if revision // every > asked and revision < request.poses:
                 asked = revision // every
                 viewer.compare()
-        show(viewer.await_news(timeout_s=0.2), _word(viewer))
+        show(viewer.wait_for_delta(timeout_s=0.2), _word(viewer))
 
 
 def _word(viewer: Any) -> str:

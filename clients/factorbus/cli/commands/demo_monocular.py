@@ -63,13 +63,13 @@ def run_monocular_demo(
     plot: Path, frames: int, points: int, features: int, noise: float, outliers: float, seed: int, workers: int
 ) -> dict[str, Any]:
     """Run it, with progress on standard error; returns the document."""
-    from factorbus.cli.demo.evaluate_filter import Sightseer, verdict
+    from factorbus.cli.demo.evaluate_filter import FilterEvaluator, verdict
     from factorbus.cli.output.console import print_note, progress
     from factorbus.cli.process.children import STARTING, service, worker
     from factorbus.cli.process.stopping import interrupt_on_sigterm
     from factorbus.client import connect
     from factorbus.simulate import monocular
-    from factorbus.viz.monocular import save_sights
+    from factorbus.viz.monocular import save_monocular_drive
 
     world = monocular(frames, seed, points=points, sigma_pixel=noise, outlier_share=outliers)
     with ExitStack() as stack:
@@ -80,19 +80,19 @@ def run_monocular_demo(
             stack.enter_context(worker(endpoint, f"worker{number}"))
         bus = stack.enter_context(connect(endpoint, client="camera"))
         front = bus.features(world.camera, rho=_RHO, sigma_rho=_SIGMA_RHO, sigma_pixel=noise)
-        sightseer = Sightseer(world, front, features)
+        evaluator = FilterEvaluator(world, front, features)
         seen = []
         with progress("the camera looks", frames) as show:
-            for frame in sightseer.run():
+            for frame in evaluator.run():
                 seen.append(frame)
                 show(
                     frame.number + 1,
                     f"{counted(len(frame.rays), 'feature')}, {frame.error_m * 100:.1f} cm from the truth",
                 )
     truth = [frame.pose[:3] for frame in world]
-    result = {**verdict(seen, sightseer), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
-    shares = [course.share for _, course in sightseer.ended]
-    save_sights(
+    result = {**verdict(seen, evaluator), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
+    shares = [history.share for _, history in evaluator.ended]
+    save_monocular_drive(
         plot, [(f.number, f.position, f.rays, f.spread) for f in seen], truth, world.points, shares, _said(result)
     )
     return result
@@ -100,7 +100,7 @@ def run_monocular_demo(
 
 def _said(result: dict[str, Any]) -> str:
     depth = result["relative_depth"]
-    return f"depths known to {depth['first']:.0%} at first sight, to {depth['last']:.2%} at last"
+    return f"depths known to {depth['first']:.0%} at the first observation, to {depth['last']:.2%} at last"
 
 
 def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
@@ -110,7 +110,7 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         ("features", f"{result['features']} made ({made}), {result['dropped_as_wrong']} found wrong and dropped"),
         ("pixels used", f"{result['pixels_used']:,}"),
-        ("depth, σ/depth, median", f"{depth['first']:.0%} at first sight → {depth['last']:.2%} at last"),
+        ("depth, σ/depth, median", f"{depth['first']:.0%} at the first observation → {depth['last']:.2%} at last"),
         ("inverse depths within 3σ", f"{within:.1%} of {result['features_judged']}"),
         (
             "trajectory within 3σ",

@@ -21,7 +21,7 @@ _LONG_ENOUGH = 10  # pixels of a feature that is judged
 
 
 @dataclass(slots=True)
-class DepthCourse:
+class DepthHistory:
     """How well a feature's depth was known: σ_ρ/ρ frame by frame, and its last error in standard deviations."""
 
     rho_true: float
@@ -43,15 +43,15 @@ class SeenFeature:
     filter_ms: float
 
 
-class Sightseer:
+class FilterEvaluator:
     """Drives a filter through a world."""
 
     def __init__(self, world: MonocularWorld, front: Features, most: int) -> None:
         self._world = world
         settings = VisualSettings(world.sigma_pixel, most=most)
         self.visual = VisualFilter(front, settings, Filter(np.zeros(CAMERA), np.zeros((CAMERA, CAMERA))))
-        self._courses: dict[Tracked, DepthCourse] = {}
-        self.ended: list[tuple[Tracked, DepthCourse]] = []
+        self._histories: dict[Tracked, DepthHistory] = {}
+        self.ended: list[tuple[Tracked, DepthHistory]] = []
 
     def run(self) -> Iterator[SeenFeature]:
         """All frames.  Raises Unavailable, Refused."""
@@ -60,11 +60,11 @@ class Sightseer:
             if number == 0:
                 self._start(frame)
             lost = self.visual.look(number, 1 / self._world.rate_hz if number else 0.0, frame.points, frame.pixels)
-            self.ended += [(feature, self._courses[feature]) for feature in lost]
+            self.ended += [(feature, self._histories[feature]) for feature in lost]
             between = time.perf_counter()
             self._grow(number, frame)
             yield self._judged(number, frame, (between - started) * 1e3, (time.perf_counter() - between) * 1e3)
-        self.ended += [(feature, self._courses[feature]) for feature in self.visual.tracked]
+        self.ended += [(feature, self._histories[feature]) for feature in self.visual.tracked]
 
     def _start(self, frame: Frame) -> None:
         """At the origin, which is the world's; velocities as somebody else measured them."""
@@ -81,14 +81,14 @@ class Sightseer:
             order = np.argsort(frame.outlier, kind="stable")
         for feature in self.visual.grow(number, frame.points, frame.pixels, order.tolist()):
             distance = float(np.linalg.norm(self._world.points[feature.track] - frame.pose[:3]))
-            self._courses[feature] = DepthCourse(1 / distance)
+            self._histories[feature] = DepthHistory(1 / distance)
         if number == 0:
             self._measure_target()
 
     def _measure_target(self) -> None:
         """A target in view when it starts gives the scale, as in MonoSLAM: the distances to some points are known."""
         filter, count = self.visual.filter, min(_TARGET_POINTS, len(self.visual.tracked))
-        truth = np.array([self._courses[feature].rho_true for feature in self.visual.tracked[:count]])
+        truth = np.array([self._histories[feature].rho_true for feature in self.visual.tracked[:count]])
         H = np.zeros((count, len(filter.x)))
         H[np.arange(count), CAMERA + FEATURE * np.arange(count) + 5] = 1.0
         filter.update(truth - filter.features[:count, 5], H, np.diag((_TARGET_SHARE * truth) ** 2))
@@ -97,9 +97,9 @@ class Sightseer:
         filter, count = self.visual.filter, len(self.visual.tracked)
         spread = np.sqrt(np.array([filter.feature_covariance(i)[5, 5] for i in range(count)]))
         for feature, rho, sigma in zip(self.visual.tracked, filter.features[:, 5], spread, strict=True):
-            course = self._courses[feature]
-            course.share.append(float(sigma / abs(rho)))
-            course.error = float((rho - course.rho_true) / sigma)
+            history = self._histories[feature]
+            history.share.append(float(sigma / abs(rho)))
+            history.error = float((rho - history.rho_true) / sigma)
         off = filter.x[:3] - frame.pose[:3]
         nees = float(off @ np.linalg.solve(filter.P[:3, :3] + 1e-18 * np.eye(3), off))
         position = filter.x[:3].copy()
@@ -108,12 +108,12 @@ class Sightseer:
         )
 
 
-def verdict(frames: list[SeenFeature], sightseer: Sightseer) -> dict[str, Any]:
+def verdict(frames: list[SeenFeature], evaluator: FilterEvaluator) -> dict[str, Any]:
     """What the run comes to: errors, consistency, how rays became points."""
-    lasting = [course for feature, course in sightseer.ended if feature.matched >= _LONG_ENOUGH]
-    errors = np.abs([course.error for course in lasting])
+    lasting = [history for feature, history in evaluator.ended if feature.matched >= _LONG_ENOUGH]
+    errors = np.abs([history.error for history in lasting])
     nees = np.array([frame.nees for frame in frames[1:]])
-    counts = sightseer.visual.counts
+    counts = evaluator.visual.counts
     return {
         "frames": len(frames),
         "features": counts["features"],
@@ -125,10 +125,10 @@ def verdict(frames: list[SeenFeature], sightseer: Sightseer) -> dict[str, Any]:
         "nees": {"mean": float(nees.mean()), "wanted": 3.0, "within_3_sigma": float((nees < _3_SIGMA).mean())},
         "inverse_depth_within_3_sigma": float((errors < 3).mean()) if lasting else None,
         "relative_depth": {
-            "first": float(np.median([course.share[0] for course in lasting])) if lasting else None,
-            "last": float(np.median([course.share[-1] for course in lasting])) if lasting else None,
+            "first": float(np.median([history.share[0] for history in lasting])) if lasting else None,
+            "last": float(np.median([history.share[-1] for history in lasting])) if lasting else None,
         },
         "filter_ms": float(np.median([f.filter_ms for f in frames])),
         "grow_ms": float(np.median([f.grow_ms for f in frames if f.grow_ms > 0.05] or [0.0])),
-        "made_by": dict(sightseer.visual.workers),
+        "made_by": dict(evaluator.visual.workers),
     }

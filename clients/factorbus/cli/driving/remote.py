@@ -116,7 +116,7 @@ class RemoteMap:
         self._waited = max(self._waited, revision)
         self._mirror.wait_for(revision, timeout_s=_ANSWER_S)
 
-    def await_news(self, timeout_s: float) -> int:
+    def wait_for_delta(self, timeout_s: float) -> int:
         """Wait for a delta, or until time is up; gives the revision that the estimate here is of."""
         with self._lock:
             self._changed.wait_for(lambda: self._news, timeout_s)

@@ -6,7 +6,7 @@ const AXES = { z: [0, 1], y: [0, 2], x: [1, 2] };
 // Where the entries of a covariance are in xx xy xz yy yz zz.
 const ENTRY = [[0, 1, 2], [1, 3, 4], [2, 4, 5]];
 const REACH_PX = 14;
-const FEW_TOUCHED = 60; // so many variables of the last step are shown in full
+const FEW_TOUCHED = 60; // at most this number of variables of the last step is shown in full
 
 export class View {
   constructor(canvas, plane) {

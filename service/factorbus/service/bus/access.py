@@ -13,8 +13,8 @@ Everything else is denied, silently: Zenoh drops what it denies, and a query end
 "Under its own name": the client library appends a suffix that is new with every run, so robot1 may use the keys of
 `robot1` and of `robot1-…`.  That is why a name here has no `-` in it: robot1-b would be a robot1.
 
-A name is the common name of a TLS certificate, or a user's; Zenoh has no rule in terms of "whoever asks", so each name
-gets rules of its own.  Flows are as the enforcing side sees them: ingress is from the one who is named.
+A name is the common name of a TLS certificate, or a user's; Zenoh has no rule in terms of "the one that asks", so each
+name gets rules of its own.  Flows are as the enforcing side sees them: ingress is from the one who is named.
 """
 
 import re

@@ -149,7 +149,7 @@ class MapPlace:
 
     def __init__(self, session: zenoh.Session, name: str, service: str) -> None:
         channels = {"delta": keys.delta_key, "event": keys.event_key, "snapshot": keys.snapshot_key}
-        # DROP: one stuck subscriber must not hold up all others; whoever misses a delta sees the gap and asks.
+        # DROP: one stuck subscriber must not hold up all others; a mirror that misses a delta sees the gap and asks.
         self._channels = {
             channel: session.declare_publisher(
                 key(name), congestion_control=zenoh.CongestionControl.DROP, priority=_PRIORITY[channel]

@@ -18,10 +18,10 @@ from factorbus.wording import counted
 # is polished, that is, goes on to its optimum.
 CONVERGE_IDLE_S, POLISH_IDLE_S = 0.1, 1.0
 FULL_SPEED_S = 2.0  # of a core, for further steps in a row; then the solver rests after each for as long as it worked
-MOST, MOST_S = 10_000, 300.0  # so many in a row, and so much of a core for them
+MOST, MOST_S = 10_000, 300.0  # further steps in a row, and the seconds of a core for them
 # Without use is a step that does not lower χ² by this share, below the least so far; and one that changes nothing.
 _SHARE, _NOTHING = 1e-7, 1e-12
-_USELESS, _STILL = 20, 3  # so many in a row
+_USELESS, _STILL = 20, 3  # steps in a row
 
 
 class Converging:

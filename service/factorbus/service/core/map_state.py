@@ -42,7 +42,7 @@ from factorbus.service.questions.admin import MovedOn
 from factorbus.service.questions.answers import Question, parse
 
 _SNAPSHOT = Read(Question("snapshot"))
-# An InsertBatch is short when it is for one insert of at most so many bytes and none of late took longer than so,
+# An InsertBatch is short when it is for one insert of at most _SHORT_BYTES and none of late took longer than _SHORT_S,
 # unless the insert was already on its way when the last InsertBatch ended: then there are likely more behind it, to be
 # applied together.
 _SHORT_BYTES = 16 << 10

@@ -2,8 +2,8 @@
 
 A question is answered between two steps in one of two ways.  Most take a copy there, and are answered from it on
 another thread; one copy serves all of them, so they go together however many there are.  Those about a few variables
-are answered on the spot, from R where it lies, and inserts wait for each.  So in one InsertBatch they come to so many
-variables together, and the others stay for the next one, which takes the inserts that came in meanwhile.
+are answered on the spot, from R where it lies, and inserts wait for each.  So in one InsertBatch they come to a bounded
+number of variables together, and the others stay for the next one, which takes the inserts that came in meanwhile.
 """
 
 from collections import deque

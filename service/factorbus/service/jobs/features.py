@@ -47,7 +47,7 @@ class _Question:
 
 @dataclass(frozen=True, slots=True)
 class _Cutting:
-    """A question that goes to workers, in at most so many shards."""
+    """A question that goes to workers, in at most `most` shards."""
 
     payload: bytes
     ask: Ask

@@ -56,7 +56,7 @@ def seconds_compiling() -> float:
 
 
 def _share_out(processes: int, progress: Callable[[str], None] | None) -> None:
-    """Compile what is missing in other processes.  One that fails leaves its kernels to whoever needs them."""
+    """Compile what is missing in other processes.  One that fails leaves its kernels to the process that needs them."""
     told, tell = os.pipe()
     with tempfile.TemporaryDirectory(prefix="factorbus-warm-") as claims, ExitStack() as stack:
         names = stack.enter_context(os.fdopen(told))
@@ -103,11 +103,11 @@ def _list_missing() -> list:
 
 
 def _end(process: subprocess.Popen) -> None:
-    """At once, if it has not ended: whoever started it is going away."""
+    """At once, if it has not ended: the process that started it is going away."""
     process.kill()
     process.wait()
 
 
 if __name__ == "__main__":
-    with suppress(FileNotFoundError, BrokenPipeError, KeyboardInterrupt):  # whoever started this has gone
+    with suppress(FileNotFoundError, BrokenPipeError, KeyboardInterrupt):  # the process that started this has gone
         _take_turns(Path(sys.argv[1]), _tell)

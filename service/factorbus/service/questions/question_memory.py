@@ -21,7 +21,7 @@ class Taken:
         self._memory, self.bytes = memory, 0
 
     def take(self, size: int) -> None:
-        """So many bytes more, until it is answered.  Raises OutOfMemory."""
+        """Reserve bytes until the question is answered.  Raises OutOfMemory."""
         if self._memory is not None and size > _LITTLE:
             self._memory.reserve(size)
             self.bytes += size

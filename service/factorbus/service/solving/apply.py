@@ -1,4 +1,4 @@
-"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: whoever has the map's InsertBatch.
+"""Waiting inserts into the solver, one step, the delta.  For one thread at a time: that with the map's InsertBatch.
 
     1  stage every insert; the solver refuses a bad one whole, the others go on
     2  one step for all of them

@@ -116,7 +116,7 @@ class Holding:
         return {"solver": self._solver.dump()} | state
 
     def _copied(self, room: int) -> Copied:
-        """All of it, if another map_solver and what lies between them fit into so many bytes."""
+        """All of it, if another map_solver and what lies between them fit into this number of bytes."""
         size = _COPIES * self.memory_bytes()
         return Copied(self.dump() if size <= room else None, size)
 

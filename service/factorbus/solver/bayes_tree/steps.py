@@ -117,7 +117,7 @@ class TreeSteps:
         return self._tree.memory_bytes()
 
     def rebase(self, fewer: int) -> None:
-        """So many of the factors that were there after the last step are gone."""
+        """Note that this number of the factors that were there after the last step is gone."""
         mark = list(self._mark)
         mark[at.FACTORS] -= fewer
         self._mark = tuple(mark)

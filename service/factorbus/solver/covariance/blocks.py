@@ -59,7 +59,7 @@ class CovarianceBlocks:
         return out
 
     def prefers_all(self, count: int) -> bool:
-        """Whether so many variables are sooner looked up among all than computed by themselves."""
+        """Whether this number of variables is sooner looked up among all than computed by itself."""
         whole = self.factored.order.size > 0
         return self._diagonal is not None or (whole and count > _FEW * self.factored.count)
 

@@ -7,5 +7,5 @@ from factorbus.solver.kernels.jit.compile import F64, I64
 
 
 def threshold(dims: I64, probability: float) -> F64:
-    """The d² that right measurements of so many dimensions stay below with `probability`, above 0 and below 1."""
+    """The d² that right measurements of this dimension stay below with `probability`, above 0 and below 1."""
     return np.asarray(chdtri(dims.astype(float), 1.0 - probability), float)

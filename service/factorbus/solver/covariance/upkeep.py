@@ -78,7 +78,7 @@ class Upkeep:
         self._dims[old : self._count], self._scalar[old : self._count] = dims, new[:, at.V_SCALAR]
 
     def _enlarge(self, count: int, width: int) -> None:
-        """For so many variables of so many numbers."""
+        """Room for a number of variables and of their numbers."""
         blocks, dims, scalar = np.zeros((count, width, width)), np.zeros(count, np.int64), np.zeros(count, np.int64)
         kept, changed_at = len(self._blocks), np.full(count, -1)
         blocks[:kept, : self._width, : self._width] = self._blocks

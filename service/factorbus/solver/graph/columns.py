@@ -98,12 +98,12 @@ def limit_lenses(raw: bytes, groups: I64) -> tuple[bytes, I64, errors.SolverErro
 
 
 def ints_at(raw: bytes, start: int, count: int) -> I64:
-    """So many int64 from raw[start] on."""
+    """`count` int64 from raw[start] on."""
     return np.frombuffer(raw, _I64, count, start)
 
 
 def floats_at(raw: bytes, start: int, count: int) -> F64:
-    """So many float64 from raw[start] on."""
+    """`count` float64 from raw[start] on."""
     return np.frombuffer(raw, _F64, count, start)
 
 

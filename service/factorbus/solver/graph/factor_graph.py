@@ -99,7 +99,7 @@ class FactorGraph(Arenas):
         self.reserve_factors(sum(counts), sum(n * (width + 1) for n, width in zip(counts, widths, strict=True)))
 
     def reserve_variables(self, more: int, numbers: int) -> None:
-        """Make room for `more` variables, whose values have so many numbers together."""
+        """Make room for `more` variables and the numbers of all their values."""
         counts = self.counts.tolist()
         if (need := counts[at.VARIABLES] + more) > self.keys.size:
             together = self.keys, self.var, self.dims, self.stamps
@@ -111,7 +111,7 @@ class FactorGraph(Arenas):
             enter_keys(counts[at.VARIABLES], self.table, self.keys)
 
     def reserve_factors(self, more: int, numbers: int) -> None:
-        """Make room for `more` factors with so many numbers together (measurement, information, scale of a loss)."""
+        """Make room for `more` factors and all their numbers (measurement, information, scale of a loss)."""
         counts = self.counts.tolist()
         if (need := counts[at.FACTORS] + more) > len(self.fac):
             self.fac = with_room(self.fac, need)

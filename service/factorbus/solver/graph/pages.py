@@ -46,7 +46,7 @@ def enlarge(owner: object, name: str, size: int) -> None:
 
 
 def _bytes(size: int) -> int:
-    """Of the pages for so many doubles: whole huge ones where it has those, and Linux puts it where they can lie."""
+    """Of the pages for `size` doubles: whole huge ones where it has those, and Linux puts it where they can lie."""
     size = _DOUBLE * size + _LINE
     return size if size < _LARGE else -(-size // _HUGE_PAGE) * _HUGE_PAGE
 

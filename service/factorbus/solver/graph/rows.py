@@ -14,7 +14,7 @@ _NO_KEYS: I64 = np.empty(0, np.int64)
 _NO_VALUES: F64 = np.empty(0)
 _KIND, _COLUMN = at.V_KIND, at.V_COLUMN
 _new = tuple.__new__
-_FEW = 8  # for so many loops in NumPy cost more than in Python
+_FEW = 8  # up to this number, loops in NumPy cost more than in Python
 
 
 class Span:
@@ -37,7 +37,10 @@ class Span:
         self._keys, self._keys_seen = _NO_KEYS, _NO_KEYS
         self._values, self._values_seen = _NO_VALUES, _NO_VALUES
         self._held: Group | None = None  # of fixed ones, whose values stay
-        self._apart, self._known = _NO_KEYS, 0  # keys of the first so many, of those that are not together
+        self._apart, self._known = (
+            _NO_KEYS,
+            0,
+        )  # keys of rows that are apart, and of how many rows they are known
         self._stamped = False  # whether any of them is known to have a time stamp
 
     def __getstate__(self) -> tuple[None, dict[str, Any]]:

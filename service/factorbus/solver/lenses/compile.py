@@ -1,4 +1,4 @@
-"""How lenses are compiled: exactly, so that a feature has the same bits whoever makes it.  No cache of their own."""
+"""How lenses are compiled: exactly, so that a feature has the same bits in every process.  No cache of their own."""
 
 from pathlib import Path
 

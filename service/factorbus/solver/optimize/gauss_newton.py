@@ -64,7 +64,7 @@ class StoppingRule:
     """When to stop: the next step would lower χ² by less than `batch_tolerance` χ² + `floor`; or after `limit` tries.
 
     reuse: the old factor makes another step while each is to gain less than this share of the one before.
-    polish: so many steps more at most, below what χ² can show, while each is to gain less than the one before.
+    polish: this number of steps more at most, below what χ² can show, while each is to gain less than the one before.
     nonmonotone: where an undamped step would raise χ², it is made all the same, and others after it until χ² is lower
     than before them: at most this many in all.  If it never is, they are taken back, and damped ones follow.
     """
@@ -238,7 +238,7 @@ def _is_rounding(decrease: float, chi2: float) -> bool:
 
 
 def _damp_more(result: Minimization) -> bool:
-    """Ten times the damping; False: that has no use any more, and whoever tries again starts without any."""
+    """Ten times the damping; False: that has no use any more, and another try starts without any."""
     result.damping = max(10.0 * result.damping, _FIRST_DAMPING)
     if result.damping > _MOST_DAMPING:
         result.damping = 0.0

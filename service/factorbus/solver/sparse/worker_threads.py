@@ -1,6 +1,6 @@
 """Where worker threads of this process work on the eliminations of this process.  MATH §9.5.
 
-The solver has no thread of its own: whoever has one to spare makes a `WorkerThread`, and calls its `run` on that
+The solver has no thread of its own: a caller with one to spare makes a `WorkerThread`, and calls its `run` on that
 thread. There is one queue in a process, as there is one set of cores.
 """
 

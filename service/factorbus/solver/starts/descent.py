@@ -30,8 +30,8 @@ _CHUNK, _MOST, _MOST_OF_OTHERS = 4, 500, 60
 # Two starts are on the way to the same optimum when no value differs by more than this share of how far they reach, or
 # χ² by less than _SAME_CHI2 of it while it falls by less than _SLOW in a chunk.
 _SAME, _SAME_CHI2, _SLOW = 2e-3, 1e-3, 1e-2
-# A start is hopeless if so many chunks as good as its last one would not bring it below the best; and where two starts
-# have met, one that is so many times above them after its first chunk.
+# A start is hopeless if this number of chunks as good as its last one would not bring it below the best; and where two
+# starts have met, one that is this many times above them after its first chunk.
 _PATIENCE, _FAR = 2, 2.0
 # Ends whose χ² differ by less than this share are one: of those, the start that comes first in the list counts.
 _EQUAL = 1e-9

@@ -76,7 +76,7 @@ class Relations:
         return Relations(*(getattr(self, name)[chosen] for name in self.__slots__))
 
     def weighed(self, weights: F64) -> "Relations":
-        """The same, each counted so many times."""
+        """The same, the information of each times its weight."""
         wide = weights[:, None, None]
         return replace(
             self,
@@ -220,7 +220,7 @@ def _bearings(graph: FactorGraph, space: PoseSpace) -> tuple[np.ndarray, ...]:
 
 
 def _value(graph: FactorGraph, variables: I64, numbers: int) -> F64:
-    """The first so many numbers of the present values."""
+    """The leading numbers of the present values."""
     return graph.values[graph.var[variables, at.V_AT, None] + np.arange(numbers)]
 
 

@@ -1,1 +1,1 @@
-"""Compiled kernels of inverse-depth features: exact arithmetic, so that whoever computes gets the same bits."""
+"""Compiled kernels of inverse-depth features: exact arithmetic, so that every process gets the same bits."""

@@ -159,7 +159,7 @@ P_CONVERGED = (
     5  # a step goes on while a Gauss–Newton step may lower χ² by more than this share; one that raised it so ends
 )
 P_CHI2_EPSILON = 6  # a χ² that is nothing
-P_RECENT_STEPS = 7  # variables with a factor in the last so many steps go last
+P_RECENT_STEPS = 7  # variables with a factor in this number of last steps are eliminated last
 P_MAX_ROUNDS = 8  # eliminations in a step, at most
 P_INITIALIZE = 9  # how many new variables, at most, are first put where their own factors want them
 P_NEXT_STEP_SHARE = 10  # what waits is relinearized in the next step where all errors add more than this share,
@@ -167,13 +167,13 @@ P_MAX_WAIT = 11  # or where any has waited for this number of steps,
 P_MAX_ERROR = 12  # or the error of one factor is more than this
 P_REROOT_MIN_FLOPS = 13  # an elimination of more flops brings what is near to the root,
 P_REROOT_PERIOD = 14  # when with it this share has been spent of what that took the last time
-P_REROOT_SIZE_LINEAR = 15  # so many scalars, times the cube root of the flops
-P_COOLDOWN_STEPS = 16  # for so many steps after a relinearization P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are more,
-P_COOLDOWN_FACTOR = 17  # up to so many times
-P_FULL_BATCH = 18  # P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are for so many scalars that wait, (9.22)
-P_COOLDOWN_FLOPS = 19  # P_COOLDOWN_STEPS is for a relinearization of so many flops
-P_REROOT_SIZE_AREA = 20  # or so many times its square, if that is more,
-P_REROOT_RING_RATIO = 21  # in rings, each with all inside it so many times as large as the next one,
+P_REROOT_SIZE_LINEAR = 15  # size of the part near the root, in scalars: times the cube root of the flops
+P_COOLDOWN_STEPS = 16  # steps after a relinearization in which P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are more,
+P_COOLDOWN_FACTOR = 17  # up to this factor
+P_FULL_BATCH = 18  # P_NEXT_STEP_SHARE and P_SAME_STEP_SHARE are for this number of scalars that wait, (9.22)
+P_COOLDOWN_FLOPS = 19  # P_COOLDOWN_STEPS is for a relinearization of this number of flops
+P_REROOT_SIZE_AREA = 20  # or times its square, if that is more,
+P_REROOT_RING_RATIO = 21  # in rings, each with all inside it this many times as large as the next one,
 P_REROOT_MAX_EXTRA = 22  # unless that takes more than this share of the elimination in addition
 P_SIZE = 23
 

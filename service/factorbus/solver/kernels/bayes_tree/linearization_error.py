@@ -33,7 +33,7 @@ from factorbus.solver.kernels.model.records import Graph
 
 LEAST_REQUIRED_SHARE = 0.02
 IN_SPACE, WITH_LANDMARKS = 8.0, 24.0
-MUCH = 8  # where more than one variable in so many has moved, all factors are gone through
+MUCH = 8  # where more than one variable in this number has moved, all factors are gone through
 # The running sums are computed anew once the magnitudes added to them exceed this multiple of χ².
 CANCELLED = 1e5
 NOTHING = 1e-6  # χ²

@@ -13,7 +13,7 @@ from factorbus.solver.kernels.model.records import Graph
 from factorbus.solver.kernels.model.sizes import size_of
 
 WAITS, MOVES = 1, 2
-SPARSE = 16  # where no more than one factor in so many is to be linearized, the others are not looked through
+SPARSE = 16  # where no more than one factor in this number is to be linearized, the others are not looked through
 
 
 @part

@@ -54,7 +54,7 @@ if CAN_SLEEP:
 
     @inline_kernel
     def sleep(words: I64, i: int) -> None:
-        """Until somebody wakes whoever sleeps at the semaphore in words[i :]; a signal does it too."""
+        """Until another thread wakes those that sleep at the semaphore in words[i :]; a signal does it too."""
         _wait(address_of(words) + 8 * i)
 
     @inline_kernel

@@ -4,12 +4,12 @@ import numpy as np
 
 from factorbus.solver.kernels.jit.compile import I64, inline_kernel, part
 
-SPARSE = 64  # of so many variables one at the most: each has pages of its own anyway
+SPARSE = 64  # one variable in this number at the most: each has pages of its own anyway
 
 
 @part
 def put_in_order(indices: I64, count: int) -> bool:
-    """Sort different indices below `count`; where they are few among so many they stay as they are, and it gives False.
+    """Sort different indices below `count`; where they are few among many they stay as they are, and it gives False.
 
     What is done with each of thousands of variables then finds its rows in the cache, for they are read ahead.
     """

@@ -22,7 +22,7 @@ MOST_LINEAR = 1e24
 
 @inline_kernel
 def are_within(most: float, start: int, count: int, numbers: F64) -> bool:
-    """Whether so many numbers from `start` on are finite and at most `most` in magnitude."""
+    """Whether `count` numbers from `start` on are finite and at most `most` in magnitude."""
     within = True
     for c in range(count):
         within &= abs(numbers[start + c]) <= most

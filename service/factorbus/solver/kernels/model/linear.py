@@ -2,7 +2,7 @@
 
     r = Σ H_e (x_e ⊟ y_e) + b                                                                            (3.26)
 
-y_e the values at which whoever sends it has linearized, H_e its Jacobians there, b its residual there.  A difference is
+y_e the values at which its sender has linearized, H_e its Jacobians there, b its residual there.  A difference is
 a local increment: ⊟ of a pose in the plane is (R_yᵀ (t − t_y), wrap(θ − θ_y)), of one in space (R_yᵀ (t − t_y), 2 v)
 with (v, w) = q_y⁻¹ ⊗ q, w ≥ 0: twice the vector part of a quaternion, the rotation vector to second order.  Of a point
 it is x − y, and of a feature of inverse depth too, its θ wrapped.

@@ -48,7 +48,7 @@ class _Members(NamedTuple):
 
 @inline_kernel
 def quotient_graph(begin: I64, length: I64) -> QuotientGraph:
-    """The graph of these lists, of nodes alone.  Whoever has elements says so in `elements`, `kind` and `degree`."""
+    """The graph of these lists, of nodes alone.  Elements are marked in `elements`, `kind` and `degree`."""
     room = begin.size
     elements, kind, degree = np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room, np.int64)
     return QuotientGraph(begin, length, elements, kind, degree, np.ones(room, np.int64), np.ones(room, np.int64))

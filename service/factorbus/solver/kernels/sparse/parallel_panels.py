@@ -1,4 +1,4 @@
-"""What a panel takes off the rows behind it, in chunks of rows that several threads make.  Same bits, whoever does."""
+"""What a panel takes off the rows behind it, in chunks of rows that several threads make.  Same bits by any."""
 
 from factorbus.solver.kernels.jit.array_table import address_of, floats, put_entry
 from factorbus.solver.kernels.jit.compile import F64, I64, inline_kernel, part
