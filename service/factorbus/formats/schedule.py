@@ -304,9 +304,8 @@ def _unreached(file: str, names: Roster, entry: I64, ranges: Ranges) -> FormatEr
     return FormatError(
         file,
         None,
-        f"{lost} is joined to the rest only through points"
-        + (", and ranges that do not determine it" if ranges else ""),
-        f"an edge to another pose, or a vertex line for {lost}",
+        f"{lost} is joined to the rest only through {'ranges that do not determine it' if ranges else 'points'}",
+        f"an edge to another pose, or a vertex line for {lost}{' and more ranges' if ranges else ''}",
     )
 
 
