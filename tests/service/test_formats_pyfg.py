@@ -187,7 +187,9 @@ def random_graph(seed: int, kinds: set[str], stamped: bool) -> Batch:
         z = np.array([pose(kind.size) for _ in rows])
         roots = [rng.normal(size=(kind.dim, kind.dim)) + 2 * np.eye(kind.dim) for _ in rows]
         packed = np.array([(root.T @ root + 0.1 * np.eye(kind.dim))[np.triu_indices(kind.dim)] for root in roots])
-        groups.append(Factors(name, keys, abs(z) + 0.1 if name.startswith("range") else z, packed))
+        if name.startswith("range"):
+            z = np.array(np.abs(z) + 0.1, np.float64)
+        groups.append(Factors(name, keys, z, packed))
     return Batch(tuple(variables), tuple(groups))
 
 
