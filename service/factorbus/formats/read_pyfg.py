@@ -15,13 +15,14 @@ from factorbus.formats.numbers import read_numbers
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, RECORDS, VERTICES, Record
 from factorbus.formats.rotations import normalized_poses
 from factorbus.formats.seconds import is_time, nanoseconds
-from factorbus.formats.weights import checked_information, doubled_rotations, inverse
+from factorbus.formats.weights import checked_information, doubled_rotations, inverted_weights
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch
 from factorbus.proto.problems import BadSymbol
 from factorbus.proto.stamps import NO_STAMP
 from factorbus.proto.symbols import format_symbol, parse_symbol
+from factorbus.wording import counted
 
 _NAME = re.compile(rb"[A-Za-z]\d+")
 
@@ -81,7 +82,9 @@ def _lines(file: str, name: str, record: Record, bucket: Bucket) -> _Lines:
     for rest, line in zip(bucket.rests, bucket.numbers, strict=True):
         words = rest.split()
         if len(words) != record.width:
-            raise FormatError(file, line, f"{name} with {len(words)} fields", f"{record.width}: {record.fields}")
+            raise FormatError(
+                file, line, f"{name} with {counted(len(words), 'field')}", f"{record.width}: {record.fields}"
+            )
         time = words[0].decode("utf-8", "backslashreplace") if record.timed else "0"
         stamps.append(nanoseconds(file, line, time))
         keys.append([_key(file, name, line, word) for word in words[record.timed : record.timed + record.names]])
@@ -117,7 +120,7 @@ def _edges(file: str, kind: str, of: _Lines) -> EdgeColumns:
     if about.size == 7:
         measured = normalized_poses(file, of.name, of.lines, measured)
     checked_information(file, of.name, of.lines, covariance, about.dim, "a covariance")
-    information = inverse(covariance, about.dim)
+    information = inverted_weights(covariance, about.dim)
     information = doubled_rotations(information) if about.half_angles else information
     checked_information(file, of.name, of.lines, information, about.dim)
     return EdgeColumns(kind, of.lines, of.keys, np.ascontiguousarray(measured), np.ascontiguousarray(information))

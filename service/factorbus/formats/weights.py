@@ -52,7 +52,7 @@ def squared(root: F64, dim: int) -> F64:
     return packed_upper(np.einsum("nki,nkj->nij", R, R))
 
 
-def inverse(packed: F64, dim: int) -> F64:
+def inverted_weights(packed: F64, dim: int) -> F64:
     """Information of covariances, or the other way round; both packed (n, dim (dim + 1) / 2)."""
     full = np.linalg.inv(unpacked_symmetric(packed, dim))
     return packed_upper((full + np.swapaxes(full, 1, 2)) / 2)

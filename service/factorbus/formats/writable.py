@@ -66,7 +66,7 @@ def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
     return Batch(told, tuple(factors))
 
 
-def plain(numbers: Iterable[float]) -> str:
+def number_text(numbers: Iterable[float]) -> str:
     """Shortest texts that read back as the same floats."""
     return " ".join([repr(number).removesuffix(".0") for number in numbers])
 

@@ -10,7 +10,7 @@ import numpy as np
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.numbering import numbered
 from factorbus.formats.records import G2O, Edge
-from factorbus.formats.writable import Form, Written, plain, writable
+from factorbus.formats.writable import Form, Written, number_text, writable
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch, Factors, Variables
 
@@ -72,7 +72,7 @@ def _vertex_lines(group: Variables, ids: I64) -> Iterator[str]:
     if group.values is not None:
         name = _VERTEX_NAMES[group.kind]
         for number, values in zip(ids.tolist(), group.values.tolist(), strict=True):
-            yield f"{name} {number} {plain(values)}"
+            yield f"{name} {number} {number_text(values)}"
 
 
 def _edge_lines(group: Factors, ids: I64) -> Iterator[str]:
@@ -80,4 +80,4 @@ def _edge_lines(group: Factors, ids: I64) -> Iterator[str]:
     offset = " 0" if record.parameters else ""
     numbers = np.concatenate([group.measured[:, : record.measured], group.information], axis=1)
     for ends, row in zip(ids.tolist(), numbers.tolist(), strict=True):
-        yield f"{name} {' '.join(map(str, ends))}{offset} {plain(row)}"
+        yield f"{name} {' '.join(map(str, ends))}{offset} {number_text(row)}"

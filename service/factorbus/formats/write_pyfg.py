@@ -13,8 +13,8 @@ import numpy as np
 from factorbus.formats.left_out import LeftOut
 from factorbus.formats.pyfg import FACTORS, PYFG, RANGE, RANGES, VERTICES
 from factorbus.formats.seconds import seconds_text
-from factorbus.formats.weights import doubled_rotations, inverse
-from factorbus.formats.writable import Form, Written, plain, writable
+from factorbus.formats.weights import doubled_rotations, inverted_weights
+from factorbus.formats.writable import Form, Written, number_text, writable
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.stamps import NO_STAMP
@@ -83,15 +83,15 @@ def _vertex_lines(group: Variables, stamps: dict[int, int]) -> Iterator[str]:
         timed = VERTICES[name].timed
         for key, values in zip(group.keys.tolist(), group.values.tolist(), strict=True):
             time = f"{seconds_text(stamps.get(key, 0))} " if timed else ""
-            yield f"{name} {time}{format_symbol(key)} {plain(values)}"
+            yield f"{name} {time}{format_symbol(key)} {number_text(values)}"
 
 
 def _factor_lines(group: Factors, stamps: dict[int, int]) -> Iterator[str]:
     name, kind = _FACTOR_NAMES[group.kind], FACTOR_KINDS[group.kind]
-    covariance = inverse(group.information, kind.dim)
+    covariance = inverted_weights(group.information, kind.dim)
     if kind.half_angles:
         covariance = doubled_rotations(covariance)
     numbers = np.concatenate([group.measured, covariance], axis=1)
     for ends, row in zip(group.keys.tolist(), numbers.tolist(), strict=True):
         time = max((stamps[key] for key in ends if key in stamps), default=0)
-        yield f"{name} {seconds_text(time)} {' '.join(map(format_symbol, ends))} {plain(row)}"
+        yield f"{name} {seconds_text(time)} {' '.join(map(format_symbol, ends))} {number_text(row)}"
