@@ -157,6 +157,8 @@ def _other_kinds() -> Batch:
             Factors("attitude_se3", np.array([[y]]), np.array([[0.5, 0.0, -9.75, 0.0, 0.0, -1.0]]), unit3),
             Factors("range_se2", np.array([[x, l]]), np.array([[2.5]]), unit1),
             Factors("range_se3", np.array([[y, p]]), np.array([[3.5]]), unit1),
+            Factors("range_between_se2", np.array([[x, x + 1]]), np.array([[2.5]]), unit1),
+            Factors("range_between_se3", np.array([[y, y + 1]]), np.array([[3.5]]), unit1),
             Factors("bearing_se2", np.array([[x, l]]), np.array([[-0.25]]), unit1),
             Factors("bearing_se3", np.array([[y, p]]), np.array([[0.0, 3.0, 4.0]]), unit3),
             Factors("linear_se2", np.array([[x]]), np.array([[*here, *H2, *b2]]), unit3),

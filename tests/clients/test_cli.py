@@ -66,7 +66,7 @@ def test_version_names_the_libraries() -> None:
         (["replay"], USAGE, "Missing argument 'FILE'"),
         (["replay", "a.g2o", "--in-process", "--connect", "tcp/127.0.0.1:1"], USAGE, "exclude each other"),
         (["replay", "a.g2o", "--out", "nowhere/b.g2o"], USAGE, "there is no folder nowhere; make it first"),
-        (["replay", "broken.g2o", "--out", "same"], USAGE, "same does not end in .g2o"),
+        (["replay", "broken.g2o", "--out", "same"], USAGE, "same does not end in .g2o or .pyfg"),
         (["replay", "broken.g2o", "--in-process", "--plot", "a.gif"], REFUSED, "a picture cannot be a .gif"),
         (["serve", "--map", "a b"], USAGE, "map name 'a b' will not do"),
         (["serve", "--listen", "7447"], USAGE, "endpoint '7447' cannot be read; wanted protocol/address, such as"),
@@ -80,7 +80,7 @@ def test_version_names_the_libraries() -> None:
         (["replay", "broken.g2o", "--in-process"], BAD_FILE, "broken.g2o:2: "),
         (["replay", "one.g2o", "--connect", "tcp/127.0.0.1:9", "--timeout", "0.1"], UNAVAILABLE, "[unavailable]"),
         (["replay", "one.g2o", "--connect", "nonsense"], USAGE, "[bad_endpoint]"),
-        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .tum or .kitti"),
+        (["convert", "one.g2o", "one.xyz"], USAGE, "one.xyz does not end in .g2o, .pyfg, .tum or .kitti"),
         (["convert", "broken.g2o", "one.tum"], BAD_FILE, "broken.g2o:2: "),
         (["simulate", "manhattan"], USAGE, "there is nothing to write"),
         (["simulate", "atlantis", "--out", "a.g2o"], USAGE, "atlantis"),
@@ -115,7 +115,7 @@ def test_with_json_a_failure_is_one_document_too(tmp_path: Path) -> None:
         "file": "missing.g2o",
         "line": None,
         "seen": "it cannot be read (No such file or directory)",
-        "wanted": "a readable g2o, TORO, iSAM or SLAM++ file",
+        "wanted": "a readable g2o, TORO, iSAM, SLAM++ or PyFactorGraph file",
     }
 
 

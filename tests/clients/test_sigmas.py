@@ -233,6 +233,8 @@ EVERY_METHOD = {
     "attitude_se3": lambda d, **how: d.attitude_se3("x0", (0, 0, 1), **how),
     "range_se2": lambda d, **how: d.range_se2("x0", "l0", 2.0, **how),
     "range_se3": lambda d, **how: d.range_se3("x0", "l0", 2.0, **how),
+    "range_between_se2": lambda d, **how: d.range_between_se2("x0", "x1", 2.0, **how),
+    "range_between_se3": lambda d, **how: d.range_between_se3("x0", "x1", 2.0, **how),
     "bearing_se2": lambda d, **how: d.bearing_se2("x0", "l0", 0.1, **how),
     "bearing_se3": lambda d, **how: d.bearing_se3("x0", "l0", (1, 0, 0), **how),
     "linear": lambda d, **how: d.linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.zeros(3), **how),

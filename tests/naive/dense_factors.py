@@ -62,6 +62,8 @@ def residual(kind: str, ends: list[np.ndarray], z: np.ndarray) -> np.ndarray:
     if kind.startswith("between"):
         relative = np.linalg.inv(pose_matrix(ends[0])) @ pose_matrix(ends[1])
         return _pose_error(np.linalg.inv(pose_matrix(z)) @ relative)
+    if kind.startswith("range_between"):
+        return np.array([np.linalg.norm(np.subtract(*(pose_matrix(end)[:-1, -1] for end in ends)))]) - z
     if kind.startswith(("landmark", "range", "bearing")):
         return _of_a_point(kind, *ends, z)
     raise KeyError(f"the kind {kind!r} has no dense twin; write its residual here")

@@ -22,6 +22,8 @@ CONNECTS = {
     "attitude_se3": ["se3"],
     "range_se2": ["se2", "point2"],
     "range_se3": ["se3", "point3"],
+    "range_between_se2": ["se2", "se2"],
+    "range_between_se3": ["se3", "se3"],
     "bearing_se2": ["se2", "point2"],
     "bearing_se3": ["se3", "point3"],
     "linear_se2": ["se2"],

@@ -10,7 +10,7 @@ from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors, Variables
 from factorbus.proto.symbols import symbol
 
-_BEGINNINGS = ("position", "heading", "attitude", "range_se", "bearing_se", "linear")
+_BEGINNINGS = ("position", "heading", "attitude", "range", "bearing_se", "linear")
 OTHERS = tuple(name for name in FACTOR_KINDS if name.startswith(_BEGINNINGS))
 
 
@@ -29,6 +29,8 @@ def random_other(kind: str, ends: list[np.ndarray], noise: float, rng: np.random
         there = rng.normal(size=3)
         seen = T[:3, :3].T @ there / np.linalg.norm(there) + noise * rng.normal(size=3)
         return np.concatenate([2.0 * seen, there])
+    if kind.startswith("range_between"):
+        return np.array([abs(np.linalg.norm(ends[1][:n] - ends[0][:n]) + noise * rng.normal())])
     seen = (np.linalg.inv(T) @ np.append(ends[1], 1.0))[:-1]
     if kind.startswith("range"):
         return np.array([abs(np.linalg.norm(seen) + noise * rng.normal())])
@@ -84,6 +86,7 @@ def other_steps(seed: int, steps: int = 8, noise: float = 0.03, loss: str = "") 
             factors += [made("linear_pair_se2_point2", x, l - 1), made("linear_pair_se3_point3", y - 1, p)]
             factors += [made("linear_pair_idp", f, f - 1), made("linear_pair_se3_idp", y, f - 1)]
             factors += [made("linear_pair_point3_idp", p - 1, f)]
+            factors += [made("range_between_se2", x, x - 1), made("range_between_se3", y - 1, y)]
         factors += [
             made("linear_idp", f),
             made("range_se2", x, l),

@@ -102,6 +102,18 @@ def test_a_point_on_the_pose_has_no_bearing_but_no_nan_either() -> None:
     assert all((J == 0.0).all() for J in found)
 
 
+@pytest.mark.parametrize("space", ["se2", "se3"])
+def test_poses_on_top_of_each_other_have_a_range_but_no_direction(space: str) -> None:
+    kind = FACTOR_KINDS[f"range_between_{space}"]
+    _, z, graph = case(kind, 1)
+    n = 2 if space == "se2" else 3
+    second = graph.var[1, at.V_AT]
+    graph.values[second : second + n] = graph.values[:n]
+    r, found = evaluate(kind, graph)
+    np.testing.assert_array_equal(r, -z)
+    assert all((J == 0.0).all() for J in found)
+
+
 def test_the_wire_and_the_solver_mean_the_same_kinds() -> None:
     assert {k.name: (k.size, k.dim) for k in VARIABLE_KINDS.values()} == {
         k.name: (k.size, k.dim) for k in wire.VARIABLE_KINDS.values()

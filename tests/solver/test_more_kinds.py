@@ -92,6 +92,8 @@ def test_a_pose_that_only_a_position_holds_is_refused() -> None:
 BAD: dict[str, tuple[str, int, float, type[errors.SolverError]]] = {
     "no range": ("range_se2", 0, 0.0, errors.BadRange),
     "a negative range": ("range_se3", 0, -1.0, errors.BadRange),
+    "no range between poses": ("range_between_se2", 0, 0.0, errors.BadRange),
+    "a negative range between poses in space": ("range_between_se3", 0, -1.0, errors.BadRange),
     "no direction": ("bearing_se3", 3, 0.0, errors.BadDirection),
     "no direction of the map": ("attitude_se3", 3, 0.0, errors.BadDirection),
     "not a number": ("position_se2", 0, np.nan, errors.NotFinite),

@@ -16,7 +16,7 @@ COMMANDS = {
     "demo": ("demo", "A simulated robot drives: solver, workers, robot and viewer as processes."),
     "serve": ("serve", "Own maps and answer on the bus until stopped."),
     "work": ("work", "Join the bus as a worker and take jobs."),
-    "replay": ("replay", "Drive a graph file (g2o, TORO, iSAM, SLAM++) through a map, pose by pose."),
+    "replay": ("replay", "Drive a graph file (g2o, TORO, iSAM, SLAM++, pyfg) through a map, pose by pose."),
     "simulate": ("simulate", "Write a simulated world to a file."),
     "watch": ("watch", "Watch a map live: in Rerun, in a browser, or into a recording."),
     "gateway": ("gateway", "Maps for browsers: a live page, HTTP and WebSocket."),

@@ -204,6 +204,14 @@ class Draft:
         """How far a point3 is from the pose (metres)."""
         return self.factor("range_se3", (pose, point), [distance], **certainty)
 
+    def range_between_se2(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+        """How far two poses in the plane are apart (metres): robots, or a robot and an anchor with an orientation."""
+        return self.factor("range_between_se2", (first, second), [distance], **certainty)
+
+    def range_between_se3(self, first: Key, second: Key, distance: float, **certainty: Unpack[Certainty]) -> Draft:
+        """How far two poses in space are apart (metres)."""
+        return self.factor("range_between_se3", (first, second), [distance], **certainty)
+
     def bearing_se2(self, pose: Key, point: Key, bearing: float, **certainty: Unpack[Certainty]) -> Draft:
         """Where a point2 is to be seen from the pose (radians, from the x axis to the left)."""
         return self.factor("bearing_se2", (pose, point), [bearing], **certainty)

@@ -163,6 +163,8 @@ _RESIDUALS: Mapping[str, Callable[..., F64]] = {
     "attitude_se3": lambda x, z: _turned_back(x[:, 3:7], _unit(z[:, 3:])) - _unit(z[:, :3]),
     "range_se2": lambda a, p, z: _distance(a, p, z, 2),
     "range_se3": lambda a, p, z: _distance(a, p, z, 3),
+    "range_between_se2": lambda a, b, z: _distance(a, b, z, 2),
+    "range_between_se3": lambda a, b, z: _distance(a, b, z, 3),
     "bearing_se2": lambda a, p, z: _bearing_range(a, p, np.column_stack([z, z]))[:, :1],
     "bearing_se3": lambda a, p, z: _unit(_into_space(a, p)) - _unit(z),
     **{kind: _linear(kind) for kind in (*LINEAR, *LINEAR_PAIRS)},

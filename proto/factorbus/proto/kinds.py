@@ -216,6 +216,8 @@ FACTOR_KINDS = {
         ),
         FactorKind("range_se2", ("se2", "point2"), 1, 1, "distance (metres)", "‖l − tₐ‖ − z", (2.5,)),
         FactorKind("range_se3", ("se3", "point3"), 1, 1, "distance (metres)", "‖l − tₐ‖ − z", (2.5,)),
+        FactorKind("range_between_se2", ("se2", "se2"), 1, 1, "distance (metres)", "‖t_b − tₐ‖ − z", (2.5,)),
+        FactorKind("range_between_se3", ("se3", "se3"), 1, 1, "distance (metres)", "‖t_b − tₐ‖ − z", (2.5,)),
         FactorKind(
             "bearing_se2",
             ("se2", "point2"),

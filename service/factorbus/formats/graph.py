@@ -7,6 +7,7 @@ import numpy as np
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.parallax import lone_bearings
+from factorbus.formats.ranging import lone_ranges
 from factorbus.formats.steps import Steps, planned, planned_whole
 from factorbus.proto.arrays import I64
 from factorbus.proto.messages import Batch
@@ -66,7 +67,7 @@ class GraphFile:
             if not self.poses:
                 raise FormatError(self.path, None, "no pose", "at least one pose to replay")
             return self.batch, self.factor_lines
-        lost = np.concatenate([unnamed(self.batch), lone_bearings(self.batch)])
+        lost = np.concatenate([unnamed(self.batch), lone_bearings(self.batch), lone_ranges(self.batch)])
         return _without(self.batch, self.factor_lines, lost) if lost.size else (self.batch, self.factor_lines)
 
 

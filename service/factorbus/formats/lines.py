@@ -49,6 +49,6 @@ def _content(path: Path) -> bytes:
     except (OSError, EOFError, zlib.error) as failure:  # gzip reports a damaged file in these three ways
         reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
         raise FormatError(
-            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO, iSAM or SLAM++ file"
+            str(path), None, f"it cannot be read ({reason})", "a readable g2o, TORO, iSAM, SLAM++ or PyFactorGraph file"
         ) from failure
     return content.removeprefix(b"\xef\xbb\xbf")

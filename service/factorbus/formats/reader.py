@@ -17,6 +17,9 @@ from factorbus.formats.mixtures import best_components
 from factorbus.formats.numbers import read_numbers
 from factorbus.formats.offsets import Offsets, leave_cameras, read_offsets
 from factorbus.formats.parallax import lone_bearings
+from factorbus.formats.pyfg import PYFG
+from factorbus.formats.ranging import lone_ranges
+from factorbus.formats.read_pyfg import is_pyfg, read_pyfg
 from factorbus.formats.read_tum import TUM, is_trajectory, read_trajectory
 from factorbus.formats.records import DIALECTS, G2O, SWITCH_PRIOR, Dialect, Vertex
 from factorbus.formats.rotations import normalized_poses
@@ -24,10 +27,10 @@ from factorbus.formats.sniff import dialect_named, sniffed
 from factorbus.proto.arrays import I64
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch
-from factorbus.proto.symbols import MAX_INDEX, symbol_parts
+from factorbus.proto.symbols import MAX_INDEX, format_symbol, symbol_parts
 from factorbus.wording import counted
 
-READS = (*DIALECTS, TUM)
+READS = (*DIALECTS, PYFG, TUM)
 
 # A prior of a point that names a pose is one of its position: RTAB-Map writes them so.
 _OF_POSES = {"prior_point2": "position_se2", "prior_point3": "position_se3"}
@@ -38,15 +41,15 @@ _CAMERAS = ("PARAMS_CAMERACALIB", "PARAMS_STEREOCAMERACALIB")
 def read(
     path: str | os.PathLike[str], dialect: str | None = None, strict: bool = False, whole: bool = False
 ) -> GraphFile:
-    """The graph in `path`: g2o, TORO, iSAM, SLAM++ or TUM text, plain or gzipped.
+    """The graph in `path`: g2o, TORO, iSAM, SLAM++, PyFactorGraph or TUM text, plain or gzipped.
 
-    dialect: "g2o", "toro", "isam", "slam++" or "tum"; without it the names of the records decide, and the ending where
-    they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.  Keys are
-    symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols and time
-    stamps are, all keys are the ids themselves.  Quaternions are normalized; angles stay as they are.  Records that
-    have no kind here are left out, which `notes` and `left_out` say; with `strict` they are refused.  So are vertices
-    that no step of a replay would have, unless the graph is wanted `whole`, as it is written to another file.  Raises
-    FormatError, which names the file and the line.
+    dialect: "g2o", "toro", "isam", "slam++", "pyfg" or "tum"; without it the names of the records decide, and the
+    ending where they do not; a guess is in the notes.  TUM is a trajectory: poses with time stamps, and no factors.
+    Keys are symbol("x", id) for poses and symbol("l", id) for points; where an id is 2^56 or more, as GTSAM's symbols
+    and time stamps are, all keys are the ids themselves; of pyfg they are its names, A12 is symbol("A", 12).
+    Quaternions are normalized; angles stay as they are.  Records that have no kind here are left out, which `notes` and
+    `left_out` say; with `strict` they are refused.  So are vertices that no step of a replay would have, unless the
+    graph is wanted `whole`, as it is written to another file.  Raises FormatError, which names the file and the line.
     """
     with np.errstate(all="ignore"):  # what overflows is not finite or not positive definite, and refused as such
         return _read(Path(path), dialect, strict, whole)
@@ -55,6 +58,9 @@ def read(
 def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFile:
     file = str(path)
     buckets = read_buckets(path)
+    if dialect == PYFG or (dialect is None and is_pyfg(path, buckets)):
+        left = LeftOut(file, strict, whole)
+        return _graph(file, PYFG, *read_pyfg(file, buckets, left), left, "keys")
     if dialect == TUM or (dialect is None and is_trajectory(buckets)):
         return read_trajectory(file, buckets)
     guess = sniffed(path, buckets) if dialect is None else dialect_named(file, dialect)
@@ -76,12 +82,23 @@ def _read(path: Path, dialect: str | None, strict: bool, whole: bool) -> GraphFi
         _say_without_letter(batch, left)
     if apart:
         left.say("poses and points are numbered separately")
-    lone = _ids_in_file(unnamed(batch), are_keys) if batch.factors else []
-    left.set_aside("vertices", len(lone), f"no edge names {shown(lone)}")
-    lost = _ids_in_file(lone_bearings(batch), are_keys)
-    left.set_aside("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
     numbering = "keys" if are_keys else "apart" if apart else "ids"
-    return GraphFile(file, chosen.name, batch, lines, tuple(left.notes), dict(left.counts), numbering)
+    return _graph(file, chosen.name, batch, lines, left, numbering)
+
+
+def _graph(file: str, dialect: str, batch: Batch, lines: tuple[I64, ...], left: LeftOut, numbering: str) -> GraphFile:
+    """The file, with what no step of its replay has set aside.  Raises FormatError when strict."""
+
+    def names(keys: I64) -> list[str]:
+        return list(map(format_symbol, keys.tolist())) if dialect == PYFG else _ids_in_file(keys, numbering == "keys")
+
+    lone = names(unnamed(batch)) if batch.factors else []
+    left.set_aside("vertices", len(lone), f"no edge names {shown(lone)}")
+    lost = names(lone_bearings(batch))
+    left.set_aside("points", len(lost), f"bearings from a single pose do not place {shown(lost)}")
+    far = names(lone_ranges(batch))
+    left.set_aside("points", len(far), f"so few ranges do not place {shown(far)}")
+    return GraphFile(file, dialect, batch, lines, tuple(left.notes), dict(left.counts), numbering)
 
 
 def _say_without_letter(batch: Batch, left: LeftOut) -> None:

@@ -8,10 +8,12 @@ import numpy as np
 
 from factorbus.formats.errors import FormatError
 from factorbus.formats.parallax import composed, delay_points
+from factorbus.formats.ranging import RANGES, Ranges, refuse_unvalued
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS
-from factorbus.proto.messages import Batch
-from factorbus.proto.symbols import format_symbol
+from factorbus.proto.messages import Batch, Variables
+from factorbus.proto.stamps import NO_STAMP
+from factorbus.proto.symbols import format_symbol, symbol_parts
 from factorbus.wording import counted
 
 POSES = ("se2", "se3")
@@ -21,8 +23,9 @@ POSES = ("se2", "se3")
 class Roster:
     """All variables of a batch in one list.
 
-    keys, is_pose, fixed, valued (N,); rank (N,): the place of a pose among the poses by key, -1 for points;
-    pose_at (P,): the pose of each rank; ends: per group of factors the rows (m, arity) of its variables.
+    keys, is_pose, fixed, valued (N,); rank (N,): the place of a pose in the order of the poses, -1 for points;
+    pose_at (P,): the pose of each rank; before (N,): the pose before a pose, -1 for none (`_ordered`); ends: per group
+    of factors the rows (m, arity) of its variables.
     """
 
     keys: I64
@@ -31,13 +34,14 @@ class Roster:
     valued: np.ndarray
     rank: I64
     pose_at: I64
+    before: I64
     ends: tuple[I64, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
     """entry (N,): the rank of the pose with which each variable enters.  root: the row of a pose to be fixed as the
-    origin of the map, or -1.  given: rows of poses that no composition reaches, so that they need their value."""
+    origin of the map, or -1.  given: rows of variables that no composition reaches, so that they need their value."""
 
     entry: I64
     root: int
@@ -50,7 +54,7 @@ def roster(file: str, batch: Batch) -> Roster:
     keys = np.concatenate([empty, *(group.keys for group in batch.variables)])
     is_pose = _spread(batch, [group.kind in POSES for group in batch.variables])
     order = np.argsort(keys, kind="stable")
-    pose_at = order[is_pose[order]]
+    pose_at, before = _ordered(batch, keys, is_pose)
     rank = np.full(len(keys), -1, np.int64)
     rank[pose_at] = np.arange(len(pose_at))
     ends = []
@@ -66,8 +70,33 @@ def roster(file: str, batch: Batch) -> Roster:
         valued=_spread(batch, [group.values is not None for group in batch.variables]),
         rank=rank,
         pose_at=pose_at,
+        before=before,
         ends=tuple(ends),
     )
+
+
+def _ordered(batch: Batch, keys: I64, is_pose: np.ndarray) -> tuple[I64, I64]:
+    """(poses in their order, the pose before each variable that is one, else -1).
+
+    The order is that of the keys.  Where all poses have a time stamp it is that of time, and the pose before a pose is
+    one of the same robot, the letter of its key.
+    """
+    poses = np.flatnonzero(is_pose)
+    poses = poses[np.argsort(keys[poses], kind="stable")]
+    chains = [poses]
+    stamps = np.concatenate([np.empty(0, np.int64), *(_stamps(group) for group in batch.variables)])
+    if len(poses) and (stamps[poses] != NO_STAMP).all():
+        poses = poses[np.argsort(stamps[poses], kind="stable")]
+        letters = np.array([symbol_parts(key)[0] for key in keys[poses].tolist()])
+        chains = [poses[letters == letter] for letter in np.unique(letters)]
+    before = np.full(len(keys), -1, np.int64)
+    for chain in chains:
+        before[chain[1:]] = chain[:-1]
+    return poses, before
+
+
+def _stamps(group: Variables) -> I64:
+    return np.full(len(group.keys), NO_STAMP) if group.stamps is None else group.stamps
 
 
 def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) -> Schedule:
@@ -75,10 +104,10 @@ def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) 
 
     use_values: poses are at the values of the file, not where composed odometry has them.
 
-    A pose enters at its own turn (by key) if an edge joins it to a pose that is in, else with the first pose that
+    A pose enters at its own turn (`_ordered`) if an edge joins it to a pose that is in, else with the first pose that
     makes such a chain.  Where nothing is fixed and no pose has a prior, the first pose is the root; otherwise the
     replay begins at those poses.  A point enters with the first pose that sees it, one that only bearings see with the
-    pose whose bearing tells where it is (`parallax`).
+    pose whose bearing tells where it is (`parallax`), and what only ranges tell of once they determine it (`ranging`).
     """
     if not len(names.pose_at):
         raise FormatError(file, None, "no pose", "at least one pose to replay")
@@ -89,17 +118,19 @@ def scheduled(file: str, batch: Batch, names: Roster, use_values: bool = False) 
         seeds[root] = True
     seeds |= names.fixed & names.is_pose
     _refuse_unknown_fixed(file, names)
-    entry, given = _in_turn(batch, names, seeds)
+    ranges = Ranges(batch, names.ends, names.fixed)
+    refuse_unvalued(file, names.keys, ranges, names.valued)
+    entry, given = (None, np.empty(0, np.int64)) if ranges else _in_turn(batch, names, seeds)
     if entry is None:
-        entry, given = _flooded(batch, names, seeds)
-    _enter_points(batch, names, entry)
+        entry, given = _flooded(batch, names, seeds, ranges)
+    _enter_points(batch, names, entry, ranges)
     if any(group.kind == "bearing_se2" for group in batch.factors):
         known = _known_poses(batch, names, root, given, use_values)
         delay_points(
             batch, names.ends, names.rank, names.fixed, composed(batch, names.ends, names.rank, entry, known), entry
         )
     if (entry < 0).any():
-        raise _unreached(file, batch, names, entry)
+        raise _unreached(file, names, entry, ranges)
     return Schedule(entry, root, given)
 
 
@@ -127,11 +158,13 @@ def _refuse_unknown_fixed(file: str, names: Roster) -> None:
 
 
 def _pairs(batch: Batch, names: Roster, points: bool) -> I64:
-    """Rows (m, 2) of the variables of all factors between two poses, or between a pose and a point."""
+    """Rows (m, 2) of the variables of all factors between two poses, or between a pose and a point, but for ranges."""
     chosen = [
         ends
         for group, ends in zip(batch.factors, names.ends, strict=True)
-        if ends.shape[1] == 2 and (FACTOR_KINDS[group.kind].connects[1] not in POSES) == points
+        if group.kind not in RANGES
+        and ends.shape[1] == 2
+        and (FACTOR_KINDS[group.kind].connects[1] not in POSES) == points
     ]
     return np.concatenate([np.empty((0, 2), np.int64), *chosen])
 
@@ -146,31 +179,44 @@ def _in_turn(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64 | None
     return names.rank.copy(), np.empty(0, np.int64)
 
 
-def _flooded(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64, I64]:
-    """Entries of poses when some must wait, pose by pose.
+def _flooded(batch: Batch, names: Roster, seeds: np.ndarray, ranges: Ranges) -> tuple[I64, I64]:
+    """Entries of poses when some must wait, pose by pose, and of the points that only ranges see.
 
     A pose is reached over an edge from a pose that is in.  When there is none, a pose that sees a point that is in,
-    or a fixed one, is let in at the value its vertex line gives, if it has one.
+    or a fixed one, is let in at the value its vertex line gives, if it has one; and so is a body that ranges determine.
     """
     edges, sightings = _neighbours(_pairs(batch, names, False)), _neighbours(_pairs(batch, names, True))
     entry = np.full(len(names.keys), -1, np.int64)
     known = set(np.flatnonzero(names.fixed & ~names.is_pose).tolist())
     given: list[int] = []
 
+    def is_in(row: int) -> bool:
+        return entry[row] >= 0 or row in known
+
     def enter(turn: int, first: int) -> list[int]:
-        """Let `first` in and all poses that had been waiting for it; the poses that see a point newly known."""
+        """Let `first` in and all poses that had been waiting for it; what may be let in now."""
         waiting, sighted = [first], []
         while waiting:
             pose = waiting.pop()
             if entry[pose] >= 0:
                 continue
             entry[pose] = turn
+            sighted += ranges.of(pose)
             waiting += [other for other in edges[pose] if entry[other] < 0 and names.rank[other] <= turn]
             for point in sightings[pose]:
                 if point not in known:
                     known.add(point)
-                    sighted += sightings[point]
+                    sighted += [*sightings[point], *ranges.of(point)]
         return sighted
+
+    def body_of(row: int, turn: int) -> list[int]:
+        """A point alone, or the poses so far that odometry joins to a pose."""
+        found, waiting = {row}, [row]
+        while waiting and names.is_pose[row]:
+            new = {other for other in edges[waiting.pop()] if names.rank[other] <= turn and entry[other] < 0} - found
+            found |= new
+            waiting += new
+        return sorted(found)
 
     for turn, pose in enumerate(names.pose_at.tolist()):
         candidates = [pose]
@@ -179,10 +225,23 @@ def _flooded(batch: Batch, names: Roster, seeds: np.ndarray) -> tuple[I64, I64]:
         while candidates:
             late = candidates.pop()
             ready = names.rank[late] <= turn and entry[late] < 0 and names.valued[late]
-            if ready and any(point in known for point in sightings[late]):
+            if not ready or not (names.is_pose[late] or ranges.lone[late]):
+                continue
+            sees = names.is_pose[late] and any(point in known for point in sightings[late])
+            if sees or (ranges and ranges.determine(body_of(late, turn), is_in)):
                 given.append(late)
                 candidates += enter(turn, late)
+    _enter_undetermined(names, ranges, entry, given)
     return entry, np.array(given, np.int64)
+
+
+def _enter_undetermined(names: Roster, ranges: Ranges, entry: I64, given: list[int]) -> None:
+    """Let in each point that ranges never determine, with the last pose that sees it: the solver says what it lacks."""
+    for point in np.flatnonzero(ranges.lone & (entry < 0)).tolist():
+        seen = [entry[pose] for pose in ranges.of(point) if entry[pose] >= 0]
+        if seen:
+            entry[point] = max(seen)
+            given.append(point)
 
 
 def _known_poses(batch: Batch, names: Roster, root: int, given: I64, use_values: bool) -> dict[int, F64]:
@@ -212,13 +271,15 @@ def _neighbours(pairs: I64) -> dict[int, list[int]]:
     return found
 
 
-def _enter_points(batch: Batch, names: Roster, entry: I64) -> None:
-    """Entries of points: with the first pose that sees them; unseen ones that are known, at the start."""
+def _enter_points(batch: Batch, names: Roster, entry: I64, ranges: Ranges) -> None:
+    """Entries of points that not only ranges see: with the first pose that does; of unseen ones that are known, at the
+    start.
+    """
     sightings = _pairs(batch, names, points=True)
     first = np.full(len(entry), np.iinfo(np.int64).max)
     seen = sightings[entry[sightings[:, 0]] >= 0]
     np.minimum.at(first, seen[:, 1], entry[seen[:, 0]])
-    points = ~names.is_pose
+    points = ~names.is_pose & ~ranges.lone
     known = names.fixed.copy()
     for group, ends in zip(batch.factors, names.ends, strict=True):
         if group.kind in ("prior_point2", "prior_point3"):
@@ -228,7 +289,7 @@ def _enter_points(batch: Batch, names: Roster, entry: I64) -> None:
     entry[points] = np.where(unseen, np.where(known, start, -1), first)[points]
 
 
-def _unreached(file: str, batch: Batch, names: Roster, entry: I64) -> FormatError:
+def _unreached(file: str, names: Roster, entry: I64, ranges: Ranges) -> FormatError:
     """The error that names what cannot be joined to the rest."""
     parts = _parts(len(entry), [ends for ends in names.ends if ends.shape[1] == 2])
     if len(parts) > 1:
@@ -243,8 +304,8 @@ def _unreached(file: str, batch: Batch, names: Roster, entry: I64) -> FormatErro
     return FormatError(
         file,
         None,
-        f"{lost} is joined to the rest only through points",
-        f"an edge to another pose, or a vertex line for {lost}",
+        f"{lost} is joined to the rest only through {'ranges that do not determine it' if ranges else 'points'}",
+        f"an edge to another pose, or a vertex line for {lost}{' and more ranges' if ranges else ''}",
     )
 
 

@@ -25,7 +25,7 @@ class Guess:
 def dialect_named(file: str, name: str) -> Guess:
     """The dialect that somebody named.  Raises FormatError when there is none of that name."""
     if name not in DIALECTS:
-        raise FormatError(file, None, f"dialect {name!r}", f"one of {', '.join((*DIALECTS, 'tum'))}")
+        raise FormatError(file, None, f"dialect {name!r}", f"one of {', '.join((*DIALECTS, 'pyfg', 'tum'))}")
     return Guess(DIALECTS[name])
 
 
@@ -62,7 +62,8 @@ def sniffed(path: Path, buckets: Mapping[str, Bucket]) -> Guess:
         str(path),
         buckets[first].numbers[0],
         f"unknown record {shown!r}",
-        "g2o (EDGE_SE2, EDGE_SE3:QUAT, ...), TORO (EDGE2, VERTEX2) or iSAM (ODOMETRY, LANDMARK, EDGE3) records, or TUM",
+        "g2o (EDGE_SE2, EDGE_SE3:QUAT, ...), TORO (EDGE2, VERTEX2), iSAM (ODOMETRY, LANDMARK, EDGE3) or PyFactorGraph "
+        "records, or TUM",
     )
 
 

@@ -6,6 +6,7 @@ from typing import overload
 
 import numpy as np
 
+from factorbus.formats.ranging import RANGES
 from factorbus.formats.schedule import POSES, Roster, Schedule, roster, scheduled
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.kinds import FACTOR_KINDS, VARIABLE_KINDS
@@ -37,12 +38,12 @@ class _FactorColumns:
 class Steps(Sequence[Batch]):
     """The batches of a replay; each is built when it is asked for.
 
-    Poses come in the order of their keys.  A step is a new pose with its edges to poses that are in (the one from the
-    pose before it first, the rest in the order of the file), the points it is the first to see, and its sightings.  A
-    pose that nothing joins to earlier ones waits for the pose that does.  New variables have no value, so that the
-    service composes them from what was measured, except fixed ones, poses that only points join to the rest, and with
-    `use_values` all that have one.  Where nothing is fixed and no pose has a prior the first pose is fixed, at its
-    value or the origin.
+    Poses come in the order of their keys, or of time where all have a stamp.  A step is a new pose with its edges to
+    poses that are in (the one from the pose before it first, the rest in the order of the file), the points it is the
+    first to see, and its sightings.  A pose that nothing joins to earlier ones waits for the pose that does.  New
+    variables have no value, so that the service composes them from what was measured, except fixed ones, poses that
+    only points or ranges join to the rest, points that only ranges see, and with `use_values` all that have one.
+    Where nothing is fixed and no pose has a prior the first pose is fixed, at its value or the origin.
     """
 
     def __init__(self, count: int, variables: list[_VariableColumns], factors: list[_FactorColumns]) -> None:
@@ -181,11 +182,12 @@ def _factor_columns(group: Factors, ends: I64, lines: I64, names: Roster, step: 
 def _odometry(group: Factors, ends: I64, lines: I64, names: Roster) -> np.ndarray:
     """Whether a factor is the first in the file to join its pose to the pose before it."""
     first = np.zeros(len(ends), bool)
-    if all(kind in POSES for kind in FACTOR_KINDS[group.kind].connects) and ends.shape[1] == 2:
-        ranks = names.rank[ends]
-        rows = np.flatnonzero(np.abs(ranks[:, 0] - ranks[:, 1]) == 1)
+    joins = group.kind not in RANGES and all(kind in POSES for kind in FACTOR_KINDS[group.kind].connects)
+    if joins and ends.shape[1] == 2:
+        one, other = ends.T
+        rows = np.flatnonzero((names.before[one] == other) | (names.before[other] == one))
         rows = rows[np.argsort(lines[rows], kind="stable")]
-        _, earliest = np.unique(ranks[rows].max(axis=1), return_index=True)
+        _, earliest = np.unique(names.rank[ends[rows]].max(axis=1), return_index=True)
         first[rows[earliest]] = True
     return first
 

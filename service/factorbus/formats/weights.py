@@ -7,10 +7,10 @@ from factorbus.formats.errors import refuse_first
 from factorbus.proto.arrays import F64, I64
 
 
-def checked_information(file: str, name: str, lines: I64, packed: F64, dim: int) -> F64:
+def checked_information(file: str, name: str, lines: I64, packed: F64, dim: int, what: str = "an information") -> F64:
     """`packed`, if every matrix is positive definite.  Raises FormatError with the first line that is not.
 
-    in   packed (n, dim (dim + 1) / 2): upper triangles row by row
+    in   packed (n, dim (dim + 1) / 2): upper triangles row by row   what: matrix it is
     """
     bad = ~positive_definite(packed, dim)
     refuse_first(
@@ -18,7 +18,7 @@ def checked_information(file: str, name: str, lines: I64, packed: F64, dim: int)
         lines,
         bad,
         lambda row: (
-            f"{name} with an information matrix that is not positive definite"
+            f"{name} with {what} matrix that is not positive definite"
             f" (smallest eigenvalue {_smallest_eigenvalue(packed[row], dim):.3g})"
         ),
         "a symmetric positive definite matrix",
@@ -50,6 +50,22 @@ def squared(root: F64, dim: int) -> F64:
     """
     R = unpacked_triangle(root, dim)
     return packed_upper(np.einsum("nki,nkj->nij", R, R))
+
+
+def inverted_weights(packed: F64, dim: int) -> F64:
+    """Information of covariances, or the other way round; both packed (n, dim (dim + 1) / 2)."""
+    full = np.linalg.inv(unpacked_symmetric(packed, dim))
+    return packed_upper((full + np.swapaxes(full, 1, 2)) / 2)
+
+
+def doubled_rotations(packed: F64) -> F64:
+    """D M D, D = diag(1, 1, 1, 2, 2, 2), of packed matrices M (n, 21) of x y z and a rotation.
+
+    Of an information in radians that is the one of half angles, which a quaternion's vector part is; of a covariance of
+    half angles it is the one in radians.
+    """
+    scale = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+    return packed * packed_upper(np.outer(scale, scale)[None])
 
 
 def unpacked_triangle(packed: F64, dim: int) -> F64:

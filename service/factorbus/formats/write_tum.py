@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from factorbus.formats.seconds import seconds_text
 from factorbus.formats.trajectory import (
     Stamped,
     one_trajectory,
@@ -44,5 +45,4 @@ def _time(row: Stamped) -> str:
     """Seconds, to the nanosecond; without a stamp the number of the key."""
     if row.stamp is None:
         return str(row.number)
-    seconds, nanoseconds = divmod(abs(row.stamp), 10**9)
-    return f"{'-' if row.stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
+    return seconds_text(row.stamp)

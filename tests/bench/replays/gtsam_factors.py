@@ -76,6 +76,15 @@ def _bearing_range_se2(i: int, j: int, z: F64, information: F64) -> Any:
     return gtsam.BearingRangeFactor2D(i, j, gtsam.Rot2(float(z[0])), float(z[1]), noise)
 
 
+def _range(make: Callable[..., Any]) -> Callable[..., Any]:
+    """A distance, as GTSAM's factor for the kinds of its ends."""
+
+    def factor(i: int, j: int, z: F64, information: F64) -> Any:
+        return make(i, j, float(z[0]), gtsam.noiseModel.Gaussian.Information(information))
+
+    return factor
+
+
 def _prior_se2(i: int, z: F64, information: F64) -> Any:
     return gtsam.PriorFactorPose2(i, gtsam.Pose2(*z.tolist()), gtsam.noiseModel.Gaussian.Information(information))
 
@@ -116,6 +125,10 @@ _FACTORS: dict[str, Callable[..., Any]] = {
     "between_se3": _between_se3,
     "landmark_se2": _landmark_se2,
     "bearing_range_se2": _bearing_range_se2,
+    "range_se2": _range(gtsam.RangeFactor2D),
+    "range_se3": _range(gtsam.RangeFactor3D),
+    "range_between_se2": _range(gtsam.RangeFactorPose2),
+    "range_between_se3": _range(gtsam.RangeFactorPose3),
     "prior_se2": _prior_se2,
     "prior_se3": _prior_se3,
     "position_se2": _position_se2,

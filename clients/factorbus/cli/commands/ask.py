@@ -97,7 +97,8 @@ def covariance_command(address: MapAddress, keys: tuple[str, ...], blocks: str |
 def gate_command(address: MapAddress, candidates: Path, probability: float, as_json: bool) -> int:
     """Whether the factors in the file CANDIDATES are plausible; the exit code is 1 when one is not.
 
-    The file is g2o, TORO, iSAM or SLAM++ text. Their keys are those of the map; vertices in the file are not looked at.
+    The file is g2o, TORO, iSAM, SLAM++ or PyFactorGraph text. Its keys are those of the map; its vertices are not
+    looked at.
 
     \b
     factorbus ask gate warehouse candidates.g2o --probability 0.99

@@ -12,7 +12,8 @@ from factorbus.wording import counted
 if TYPE_CHECKING:
     from factorbus.formats import GraphFile
 
-_WRITES = (".g2o", ".tum", ".kitti")
+_GRAPHS = (".g2o", ".pyfg")
+_WRITES = (*_GRAPHS, ".tum", ".kitti")
 
 
 @click.command()
@@ -31,7 +32,8 @@ _WRITES = (".g2o", ".tum", ".kitti")
 def command(
     source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str, as_json: bool
 ) -> None:
-    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++ or TUM text) and write TARGET (.g2o, .tum or .kitti, by its ending).
+    """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg or TUM text) and write TARGET (.g2o, .pyfg, .tum
+    or .kitti, by its ending).
 
     What has no place in TARGET, or is not read, is left out and said. A trajectory is one robot's, and a robot is the
     letter of its keys: of several each gets a file of its own, out-a.tum, out-b.tum. A .tum has each pose's time stamp.
@@ -39,6 +41,7 @@ def command(
     \b
     factorbus convert w10000.graph w10000.g2o
     factorbus convert estimate.g2o estimate.tum
+    factorbus convert goats.pyfg goats.g2o
     factorbus convert two-robots.g2o a.tum --robot a
     factorbus convert edges.txt edges.g2o --dialect slam++
     """
@@ -46,8 +49,10 @@ def command(
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
-    if robot is not None and target.suffix == ".g2o":
-        raise click.UsageError("--robot is of trajectories: a .g2o has the whole graph")
+    if robot is not None and target.suffix in _GRAPHS:
+        raise click.UsageError(f"--robot is of trajectories: a {target.suffix} has the whole graph")
+    if ids != "auto" and target.suffix == ".pyfg":
+        raise click.UsageError("--ids is of a .g2o: a .pyfg has the names of the keys")
     from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
@@ -65,11 +70,11 @@ def _check_any(graph: "GraphFile", target: Path) -> None:
     """Raises FormatError where nothing of `graph` would be in `target`."""
     from factorbus.formats import FormatError
 
-    if target.suffix == ".g2o" and not (graph.batch.variable_count or graph.batch.factor_count):
+    if target.suffix in _GRAPHS and not (graph.batch.variable_count or graph.batch.factor_count):
         raise FormatError(
-            graph.path, None, "nothing that a .g2o would have", "at least one vertex or edge that is read"
+            graph.path, None, f"nothing that a {target.suffix} would have", "at least one vertex or edge that is read"
         )
-    if target.suffix != ".g2o" and not graph.poses:
+    if target.suffix not in _GRAPHS and not graph.poses:
         raise FormatError(graph.path, None, f"no pose, and a {target.suffix} has nothing else", "at least one pose")
 
 
@@ -77,7 +82,7 @@ def _written(
     graph: "GraphFile", target: Path, strict: bool, robot: str | None, ids: str
 ) -> tuple[list[Path], tuple[str, ...], dict[str, int]]:
     """(the files, what was left out of them, how much is in them).  Raises FormatError, SeveralRobots."""
-    from factorbus.formats import tum_notes, write_g2o, write_kitti, write_tum
+    from factorbus.formats import tum_notes, write_g2o, write_kitti, write_pyfg, write_tum
     from factorbus.formats.left_out import LeftOut
     from factorbus.formats.trajectory import one_trajectory, trajectories, untimed
 
@@ -85,6 +90,8 @@ def _written(
     if target.suffix == ".g2o":
         same = graph.numbering if graph.numbering != "ids" else "auto"
         return [target], write_g2o(target, graph.batch, strict, same if ids == "auto" else ids), counts
+    if target.suffix == ".pyfg":
+        return [target], write_pyfg(target, graph.batch, strict), counts
     form = target.suffix[1:].upper()
     found = trajectories(graph.batch, form)
     chosen = [one_trajectory(graph.batch, form, robot)] if robot is not None else list(found.values())

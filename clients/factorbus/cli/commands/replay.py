@@ -101,12 +101,12 @@ class ReplayRequest:
 @click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
-@out_option("--out", "out", "Write the estimate and the factors as g2o.", "FILE.g2o")
+@out_option("--out", "out", "Write the estimate and the factors as g2o or pyfg, by the ending.", "FILE.g2o")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
 @json_option
 def command(as_json: bool, **asked: Any) -> None:
-    """Drive FILE (g2o, TORO .graph, iSAM or SLAM++ text, or the name of a data set) through a map, pose by pose.
+    """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, or the name of a data set) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
     there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
@@ -134,8 +134,8 @@ def command(as_json: bool, **asked: Any) -> None:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
     if request.in_process and request.live:
         raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
-    if request.out is not None and request.out.suffix != ".g2o":
-        raise click.BadParameter(f"{request.out} does not end in .g2o", param_hint="--out")
+    if request.out is not None and request.out.suffix not in (".g2o", ".pyfg"):
+        raise click.BadParameter(f"{request.out} does not end in .g2o or .pyfg", param_hint="--out")
     from factorbus.cli.output import console as screen
 
     def report(result: dict[str, Any]) -> None:
@@ -295,13 +295,18 @@ def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
     """The files that were asked for; of several robots each has a trajectory of its own, which is said."""
     from factorbus.cli.output.console import print_note
     from factorbus.cli.process.reading import say
-    from factorbus.formats import write_g2o, write_kitti, write_tum
+    from factorbus.formats import write_g2o, write_kitti, write_pyfg, write_tum
     from factorbus.proto.messages import Batch
 
     files: list[Path] = []
     if request.out:
         ids = numbering if numbering != "ids" else "auto"
-        say(request.out, write_g2o(request.out, target.graph(), request.strict, ids))
+        graph, strict = target.graph(), request.strict
+        is_g2o = request.out.suffix == ".g2o"
+        say(
+            request.out,
+            write_g2o(request.out, graph, strict, ids) if is_g2o else write_pyfg(request.out, graph, strict),
+        )
         files.append(request.out)
     for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
         if path:

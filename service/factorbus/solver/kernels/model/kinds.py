@@ -21,7 +21,14 @@ from factorbus.solver.kernels.model.dispatch import check_same, dispatcher
 from factorbus.solver.kernels.model.linear import linear, linear_se2
 from factorbus.solver.kernels.model.points import prior_point2, prior_point3
 from factorbus.solver.kernels.model.pose_measurements import attitude_se3, heading_se2, position_se2, position_se3
-from factorbus.solver.kernels.model.range_bearing import bearing_se2, bearing_se3, range_se2, range_se3
+from factorbus.solver.kernels.model.range_bearing import (
+    bearing_se2,
+    bearing_se3,
+    range_between_se2,
+    range_between_se3,
+    range_se2,
+    range_se3,
+)
 from factorbus.solver.kernels.model.records import Ends
 from factorbus.solver.kernels.model.se2 import bearing_range_se2, between_se2, landmark_se2, prior_se2
 from factorbus.solver.kernels.model.se3 import between_se3, landmark_se3, prior_se3
@@ -103,6 +110,8 @@ FACTOR_MODELS = {
     "attitude_se3": FactorModel(attitude_se3, "MATH (3.22)", directions=(0, 3)),
     "range_se2": FactorModel(range_se2, "MATH (3.23)", rigid=True, positive_at=0),
     "range_se3": FactorModel(range_se3, "MATH (3.23)", rigid=True, positive_at=0),
+    "range_between_se2": FactorModel(range_between_se2, "MATH (3.34)", rigid=True, positive_at=0),
+    "range_between_se3": FactorModel(range_between_se3, "MATH (3.34)", rigid=True, positive_at=0),
     "bearing_se2": FactorModel(bearing_se2, "MATH (3.24)", rigid=True),
     "bearing_se3": FactorModel(bearing_se3, "MATH (3.25)", rigid=True, directions=(0,)),
     **{name: _linear_model(name) for name in FACTOR_KINDS if name.startswith("linear_")},

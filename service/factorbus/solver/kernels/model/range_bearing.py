@@ -1,6 +1,6 @@
-"""A point of which a pose knows only how far it is, or only where it is to be seen.  MATH §3.5.
+"""A point of which a pose knows only how far it is, or only where it is to be seen; how far two poses are apart.
 
-Arguments as in `se2`.
+MATH §3.5.  Arguments as in `se2`.
 """
 
 import math
@@ -39,6 +39,35 @@ def range_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) ->
     for a in range(3):
         A[0, a] = -(q[a] * n0 + q[3 + a] * n1 + q[6 + a] * n2)
         A[0, 3 + a] = 0.0
+
+
+@inline_kernel
+def range_between_se2(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
+    """r = |t_j − t_i| − ρ,  n = (t_j − t_i)/|t_j − t_i|,  A = [ −(R_iᵀ n)ᵀ | 0 ],  B = [ (R_jᵀ n)ᵀ | 0 ].  (3.34)"""
+    tx, ty = x[j] - x[i], x[j + 1] - x[i + 1]
+    distance = math.sqrt(tx * tx + ty * ty)
+    inverse = 1.0 / distance if distance > _NEAR else 0.0
+    nx, ny = tx * inverse, ty * inverse
+    r[0] = distance - p[k]
+    c, s = math.cos(x[i + 2]), math.sin(x[i + 2])
+    A[0, 0], A[0, 1], A[0, 2] = -c * nx - s * ny, s * nx - c * ny, 0.0
+    c, s = math.cos(x[j + 2]), math.sin(x[j + 2])
+    B[0, 0], B[0, 1], B[0, 2] = c * nx + s * ny, c * ny - s * nx, 0.0
+
+
+@inline_kernel
+def range_between_se3(x: F64, i: int, j: int, p: F64, k: int, r: F64, A: F64, B: F64) -> None:
+    """As `range_between_se2`."""
+    t0, t1, t2 = x[j] - x[i], x[j + 1] - x[i + 1], x[j + 2] - x[i + 2]
+    distance = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    inverse = 1.0 / distance if distance > _NEAR else 0.0
+    n0, n1, n2 = t0 * inverse, t1 * inverse, t2 * inverse
+    r[0] = distance - p[k]
+    q, s = rotation_matrix(x, i + 3), rotation_matrix(x, j + 3)
+    for a in range(3):
+        A[0, a] = -(q[a] * n0 + q[3 + a] * n1 + q[6 + a] * n2)
+        B[0, a] = s[a] * n0 + s[3 + a] * n1 + s[6 + a] * n2
+        A[0, 3 + a], B[0, 3 + a] = 0.0, 0.0
 
 
 @inline_kernel

@@ -1,0 +1,111 @@
+"""What of a graph a form of file has records for; the rest is left out and said."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorbus.formats.errors import FormatError
+from factorbus.formats.left_out import LeftOut, shown
+from factorbus.proto.arrays import I64
+from factorbus.proto.messages import Batch, Factors, Variables
+from factorbus.proto.stamps import NO_STAMP
+from factorbus.proto.symbols import format_symbol
+
+# How many of what are left out, by name and reason.  A kind may come in several groups: each is said once for the file.
+_Lost = Counter[tuple[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """The text of a file; notes: what was left out of it, for people; left_out: the same, counted by kind."""
+
+    text: str
+    notes: tuple[str, ...]
+    left_out: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form of file: its name, the kinds of variables it has, and of factors with how many numbers are measured.
+
+    timed: the kinds of variables whose time it has.  fixes: whether it says which variables are fixed.
+    """
+
+    name: str
+    variables: frozenset[str]
+    measured: Mapping[str, int]
+    timed: frozenset[str] = frozenset()
+    fixes: bool = True
+
+
+def writable(batch: Batch, form: Form, left: LeftOut) -> Batch:
+    """What of `batch` there are records for.  Raises FormatError for a factor of a variable that is not there."""
+    _refuse_unknown(batch, form.name)
+    lost = _Lost()
+    variables = []
+    for group in batch.variables:
+        if group.kind in form.variables:
+            variables.append(group)
+        else:
+            lost[group.kind, f"{form.name} has no record for such variables"] += len(group.keys)
+        if group.kind not in form.timed:
+            stamps = 0 if group.stamps is None else int((group.stamps != NO_STAMP).sum())
+            lost["time stamps", f"{form.name} has no record for the time of {group.kind} variables"] += stamps
+        if group.fixed and not form.fixes:
+            lost["fixed variables", f"{form.name} has no record for them: written as free"] += len(group.keys)
+    gone = np.concatenate(
+        [np.empty(0, np.int64), *(group.keys for group in batch.variables if group.kind not in form.variables)]
+    )
+    factors = [kept for group in batch.factors if (kept := _writable_factors(group, gone, form, lost)) is not None]
+    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in factors)])
+    told = tuple(_told(variables, named, lost))
+    for (name, why), count in lost.items():
+        left.drop(name, count, why)
+    return Batch(told, tuple(factors))
+
+
+def number_text(numbers: Iterable[float]) -> str:
+    """Shortest texts that read back as the same floats."""
+    return " ".join([repr(number).removesuffix(".0") for number in numbers])
+
+
+def _writable_factors(group: Factors, gone: I64, form: Form, lost: _Lost) -> Factors | None:
+    if group.kind not in form.measured or np.isin(group.keys, gone).any():
+        lost[group.kind, f"{form.name} has no record for such factors"] += len(group.keys)
+        return None
+    kept = np.ones(len(group.keys), bool)
+    if group.kind in ("position_se2", "position_se3"):
+        kept = (group.measured[:, form.measured[group.kind] :] == 0.0).all(axis=1)
+        lost[group.kind, f"{form.name} has no record for an antenna beside its pose"] += int((~kept).sum())
+    if group.loss:
+        why = f"{form.name} has no losses: written without their {group.loss}"
+        lost[f"{group.kind} loss", why] += len(group.keys)
+    if not kept.any():
+        return None
+    return Factors(group.kind, group.keys[kept], group.measured[kept], group.information[kept])
+
+
+def _told(variables: list[Variables], named: I64, lost: _Lost) -> Iterator[Variables]:
+    """The variables that a vertex line or an edge tells of."""
+    untold: list[str] = []
+    for group in variables:
+        told = np.isin(group.keys, named) if group.values is None else np.ones(len(group.keys), bool)
+        untold += [format_symbol(key) for key in group.keys[~told].tolist()]
+        if told.all():
+            yield group
+        elif told.any():
+            stamps = None if group.stamps is None else group.stamps[told]
+            yield group._replace(keys=group.keys[told], stamps=stamps)
+    lost["variables", f"neither a value nor an edge tells of {shown(untold)}"] += len(untold)
+
+
+def _refuse_unknown(batch: Batch, form: str) -> None:
+    known = np.concatenate([np.empty(0, np.int64), *(group.keys for group in batch.variables)])
+    named = np.concatenate([np.empty(0, np.int64), *(group.keys.ravel() for group in batch.factors)])
+    if not np.isin(named, known).all():
+        lost = named[~np.isin(named, known)][0]
+        raise FormatError(
+            form, None, f"a factor of {format_symbol(int(lost))}, which is not in the graph", "all variables"
+        )
