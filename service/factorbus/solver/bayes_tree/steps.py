@@ -207,9 +207,9 @@ class TreeSteps:
             # Where R is not quite that of Λ, to gain nothing is all that can be said of the optimum.
             if goes_on and chi2_before - result.chi2 <= _AT_END * (result.chi2 + LEAST_CHI2):
                 result.converged = True
-            # Of the optimum of a batch that has not converged nothing is known.
-            tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
-            self._damping = 0.0 if result.converged else result.damping
+            if result:  # of the optimum of a batch that has not converged nothing is known
+                tree.totals[tl.T_LEAST] = tree.totals[tl.T_CHI2] if result.converged else 0.0
+                self._damping = 0.0 if result.converged else result.damping
             # The tree's own step followed, and what it was before is that of the step.
             tree.totals[tl.T_BEFORE] = chi2_before
         if not math.isfinite(tree.totals[tl.T_CHI2]):
