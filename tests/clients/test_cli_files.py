@@ -217,3 +217,18 @@ def test_a_replay_says_how_the_file_was_read(folder: Path, capsys: pytest.Captur
         assert main(["replay", "a.txt", "--in-process", "--json", "--mode", "inc-l", *more]) == OK
         chi2.append(json.loads(capsys.readouterr().out)["chi2"])
     assert chi2[0] > 40 * chi2[1]
+
+
+def test_ranges_go_from_pyfg_to_pyfg_and_through_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    moves = "".join(f"EDGE_SE2 0 A{k} A{k + 1} 1 0 1.57 1 0 0 1 0 1\n" for k in range(3))
+    seen = "".join(f"EDGE_RANGE 0 A{k} L0 {z} 1\n" for k, z in enumerate((5, 4.5, 4.1, 4.6)))
+    poses = "".join(f"VERTEX_SE2 0 A{k} {x} {y} 0\n" for k, (x, y) in enumerate(((0, 0), (1, 0), (1, 1), (0, 1))))
+    (folder / "a.pyfg").write_text(f"{poses}VERTEX_XY L0 4 3\n{moves}{seen}")
+    assert main(["convert", "a.pyfg", "b.pyfg", "--strict"]) == OK
+    assert "b.pyfg: 4 poses, 1 landmark, 7 factors" in capsys.readouterr().err
+    assert read(folder / "b.pyfg").batch.factor_count == 7
+    assert main(["convert", "a.pyfg", "c.pyfg", "--ids", "keys"]) == USAGE
+    assert main(["replay", "a.pyfg", "--in-process", "--mode", "inc-l", "--out", "d.pyfg"]) == OK
+    assert "1 fixed variable left out" in capsys.readouterr().err
+    again = read(folder / "d.pyfg").batch
+    assert {group.kind for group in again.factors} == {"between_se2", "range_se2"}

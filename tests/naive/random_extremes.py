@@ -86,8 +86,8 @@ def connects(kind: str) -> list[str]:
         return [kind.removeprefix("prior_")]
     if kind.startswith(("position", "heading", "attitude")):
         return [kind.rpartition("_")[2]]
-    if kind.startswith("between"):
-        return [kind.removeprefix("between_")] * 2
+    if kind.startswith(("between", "range_between")):
+        return [kind.rpartition("_")[2]] * 2
     if kind in SIGHTS:
         return ["se3", "point3" if kind == "point_seen" else "idp"]
     return [kind.rpartition("_")[2], "point2" if kind.endswith("se2") else "point3"]

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from factorbus.formats import FormatError, read
 from factorbus.formats.parallax import lone_bearings
+from factorbus.formats.ranging import lone_ranges
 
 INFO3 = "1 0 0 1 0 1"
 INFO6 = " ".join("1" if i == j else "0" for i in range(6) for j in range(i, 6))
@@ -27,6 +28,11 @@ FILES = [
     f"VERTEX2 0 0 0 0\nODOMETRY 0 1 1 0 0 {INFO3}\nLANDMARK2 1 5 5 6 1 0 1\n",
     "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 1 0 1 1 0 0\nEQUIV 0 1\nBR 0 5 0.1 2 0.1 0.1\n",
     f"ODOMETRY 0 1 1 0 0 {INFO3}\nLANDMARK 1 0 5 6 1 0 1\nEDGE3 5 6 1 2 3 0.1 0.2 0.3 {INFO6}\n",
+    "VERTEX_SE2 0.5 A0 0 0 0\nVERTEX_SE2 1.5 A1 1 0 0\nVERTEX_SE2 1.5 B0 1 3 0\nVERTEX_XY L0 4 1\n"
+    f"VERTEX_SE2:PRIOR 0.5 A0 0 0 0 {INFO3}\nEDGE_SE2 0.5 A0 A1 1 0 0 {INFO3}\nEDGE_SE2_XY 0.5 A0 L0 4 1 1 0 1\n"
+    "EDGE_RANGE 0.5 A0 L0 4 1\nEDGE_RANGE 1.5 A1 B0 3 1\n",
+    f"VERTEX_SE3:QUAT 0 A0 0 0 0 0 0 0 1\nVERTEX_XYZ L0 1 2 3\nEDGE_SE3:QUAT 0 A0 A1 1 0 0 0 0 0 1 {INFO6}\n"
+    "EDGE_RANGE 0 A0 L0 4 1\n",
 ]
 NUMBERS = [
     "0",
@@ -110,7 +116,8 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFact
     except FormatError as caught:
         problem = caught
     if problem is None:
-        lone = lone_bearings(graph.batch)  # in no step, with all that names them
+        # In no step, with all that names them.
+        lone = np.concatenate([lone_bearings(graph.batch), lone_ranges(graph.batch)])
         assert count == sum(int((~np.isin(g.keys, lone).any(axis=1)).sum()) for g in graph.batch.factors)
     else:
         assert problem.file == str(path)
