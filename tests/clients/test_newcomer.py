@@ -47,6 +47,13 @@ def test_version() -> None:
     assert typed("--version").stdout == f"factorbus {__version__}\n"
 
 
+@pytest.mark.parametrize("example", ["square", "viewer", "async_robot"])
+def test_an_example_says_how_it_is_called(example: str) -> None:
+    path = Path(__file__).parents[2] / "clients" / "examples" / f"{example}.py"
+    said = subprocess.run([sys.executable, str(path), "--help"], capture_output=True, text=True, timeout=60, check=True)
+    assert said.stdout.startswith(f"usage: {example}.py [-h] [endpoint] [map]")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

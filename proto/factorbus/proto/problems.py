@@ -6,6 +6,7 @@
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
+    ├── NotFiniteNumbers     not_finite           a NaN or an infinity among numbers for a map (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   ├── UnknownKind      unknown_kind         a kind of variable, factor or change that this version does not know
@@ -15,12 +16,15 @@
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
     ├── UnknownMap           unknown_map          no such map here
+    ├── NotHeld              unknown_variable     a mirror or an answer has no such variable (client side)
     ├── UnknownQuestion      unknown_question     no such question or operation
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
     │   ├── NobodyListens    unavailable          there is nothing at that address
-    │   └── ClosedHere       unavailable          this client itself has closed the connection, or left the map
+    │   ├── ClosedHere       unavailable          this client itself has closed the connection, or left the map
+    │   ├── NoMirror         unavailable          the estimate of a map that was opened without a mirror
+    │   └── NotReached       unavailable          a revision was waited for that has not come
     ├── NotConverged         not_converged        a map was waited for in vain (client side)
     ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── OtherProtocol        other_protocol       only services of another major version are there (client side)
@@ -111,6 +115,14 @@ class BadShape(Problem):
         super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
+class NotFiniteNumbers(Problem):
+    code = "not_finite"
+
+    def __init__(self, where: str, seen: object) -> None:
+        wanted = "finite numbers"
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
+
+
 class BadInformation(Problem):
     code = "bad_information"
 
@@ -127,9 +139,6 @@ class BadMessage(Problem):
 
 class BadLoss(BadMessage):
     code = "bad_loss"
-
-    def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(where, f"of the loss seen {seen}", wanted)
 
 
 class BadOption(BadMessage):
@@ -185,6 +194,15 @@ class UnknownMap(Problem):
         shown = ", ".join(sorted(known)[:_NAMED]) + (f" and {len(known) - _NAMED} more" if len(known) > _NAMED else "")
         there = f"there are {shown}{nearest(name, known)}" if known else "there is none yet"
         super().__init__(f"there is no map {name!r} here; {there}", map=name, known=sorted(known))
+
+
+class NotHeld(Problem, KeyError):
+    """What is looked up in a mirror or an answer is not in it: as of any mapping of Python's, a KeyError."""
+
+    code = "unknown_variable"
+
+    def __str__(self) -> str:
+        return self.message  # a KeyError shows its quotes
 
 
 class UnknownQuestion(Problem):
@@ -247,6 +265,27 @@ class ClosedHere(Unavailable):
         """connection: all of it is closed, and not only the map."""
         closed = "this connection is closed; connect again" if connection else "it was closed here; open it again"
         Problem.__init__(self, f"{what.rstrip(',')}: {closed}", waited_s=0.0)
+
+
+class NoMirror(Unavailable):
+    """There is no local copy to read: the map was opened without."""
+
+    def __init__(self, name: str) -> None:
+        Problem.__init__(self, f"map {name!r} was opened without a mirror; open it with mirror=True", waited_s=0.0)
+
+
+class NotReached(Unavailable):
+    """The service is there, and the mirror up to date, but not at the revision that was waited for."""
+
+    def __init__(self, name: str, wanted: int, revision: int, waited_s: float) -> None:
+        Problem.__init__(
+            self,
+            f"map {name!r} is at revision {revision}, and has not reached {wanted} within {waited_s:g} s; "
+            "wait for the revision of an Accepted, or wait longer",
+            revision=revision,
+            waited_for=wanted,
+            waited_s=waited_s,
+        )
 
 
 class BetterOptimum(Problem):

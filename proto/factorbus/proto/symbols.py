@@ -13,7 +13,7 @@ _MOST_SHOWN = 80
 
 def symbol(letter: str, index: int) -> int:
     """The key of `letter` and `index`: symbol("x", 12) prints as x12.  Raises BadSymbol."""
-    if len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
+    if not isinstance(letter, str) or len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
         raise BadSymbol(f"{letter}{index}", "one ASCII letter")
     if not 0 <= index <= MAX_INDEX:
         raise BadSymbol(f"{letter}{index}", f"an index from 0 to {MAX_INDEX}")
