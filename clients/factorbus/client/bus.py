@@ -36,7 +36,7 @@ def connect(
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
     listening_s: give up after this, and not `timeout_s`, where nobody listens at all; None: wait for a service to come.
-    Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting.
+    Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting, BadConfigurationFile.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
     timeout_s = checked_seconds("timeout_s", timeout_s, timeout_s)

@@ -5,6 +5,7 @@
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
+    ├── BadConfigurationFile bad_file             a zenoh configuration file that cannot be read (client side)
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
     ├── NotFiniteNumbers     not_finite           a NaN or an infinity among numbers for a map (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
@@ -106,6 +107,16 @@ class BadSetting(Problem):
     def __init__(self, path: str, reason: str) -> None:
         wanted = "a path and value of a zenoh configuration"
         super().__init__(f"setting {path!r}: {reason}; wanted {wanted}", seen=path, wanted=wanted)
+
+
+class BadConfigurationFile(Problem):
+    """A zenoh configuration file.  from_environment: the variable that names it; empty: an argument or option did."""
+
+    code = "bad_file"
+
+    def __init__(self, file: str, reason: str, from_environment: str = "") -> None:
+        named = f", which {from_environment} names," if from_environment else ""
+        super().__init__(f"the zenoh configuration {file}{named} cannot be read: {reason}", path=file)
 
 
 class BadShape(Problem):
@@ -219,9 +230,10 @@ class SeveralRobots(Problem):
 
     def __init__(self, robot: str | None, robots: tuple[str, ...]) -> None:
         there = ", ".join(letter or "keys without a letter" for letter in robots) or "no pose"
+        verb = "is" if len(robots) < 2 and robots != ("",) else "are"
         asked = "none was chosen" if robot is None else f"none is {robot[:8]!r}"
         super().__init__(
-            f"a trajectory is one robot's; there are {there}, and {asked}: name one (robot, --robot)",
+            f"a trajectory is one robot's; there {verb} {there}, and {asked}: name one (robot, --robot)",
             robots=list(robots),
         )
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import require
+from factorbus.cli.output.exits import output_file, require
 from factorbus.cli.process.options import Number, json_option, out_option
 from factorbus.wording import counted
 
@@ -92,9 +92,9 @@ def run_monocular_demo(
     truth = [frame.pose[:3] for frame in world]
     result = {**verdict(seen, sightseer), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
     shares = [course.share for _, course in sightseer.ended]
-    save_sights(
-        plot, [(f.number, f.position, f.rays, f.spread) for f in seen], truth, world.points, shares, _said(result)
-    )
+    frames_seen = [(f.number, f.position, f.rays, f.spread) for f in seen]
+    with output_file(plot):
+        save_sights(plot, frames_seen, truth, world.points, shares, _said(result))
     return result
 
 
