@@ -59,7 +59,7 @@ RANGES = types.MappingProxyType(
         "converge_tolerance": _SHARE,
         "converge_max_iterations": _count(0),
         "constrain_recent_poses": _count(1),
-        "relinearize_threshold": _FINITE,
+        "relinearize_threshold": _AMOUNT,
         "relinearize_next_step_share": _FINITE,
         "relinearize_same_step_share": _FINITE,
         "relinearize_full_batch": _count(1),
