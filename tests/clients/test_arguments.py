@@ -13,10 +13,11 @@ from faulty.service import MAP, Service, endpoint_in
 from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
-from factorbus.client.uncertainty import factors_of, paired, sightings
+from factorbus.client.uncertainty import factors_of, paired, sightings, why_question
 from factorbus.proto.asking import Covariances
 from factorbus.proto.messages import Batch, Estimate, MapGraph
 from factorbus.proto.problems import BadLoss, BadOption, ClosedHere, Problem
+from factorbus.proto.symbols import symbol
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -104,6 +105,15 @@ def test_without_a_bus(call: Callable[[], object], said: str) -> None:
         (lambda: sightings("x1", "landmark_se2", (math.nan, 0), np.eye(2), None, 0.9), "not_finite"),
         (lambda: sightings("x1", "landmark_se2", (1, 0), ANY, None, 0.9), "bad_shape"),
         (lambda: paired(cast("Any", 5)), "bad_shape"),
+        (lambda: paired(cast("Any", [None])), "bad_shape"),
+        (lambda: why_question(None, cast("Any", [])), "bad_shape"),
+        (lambda: symbol("x", cast("Any", "1")), "bad_symbol"),
+        (lambda: symbol(cast("Any", 5), 1), "bad_symbol"),
+        (lambda: Draft().linear(["x0"], cast("Any", 5), [np.eye(3)], (0, 0, 0), sigmas=[1] * 3), "bad_option"),
+        (
+            lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.eye(3)], (0, 0, 0), kinds=cast("Any", 5), sigmas=[1] * 3),
+            "bad_option",
+        ),
     ],
 )
 def test_numbers_are_refused_before_they_are_sent(call: Callable[[], object], code: str) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import all_finite, as_numbers
+from factorbus.client.arguments import all_finite, as_numbers, of_type
 from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
 from factorbus.pieces import MOST, as_pieces, tangent_dims
 from factorbus.proto.arrays import F64
@@ -31,9 +31,11 @@ def linear_pieces(
 ) -> list[Factors]:
     """|Σ H (x ⊟ y) + b|² by Ω as factors, in their order; see `Draft.linear`.
 
-    Raises BadShape, UnknownKind, BadInformation, BadLoss.
+    Raises BadShape, UnknownKind, BadInformation, BadLoss, BadOption, NotFiniteNumbers.
     """
     where = " ".join(["linear", *map(format_symbol, keys)])
+    for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds or ())):
+        of_type(f"{where}: {name}", given, Collection, "one for each key")
     y = [all_finite(where, as_numbers(f"{where}: values", value)) for value in values]
     names = _kinds_of(where, y) if kinds is None else list(kinds)
     b = all_finite(where, as_numbers(f"{where}: residual", residual))

@@ -155,7 +155,7 @@ def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
         raise BadShape("pairs", repr(pairs)[:80], 'pairs of keys, such as [("x1", "x2")]')
     alone = len(pairs) == 2 and not any(isinstance(key, (tuple, list, np.ndarray)) for key in pairs)
     each: list[Any] = [pairs] if alone else list(pairs)
-    if any(isinstance(pair, (str, int)) or len(pair) != 2 for pair in each):
+    if any(isinstance(pair, str) or not isinstance(pair, (Sequence, np.ndarray)) or len(pair) != 2 for pair in each):
         raise BadShape("pairs", repr(pairs)[:80], 'pairs of keys, such as [("x1", "x2")]')
     return [key for pair in each for key in pair]
 
@@ -184,9 +184,10 @@ def why_question(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")
-    return AskWhy(
-        None if key is None else key_number(key), None if factor is None else int(id_numbers("why", factor)[0])
-    )
+    ids = None if factor is None else id_numbers("why", factor)
+    if ids is not None and ids.size != 1:
+        raise BadShape("why", f"{ids.size} factors", "one factor")
+    return AskWhy(None if key is None else key_number(key), None if ids is None else int(ids[0]))
 
 
 def sightings(
