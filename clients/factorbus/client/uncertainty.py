@@ -186,7 +186,7 @@ def why_question(key: Key | None, factor: int | None) -> AskWhy:
         raise BadShape("why", "both or neither of a key and a factor", "one of them")
     ids = None if factor is None else id_numbers("why", factor)
     if ids is not None and ids.size != 1:
-        raise BadShape("why", f"{ids.size} factors", "one factor")
+        raise BadShape("why", counted(ids.size, "factor"), "one factor")
     return AskWhy(None if key is None else key_number(key), None if ids is None else int(ids[0]))
 
 
