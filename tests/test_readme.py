@@ -5,6 +5,7 @@ import re
 import subprocess
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from walk import ROOT, SCRIPTS, blocks, walker
@@ -97,6 +98,23 @@ def test_commands_of_the_table_are_all_there_are() -> None:
     section = text[text.index("## Commands") : text.index("`factorbus COMMAND --help`")]
     told = {words.split()[0] for words in re.findall(r"`([^`]+)`", section)}
     assert told == set(COMMANDS) - {"robot", "version"}
+
+
+def test_commands_said_to_print_json_are_those_that_do() -> None:
+    from factorbus.cli.main import COMMANDS, cli
+
+    text = (ROOT / "README.md").read_text()
+    section = text[text.index("`--json` prints one") : text.index("Exit codes:")]
+    told = {words.split()[0] for words in re.findall(r"`([^`]+)`", section)} - {"--json"}
+    with click.Context(cli) as context:
+        found = {name: cli.get_command(context, name) for name in COMMANDS if name != "robot"}
+    assert told == {name for name, command in found.items() if command is not None and prints_json(command)}
+
+
+def prints_json(command: click.Command) -> bool:
+    """It has the option, or one of its own commands does."""
+    own = command.commands.values() if isinstance(command, click.Group) else ()
+    return any("--json" in option.opts for option in command.params) or any(map(prints_json, own))
 
 
 def test_the_table_of_extras_says_what_commands_ask_for() -> None:

@@ -4,6 +4,7 @@ In one terminal  `factorbus serve`
 in another       `python clients/examples/async_robot.py [ENDPOINT] [MAP]`
 """
 
+import argparse
 import asyncio
 import os
 import sys
@@ -11,16 +12,18 @@ import sys
 from factorbus.client import Draft
 from factorbus.client.aio import Map, connect
 
-ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447")
-MAP = sys.argv[2] if len(sys.argv) > 2 else "corridor"
+parser = argparse.ArgumentParser(description="A robot under asyncio: inserts in flight while a task prints.")
+parser.add_argument("endpoint", nargs="?", default=os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447"))
+parser.add_argument("map", nargs="?", default="corridor")
+given = parser.parse_args()
 POSES = 20
 
 
 async def main() -> None:
     """Drive straight on, without waiting for each answer."""
-    async with connect(ENDPOINT, client="robot2") as bus, bus.map(MAP) as corridor:
+    async with connect(given.endpoint, client="robot2") as bus, bus.map(given.map) as corridor:
         if corridor.estimate.revision > 0:
-            sys.exit(f"map {MAP} has been driven already; name another one")
+            sys.exit(f"map {given.map} has been driven already; name another one, or `factorbus drop {given.map}`")
         printer = asyncio.create_task(show(corridor))
         await corridor.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
         for i in range(1, POSES):

@@ -4,19 +4,22 @@ In one terminal  `factorbus serve`
 in another       `python clients/examples/square.py [ENDPOINT] [MAP]`
 """
 
+import argparse
 import math
 import os
 import sys
 
 from factorbus.client import Draft, connect
 
-ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447")
-MAP = sys.argv[2] if len(sys.argv) > 2 else "square"
+parser = argparse.ArgumentParser(description="A robot drives a square and sees its start again.")
+parser.add_argument("endpoint", nargs="?", default=os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447"))
+parser.add_argument("map", nargs="?", default="square")
+given = parser.parse_args()
 SIGMAS = (0.1, 0.1, 0.02)  # metres, metres, radians
 
-with connect(ENDPOINT, client="robot1") as bus, bus.map(MAP) as square:
+with connect(given.endpoint, client="robot1") as bus, bus.map(given.map) as square:
     if square.estimate.revision > 0:
-        sys.exit(f"map {MAP} has been driven already; name another one")
+        sys.exit(f"map {given.map} has been driven already; name another one, or `factorbus drop {given.map}`")
     square.insert(Draft().se2("x0", (0, 0, 0), fixed=True))
     for i in range(1, 5):  # 10 m ahead, a left turn that the odometry takes for 92 degrees
         turn = (10, 0, math.radians(92))

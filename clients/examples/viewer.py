@@ -4,15 +4,18 @@ In one terminal  `factorbus serve`
 in another       `python clients/examples/viewer.py [ENDPOINT] [MAP] [UNTIL_REVISION]`
 """
 
+import argparse
 import os
-import sys
 import threading
 
 from factorbus.client import connect
 from factorbus.proto.messages import Delta
 
-DEFAULTS = [os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447"), "square", "0"]
-ENDPOINT, MAP, UNTIL = [*sys.argv[1:], *DEFAULTS[len(sys.argv) - 1 :]]
+parser = argparse.ArgumentParser(description="Print what changes in a map, as it changes.")
+parser.add_argument("endpoint", nargs="?", default=os.environ.get("FACTORBUS_ENDPOINT", "tcp/127.0.0.1:7447"))
+parser.add_argument("map", nargs="?", default="square")
+parser.add_argument("until_revision", nargs="?", type=int, default=0)
+given = parser.parse_args()
 there = threading.Event()
 
 
@@ -23,12 +26,12 @@ def show(delta: Delta) -> None:
     print(
         f"revision {delta.revision} ({what}): {counts}; chi2 {delta.report.get('chi2', float('nan')):.3f}", flush=True
     )
-    if 0 < int(UNTIL) <= delta.revision:
+    if 0 < given.until_revision <= delta.revision:
         there.set()
 
 
-with connect(ENDPOINT, client="viewer") as bus, bus.map(MAP) as joined:
+with connect(given.endpoint, client="viewer") as bus, bus.map(given.map) as joined:
     joined.estimate.on_delta(show)
-    print(f"map {MAP} at revision {joined.estimate.revision}: {len(joined.estimate)} variables", flush=True)
-    if not 0 < int(UNTIL) <= joined.estimate.revision:
+    print(f"map {given.map} at revision {joined.estimate.revision}: {len(joined.estimate)} variables", flush=True)
+    if not 0 < given.until_revision <= joined.estimate.revision:
         there.wait()

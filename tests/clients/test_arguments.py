@@ -13,9 +13,11 @@ from faulty.service import MAP, Service, endpoint_in
 from factorbus.client import Bus, Changes, Draft, Map, Unavailable, aio, connect
 from factorbus.client.draft import batch_of
 from factorbus.client.merging import fit_into
-from factorbus.client.uncertainty import factors_of
+from factorbus.client.uncertainty import factors_of, paired, sightings, why_question
+from factorbus.proto.asking import Covariances
 from factorbus.proto.messages import Batch, Estimate, MapGraph
-from factorbus.proto.problems import BadOption, ClosedHere
+from factorbus.proto.problems import BadLoss, BadOption, ClosedHere, Problem
+from factorbus.proto.symbols import symbol
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -64,12 +66,73 @@ def kitchen(bus: Bus) -> Iterator[Map]:
         ),
         (lambda: connect("tcp/127.0.0.1:1", timeout_s=ANY), "timeout_s: 'no' (str); wanted seconds"),
         (lambda: connect("tcp/127.0.0.1:1", listening_s=-1), "listening_s: -1 (int); wanted seconds"),
+        (lambda: connect(cast("Any", None)), "endpoint: None (NoneType); wanted an address such as"),
+        (lambda: connect(cast("Any", 5)), "endpoint: 5 (int); wanted an address such as"),
+        (lambda: connect(cast("Any", ["tcp/127.0.0.1:1", 5])), "endpoint: 5 (int); wanted an address such as"),
+        (lambda: connect([]), "endpoint: an empty list; wanted an address such as"),
+        (lambda: connect("tcp/127.0.0.1:1", settings=cast("Any", 5)), "settings: 5 (int); wanted a mapping of path"),
+        (lambda: connect("tcp/127.0.0.1:1", zenoh=cast("Any", 5)), "zenoh: 5 (int); wanted the path of a file"),
+        (lambda: Draft().se2("x2", fixd=ANY), "se2 x2: there is no keyword 'fixd'; wanted fixed, stamp"),
+        (
+            lambda: fit_into(Estimate(1, 1, ()), MapGraph(1, 1, Batch()), letters=ANY),
+            "letters: 'no' (str); wanted a mapping of letters",
+        ),
+        (lambda: sightings("x1", "landmark_se2", (1, 1), np.eye(2), None, ANY), "probability: 'no' (str); wanted"),
     ],
 )
 def test_without_a_bus(call: Callable[[], object], said: str) -> None:
     with pytest.raises(BadOption) as refused:
         call()
     assert said in refused.value.message
+
+
+@pytest.mark.parametrize(
+    ("call", "code"),
+    [
+        (lambda: Draft().se2("x0", (0, math.nan, 0)), "not_finite"),
+        (lambda: Draft().point2("l0", (math.inf, 0)), "not_finite"),
+        (lambda: Draft().heading_se2("x0", math.nan, sigmas=1.0), "not_finite"),
+        (lambda: Draft().between_se2("x0", "x1", (1, math.nan, 0), sigmas=(1, 1, 1)), "not_finite"),
+        (lambda: Draft().heading_se2("x0", 0.0, information=[math.nan]), "bad_information"),
+        (lambda: Draft().between_se2("x0", "x1", (1, 0, 0), information=np.full((3, 3), np.inf)), "bad_information"),
+        (lambda: Draft().linear(["x0"], [(0, 0, math.nan)], [np.eye(3)], np.zeros(3), sigmas=[1] * 3), "not_finite"),
+        (lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.nan * np.eye(3)], np.zeros(3), sigmas=[1] * 3), "not_finite"),
+        (lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.eye(3)], np.full(3, np.nan), sigmas=[1] * 3), "not_finite"),
+        (lambda: Draft().linear(["x0"], [("a", 0, 0)], [np.eye(3)], np.zeros(3), sigmas=[1] * 3), "bad_shape"),
+        (lambda: Draft().variable(cast("Any", []), "x0"), "unknown_kind"),
+        (lambda: Changes().weigh([1], math.nan), "not_finite"),
+        (lambda: sightings("x1", "landmark_se2", ANY, np.eye(2), None, 0.9), "bad_shape"),
+        (lambda: sightings("x1", "landmark_se2", (math.nan, 0), np.eye(2), None, 0.9), "not_finite"),
+        (lambda: sightings("x1", "landmark_se2", (1, 0), ANY, None, 0.9), "bad_shape"),
+        (lambda: paired(cast("Any", 5)), "bad_shape"),
+        (lambda: paired(cast("Any", [None])), "bad_shape"),
+        (lambda: why_question(None, cast("Any", [])), "bad_shape"),
+        (lambda: symbol("x", cast("Any", "1")), "bad_symbol"),
+        (lambda: symbol(cast("Any", 5), 1), "bad_symbol"),
+        (lambda: Draft().linear(["x0"], cast("Any", 5), [np.eye(3)], (0, 0, 0), sigmas=[1] * 3), "bad_option"),
+        (
+            lambda: Draft().linear(["x0"], [(0, 0, 0)], [np.eye(3)], (0, 0, 0), kinds=cast("Any", 5), sigmas=[1] * 3),
+            "bad_option",
+        ),
+    ],
+)
+def test_numbers_are_refused_before_they_are_sent(call: Callable[[], object], code: str) -> None:
+    with pytest.raises(Problem) as refused:
+        call()
+    assert refused.value.code == code
+
+
+@pytest.mark.parametrize("none", ["", "none"])
+def test_no_loss_has_the_word_of_the_command_line(none: str) -> None:
+    (change,) = Changes().loss([13], none, 0).listed()
+    assert change.loss == ""
+
+
+def test_a_loss_that_does_not_exist_is_said_in_a_sentence() -> None:
+    with pytest.raises(BadLoss, match=r"^changes: the loss 'foo'; wanted none, or one of huber"):
+        Changes().loss([13], "foo", 1.0)
+    (group,) = Draft().heading_se2("x0", 0.0, sigmas=1.0, loss="none").batch().factors
+    assert group.loss == ""
 
 
 def test_true_and_false_of_numpy_will_do() -> None:
@@ -91,6 +154,10 @@ def test_true_and_false_of_numpy_will_do() -> None:
         (lambda m: m.chi2(True, values="no"), "values: 'no' (str); wanted True or False"),
         (lambda m: m.export(strict="no"), "strict: 'no' (str); wanted True or False"),
         (lambda m: m.estimate.wait_for("1"), "revision: '1' (str); wanted a whole number"),
+        (lambda m: m.estimate.on_delta(None), "callback: None (NoneType); wanted a function of a delta"),
+        (lambda m: m.repair(probability="0.9"), "probability: '0.9' (str); wanted a number between 0 and 1"),
+        (lambda m: m.uncertainty.gate(Draft(), "0.9"), "probability: '0.9' (str); wanted a number between 0 and 1"),
+        (lambda m: m.uncertainty.gate(Draft(), 1), "probability: 1 (int); wanted a number between 0 and 1"),
     ],
 )
 def test_of_a_map(service: Service, kitchen: Map, call: Callable[[Any], object], said: str) -> None:
@@ -164,6 +231,36 @@ def test_everything_on_a_closed_connection_says_so(bus: Bus, kitchen: Map) -> No
         assert isinstance(refused.value, Unavailable)
         assert "did not answer" not in refused.value.message
         assert refused.value.code == "unavailable"
+
+
+def test_what_is_looked_up_and_not_there_is_a_problem_and_a_key_error(kitchen: Map) -> None:
+    kitchen.insert(POINT)
+    calls: list[tuple[Callable[[], object], str]] = [
+        (lambda: kitchen.estimate["x99"], "x99 is not in map 'kitchen'"),
+        (lambda: kitchen.estimate["no key"], "variable key 'no key' cannot be read"),
+        (lambda: kitchen.estimate.stamp("x99"), "x99 is not in map 'kitchen'"),
+        (lambda: kitchen.estimate.columns("se3"), "no variables of kind 'se3' in map 'kitchen'"),
+        (lambda: Covariances(1, 1, "diagonal")["x0"], "the answer has no covariance of x0"),
+    ]
+    for call, said in calls:
+        with pytest.raises(KeyError) as missing:
+            call()
+        assert isinstance(missing.value, Problem)
+        assert missing.value.code == "unknown_variable"
+        assert str(missing.value).startswith(said)
+
+
+def test_a_revision_that_has_not_come_is_no_silence(kitchen: Map) -> None:
+    kitchen.insert(POINT)
+    with pytest.raises(Unavailable) as missing:
+        kitchen.estimate.wait_for(revision=1000, timeout_s=0.2)
+    assert missing.value.message.startswith("map 'kitchen' is at revision 1, and has not reached 1000 within 0.2 s")
+
+
+def test_a_map_without_a_mirror_says_so(bus: Bus) -> None:
+    with bus.map(MAP, mirror=False) as joined, pytest.raises(Unavailable) as missing:
+        joined.estimate["x0"]
+    assert missing.value.message == "map 'kitchen' was opened without a mirror; open it with mirror=True"
 
 
 def test_a_map_that_was_left_says_so(kitchen: Map) -> None:

@@ -67,7 +67,11 @@ def test_version_names_the_libraries() -> None:
         (["replay", "a.g2o", "--in-process", "--connect", "tcp/127.0.0.1:1"], USAGE, "exclude each other"),
         (["replay", "a.g2o", "--out", "nowhere/b.g2o"], USAGE, "there is no folder nowhere; make it first"),
         (["replay", "broken.g2o", "--out", "same"], USAGE, "same does not end in .g2o or .pyfg"),
-        (["replay", "broken.g2o", "--in-process", "--plot", "a.gif"], REFUSED, "a picture cannot be a .gif"),
+        (
+            ["replay", "broken.g2o", "--in-process", "--plot", "a.gif"],
+            USAGE,
+            "a.gif does not end in .png or .svg or .pdf",
+        ),
         (["serve", "--map", "a b"], USAGE, "map name 'a b' will not do"),
         (["serve", "--listen", "7447"], USAGE, "endpoint '7447' cannot be read; wanted protocol/address, such as"),
         (["serve", "--listen", "tcp/0.0.0.0:99999"], USAGE, "protocol/address with a port from 0 to 65535, such as"),

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 import pytest
-from faulty.service import MAP, Service, point, same
+from faulty.service import MAP, Service, not_a_number, point, same
 
 from factorbus.client import NoAnswerYet, Refused, Unavailable, connect, request_sender
 
@@ -77,9 +77,9 @@ def test_a_refusal_reaches_every_reader(start: Callable[..., Service], endpoint:
     service = start()
     with connect(endpoint) as bus, bus.map(MAP) as kitchen:
         with pytest.raises(Refused, match="NaN"):
-            kitchen.insert(point("l1", float("nan")))
+            kitchen.insert(not_a_number("l1"))
         kitchen.flush()  # it has been seen
-        kitchen.send(point("l1", float("nan")))
+        kitchen.send(not_a_number("l1"))
         kitchen.send(point("l2", 2))
         with pytest.raises(Refused, match="NaN"):
             kitchen.flush()
@@ -93,7 +93,7 @@ def test_a_refusal_nobody_saw_comes_out_of_with(start: Callable[..., Service], e
     with connect(endpoint) as bus:
         kitchen = bus.map(MAP)
         with pytest.raises(Refused, match="NaN"), kitchen:
-            kitchen.send(point("l1", float("nan")))
+            kitchen.send(not_a_number("l1"))
 
 
 def test_a_full_window_blocks_and_says_so(start: Callable[..., Service], endpoint: str) -> None:

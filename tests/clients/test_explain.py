@@ -107,6 +107,7 @@ def test_every_exception_is_found_by_its_name() -> None:
     pages = read_pages()
     assert sorted(name for name in found if code_of(name) not in pages) == []
     assert {code_of(word) for word in ("notconverged", "NOT_CONVERGED", "not-converged")} == {"not_converged"}
+    assert {code_of(name) for name in ("ClosedHere", "NoMirror", "NotReached", "NobodyListens")} == {"unavailable"}
     assert code_of("formaterror") == "bad_file"
     assert code_of("factorbus.client.NotConverged") == code_of("[not_converged]") == "not_converged"
 

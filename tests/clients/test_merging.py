@@ -248,7 +248,8 @@ def test_what_a_map_knows_of_its_own_frame_is_refused_unless_it_is_only_where_it
     with pytest.raises(AbsoluteFactors) as refused:
         fit_into(here("x0", "x1"), other, anchors=link(), letters=LETTERS)
     assert refused.value.detail == count
-    letters = {**LETTERS, "l": "m"}
+    points = any(group.kind == "point2" for group in other.batch.variables)
+    letters = {**LETTERS, "l": "m"} if points else LETTERS
     without = fit_into(here("x0", "x1"), other, anchors=link(), letters=letters, absolute="leave_out")
     assert without.left_out == count
     assert without.batch.factor_count == 2
@@ -299,6 +300,14 @@ def test_what_cannot_be_merged_says_why() -> None:
     ):
         with pytest.raises(problem):
             fit_into(ours, wrong, **how)
+
+
+def test_an_anchor_on_nothing_and_a_letter_of_nothing_are_named() -> None:
+    ours, other = here("x0", "x1"), there()
+    with pytest.raises(NoAnchor, match="the anchors name y888, which neither this map has nor the other"):
+        fit_into(ours, other, letters=LETTERS, anchors=link(b="y888"))
+    with pytest.raises(CannotMerge, match="letters renames 'z', and the other map has no such variables; it has 'x'"):
+        fit_into(ours, other, letters={"z": "y"}, anchors=link())
 
 
 def collided() -> MapGraph:

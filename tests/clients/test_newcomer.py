@@ -47,6 +47,13 @@ def test_version() -> None:
     assert typed("--version").stdout == f"factorbus {__version__}\n"
 
 
+@pytest.mark.parametrize("example", ["square", "viewer", "async_robot"])
+def test_an_example_says_how_it_is_called(example: str) -> None:
+    path = Path(__file__).parents[2] / "clients" / "examples" / f"{example}.py"
+    said = subprocess.run([sys.executable, str(path), "--help"], capture_output=True, text=True, timeout=60, check=True)
+    assert said.stdout.startswith(f"usage: {example}.py [-h] [endpoint] [map]")
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -103,7 +110,7 @@ def test_a_map_is_saved_whole_or_the_way_of_each_robot(
     assert each == [str(tmp_path / f"all-{name}.kitti") for name in ("none", "a", "b")]
     assert all(len(Path(path).read_text().splitlines()) == 4 for path in each)
     assert main(["save", "yard", str(way), "--robot", "q", "--connect", endpoint]) == REFUSED
-    assert "there is keys without a letter, a, b" in capsys.readouterr().err
+    assert "there are keys without a letter, a, b" in capsys.readouterr().err
     assert main(["save", "yard", str(tmp_path / "a.xyz"), "--connect", endpoint]) == USAGE
     assert main(["save", "yard", str(whole), "--robot", "a", "--connect", endpoint]) == USAGE
     assert save(str(tmp_path / "counted.g2o"), "--ids", "counted") == [str(tmp_path / "counted.g2o")]

@@ -7,7 +7,7 @@ import pytest
 
 from factorbus.cli.driving.columns import merged, positions
 from factorbus.cli.main import main
-from factorbus.cli.output.exits import BAD_FILE, OK, REFUSED
+from factorbus.cli.output.exits import BAD_FILE, OK, USAGE
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.symbols import symbol
 from factorbus.simulate import city_trees, manhattan
@@ -178,6 +178,6 @@ def test_odometry_is_reckoned_and_not_the_files_values(town: Path, tmp_path: Pat
 
 
 def test_bad_endings_and_files_are_refused_before_the_work(tmp_path: Path, capsys) -> None:
-    assert main(["plot", "map", "any.g2o", "--out", str(tmp_path / "map.gif")]) == REFUSED
-    assert "a picture cannot be a .gif" in capsys.readouterr().err
+    assert main(["plot", "map", "any.g2o", "--out", str(tmp_path / "map.gif")]) == USAGE
+    assert "map.gif does not end in .png or .svg or .pdf" in capsys.readouterr().err
     assert main(["plot", "drive", "missing.g2o", "--out", str(tmp_path / "map.png")]) == BAD_FILE

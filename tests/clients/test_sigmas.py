@@ -12,7 +12,7 @@ from naive.dense_least_squares import DenseGraph
 
 from factorbus.client import Camera, Changes, Draft
 from factorbus.client.certainty import DEFAULT_SCALES
-from factorbus.proto.kinds import LOSSES
+from factorbus.proto.kinds import LOSSES, VARIABLE_KINDS
 from factorbus.proto.messages import Batch, Variables
 from factorbus.proto.problems import BadInformation, BadLoss, BadShape, BadSymbol, Problem
 from factorbus.proto.symbols import symbol
@@ -251,8 +251,8 @@ def test_every_method_that_takes_a_certainty_is_among_them() -> None:
         for name, method in inspect.getmembers(Draft, inspect.isfunction)
         if not name.startswith("_") and any(p.kind is kinds for p in inspect.signature(method).parameters.values())
     }
-    # An inverse-depth feature has a certainty of its own, `FeatureCertainty`.
-    assert takes - {"idp_first"} == set(EVERY_METHOD)
+    # An inverse-depth feature has a certainty of its own, `FeatureCertainty`; a variable has none (`Held`).
+    assert takes - {"idp_first", "variable", *VARIABLE_KINDS} == set(EVERY_METHOD)
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)

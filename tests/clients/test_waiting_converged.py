@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from faulty.service import MAP, Service, endpoint_in
+from faulty.service import MAP, Service, endpoint_in, not_a_number
 
 from factorbus.client import Draft, Map, NotConverged, Refused, Unavailable, aio, connect
 
@@ -169,7 +169,7 @@ def test_what_was_sent_is_waited_for_first(service: Service, kitchen: Map) -> No
         kitchen.wait_converged(0.2)
     kitchen.wait_converged(50)
     assert kitchen.estimate.revision == 2
-    refused = kitchen.send(Draft().point2("l3", (float("nan"), 0)))
+    refused = kitchen.send(not_a_number("l3"))
     with pytest.raises(Refused):
         kitchen.wait_converged(50)
     assert refused.done()

@@ -19,7 +19,7 @@ from zenoh.handlers import Callback
 from factorbus.client import Draft
 from factorbus.client.mirror import Mirror
 from factorbus.proto import codec, keys
-from factorbus.proto.messages import Accepted, Delta, Estimate, Variables
+from factorbus.proto.messages import Accepted, Batch, Delta, Estimate, Variables
 from factorbus.proto.problems import BadSequence, Busy, Problem, UnknownMap, WrongEpoch
 
 MAP = "kitchen"
@@ -179,6 +179,12 @@ def peer(endpoint: str) -> zenoh.Config:
 
 def point(key: str, x: float, y: float = 0.0) -> Draft:
     return Draft().point2(key, (x, y))
+
+
+def not_a_number(key: str) -> Batch:
+    """A point that the service refuses; a draft would, before it is sent."""
+    drafted = point(key, 0.0).batch()
+    return Batch(tuple(group._replace(values=np.full((1, 2), np.nan)) for group in drafted.variables))
 
 
 def same(mirror: Mirror, service: Service) -> bool:

@@ -97,7 +97,7 @@ def test_what_was_seen_is_told_with_what_is_wanted_both_as_text(kind: type[Probl
 @pytest.mark.parametrize(("least", "wanted"), [(-1e12, "at most 1e+12 in magnitude"), (1e-24, "1e-24 to 1e+24")])
 def test_bounds_are_numbers_beside_the_text(least: float, wanted: str) -> None:
     most = 1e12 if least < 0 else 1e24
-    detail = OutOfBounds("the value of se2 x1", 1e13, least, most).detail
+    detail = OutOfBounds("the value of se2 x1", 1e13, least, most, "give a larger sigma").detail
     assert detail == {
         "where": "the value of se2 x1", "seen": "1e+13", "wanted": wanted, "least": least, "most": most,
     }  # fmt: skip

@@ -140,6 +140,20 @@ REFUSED = {
 }  # fmt: skip
 
 
+ADVICE = {
+    "value just beyond its bound": "choose units and an origin near the data",
+    "measurement beyond its bound": "choose units and an origin near the data",
+    "information beyond its bound": "give a larger sigma",
+    "information below its bound": "give a smaller sigma",
+}
+
+
+@pytest.mark.parametrize("name", ADVICE)
+def test_the_advice_is_for_what_is_out_of_bounds(name: str) -> None:
+    with pytest.raises(errors.SolverError, match=ADVICE[name] + "$"):
+        small_map().stage(REFUSED[name][1])
+
+
 def small_map(mode: str = "auto") -> Solver:
     solver = Solver(Options(mode=mode))
     solver.stage(

@@ -1,13 +1,16 @@
 """The entry point: the table of commands, each imported when it is called, and how the process ends."""
 
+import errno
 import importlib
+import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 
 import click
 
-from factorbus.cli.output.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, report
+from factorbus.cli.output.exits import EXIT_CODES, INTERRUPTED, OK, USAGE, Stopped, report
 from factorbus.proto.nearest import nearest
 from factorbus.proto.version import __version__
 
@@ -44,6 +47,7 @@ COMMANDS = {
     "robot": ("robot", ""),
 }
 _HIDDEN = ("robot",)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 _EPILOG = """\b
 Start here:
@@ -94,11 +98,14 @@ def cli(debug: bool) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code, and never shows a traceback unless asked to."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _print_what_can_be()
     debug = "--debug" in arguments or bool(os.environ.get("FACTORBUS_DEBUG"))
     try:
         return cli.main(arguments, prog_name="factorbus", standalone_mode=False) or OK
     except click.ClickException as error:
         error.show()
+        if isinstance(error, click.NoSuchOption) and re.fullmatch(r"-[0-9.]", error.option_name):
+            click.echo("A number below 0 is written behind `--`, and options before that: NAME -- -1", err=True)
         return USAGE
     except (KeyboardInterrupt, click.Abort):
         click.echo("interrupted", err=True)
@@ -106,5 +113,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output left, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return OK
+    except OSError as error:
+        if error.errno not in _FULL or error.filename is not None:
+            return report(error, as_json="--json" in arguments, debug=debug)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return report(Stopped("cannot_write", f"standard output cannot be written: {error.strerror}"), False, debug)
     except Exception as error:
         return report(error, as_json="--json" in arguments, debug=debug)
+
+
+def _print_what_can_be() -> None:
+    """What the encoding of a stream does not have, χ in ASCII say, is shown as a question mark."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")

@@ -2,18 +2,21 @@
 
 import math
 import threading
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
 
-from factorbus.proto.problems import BadOption
+from factorbus.proto.arrays import F64
+from factorbus.proto.nearest import nearest
+from factorbus.proto.problems import BadOption, BadShape, NotFiniteNumbers
 
 T = TypeVar("T")
 _PLAIN = (str, bytes, int, float, complex, list, tuple, dict, type(None))
 
 
-def of_type(what: str, given: Any, kind: type[T], wanted: str) -> T:
+def of_type(what: str, given: Any, kind: type[T] | tuple[type[T], ...], wanted: str) -> T:
     """`given`, if it is of this kind.  Raises BadOption."""
     if not isinstance(given, kind):
         raise BadOption(what, seen(given), wanted)
@@ -35,6 +38,36 @@ def checked_seconds(what: str, given: Any, usual: float) -> float:
     if not 0.0 <= number <= threading.TIMEOUT_MAX:
         raise BadOption(what, seen(given), "seconds: a finite number, 0 or more; or None, for as long as usual")
     return number
+
+
+def as_numbers(what: str, given: Any, wanted: str = "numbers") -> F64:
+    """`given` as an array of floats, of any shape.  Raises BadShape."""
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError):
+        raise BadShape(what, repr(given)[:80], wanted) from None
+
+
+def all_finite(what: str, numbers: F64) -> F64:
+    """`numbers`, if none of them is a NaN or an infinity.  Raises NotFiniteNumbers."""
+    if not np.isfinite(numbers).all():
+        raise NotFiniteNumbers(what, repr(numbers.tolist())[:80])
+    return numbers
+
+
+def checked_probability(what: str, given: Any) -> float:
+    """Between 0 and 1, neither of the two.  Raises BadOption."""
+    number = math.nan if isinstance(given, (bool, np.bool_)) or not isinstance(given, Real) else float(given)
+    if not 0.0 < number < 1.0:
+        raise BadOption(what, seen(given), "a number between 0 and 1")
+    return number
+
+
+def checked_keywords(what: str, given: Iterable[str], wanted: Sequence[str]) -> None:
+    """A misspelt keyword must not be ignored.  Raises BadOption."""
+    for name in given:
+        if name not in wanted:
+            raise BadOption(what, f"there is no keyword {name!r}", f"{', '.join(wanted)}{nearest(name, wanted)}")
 
 
 def seen(given: Any) -> str:

@@ -36,13 +36,15 @@ def connect(
     the service's lists.  timeout_s: also the default for everything done over this connection.
     zenoh: a zenoh configuration file, for certificates and passwords.  settings: more of the same, path to value.
     listening_s: give up after this, and not `timeout_s`, where nobody listens at all; None: wait for a service to come.
-    Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting.
+    Raises Unavailable, BadEndpoint, BadName, BadOption, BadSetting, BadConfigurationFile.
     """
     keys.checked_name("client", client, keys.LONGEST_NAME - SUFFIX_LENGTH)
     timeout_s = checked_seconds("timeout_s", timeout_s, timeout_s)
     listening_s = None if listening_s is None else checked_seconds("listening_s", listening_s, listening_s)
-    endpoints = [endpoint] if isinstance(endpoint, str) else list(endpoint)
-    return Bus(open_link(endpoints, timeout_s, settings or {}, str(zenoh), listening_s), client, timeout_s)
+    endpoints = _endpoints(endpoint)
+    of_type("zenoh", zenoh, (str, PathLike), "the path of a file")
+    settings = of_type("settings", settings or {}, Mapping, "a mapping of path to value")
+    return Bus(open_link(endpoints, timeout_s, settings, str(zenoh), listening_s), client, timeout_s)
 
 
 class Bus:
@@ -197,6 +199,14 @@ class Bus:
         what = f"the service, asked for admin/{operation},"
         request = Request(what, keys.admin_key(operation), codec.encode_map(question), decode, timeout_s)
         return self._sender.carry(request).future.result()
+
+
+def _endpoints(given: Any) -> list[str]:
+    wanted = 'an address such as "tcp/127.0.0.1:7447", or several'
+    listed = [given] if isinstance(given, str) else [*of_type("endpoint", given, Sequence, wanted)]
+    if not listed:
+        raise BadOption("endpoint", "an empty list", wanted)
+    return [of_type("endpoint", each, str, wanted) for each in listed]
 
 
 def _rows(data: bytes) -> list[MapRow]:

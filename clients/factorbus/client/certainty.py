@@ -9,6 +9,7 @@ from typing import Required, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import as_numbers
 from factorbus.proto.arrays import F64
 from factorbus.proto.kinds import FACTOR_KINDS, LOSSES
 from factorbus.proto.nearest import nearest
@@ -88,9 +89,9 @@ def triangle_of(where: str, dim: int, certainty: Certainty, kind: str = "") -> F
     _check_names(where, certainty)
     sigmas, information = certainty.get("sigmas"), certainty.get("information")
     if sigmas is not None and information is None:
-        return _from_sigmas(where, dim, np.atleast_1d(_numbers(f"{where}: sigmas", sigmas)), kind)
+        return _from_sigmas(where, dim, np.atleast_1d(as_numbers(f"{where}: sigmas", sigmas)), kind)
     if information is not None and sigmas is None:
-        return _from_matrix(where, dim, _numbers(f"{where}: information", information))
+        return _from_matrix(where, dim, as_numbers(f"{where}: information", information))
     seen = "neither sigmas nor information" if sigmas is None else "both sigmas and information"
     raise BadInformation(where, seen, "one of the two: how certain it is")
 
@@ -113,8 +114,10 @@ def loss_of(where: str, loss: tuple[str, float] | str | None) -> tuple[str, floa
     if loss is None:
         return "", 0.0
     name, scale = _parts(where, loss)
+    if name == "none":
+        return "", 0.0
     if name not in LOSSES:
-        raise BadLoss(where, repr(name), f"one of {', '.join(LOSSES)}{nearest(name, LOSSES)}")
+        raise BadLoss(where, f"the loss {name!r}", f"none, or one of {', '.join(LOSSES)}{nearest(name, LOSSES)}")
     scale = DEFAULT_SCALES[name] if scale is None else scale
     if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)):
         raise BadLoss(where, f"the scale {scale!r}", "a finite number above 0, standard deviations")
@@ -127,7 +130,7 @@ def _parts(where: str, loss: object) -> tuple[object, object]:
     if isinstance(loss, str):
         return loss, None
     if not isinstance(loss, (tuple, list)) or len(loss) != 2:
-        raise BadLoss(where, repr(loss), 'a name and a scale, such as ("huber", 1.345), or a name alone')
+        raise BadLoss(where, f"the loss {loss!r}", 'a name and a scale, such as ("huber", 1.345), or a name alone')
     return loss[0], loss[1]
 
 
@@ -140,13 +143,6 @@ def _check_names(where: str, certainty: Mapping[str, object]) -> None:
             if name.startswith("cov"):
                 meant += " It is the inverse of the covariance of the residual; or give sigmas"
             raise BadInformation(where, f"there is no keyword {name!r}", f"{', '.join(wanted)}{meant}")
-
-
-def _numbers(where: str, given: ArrayLike) -> F64:
-    try:
-        return np.array(given, np.float64)
-    except (TypeError, ValueError):
-        raise BadShape(where, repr(given)[:80], "numbers") from None
 
 
 def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
@@ -166,13 +162,15 @@ def _from_sigmas(where: str, dim: int, sigmas: F64, kind: str) -> F64:
 
 
 def _from_matrix(where: str, dim: int, matrix: F64) -> F64:
-    if matrix.shape == (dim * (dim + 1) // 2,):
-        return matrix
-    if matrix.shape != (dim, dim):
+    is_triangle = matrix.shape == (dim * (dim + 1) // 2,)
+    if not is_triangle and matrix.shape != (dim, dim):
         wanted = f"({dim}, {dim}), or ({dim * (dim + 1) // 2},) for its upper triangle row by row"
         raise BadShape(f"{where}: information", f"shape {matrix.shape}", wanted)
-    with np.errstate(invalid="ignore"):  # what is not finite the service refuses, with its place
-        worst = np.abs(matrix - matrix.T).max()
+    if not np.isfinite(matrix).all():
+        raise BadInformation(f"{where}: information", repr(matrix.tolist())[:80], "finite numbers")
+    if is_triangle:
+        return matrix
+    worst = np.abs(matrix - matrix.T).max()
     if worst > _ASYMMETRY * np.abs(matrix).max():
         raise BadInformation(f"{where}: information", f"asymmetric by {worst:g}", "a symmetric matrix")
     return matrix[np.triu_indices(dim)]

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import checked_flag, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_flag, of_type
 from factorbus.client.certainty import loss_of
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
@@ -50,12 +50,12 @@ class Changes:
         return self._add(Change("remove_variables", keys=np.concatenate([*brought, np.empty(0, np.int64)]), alone=True))
 
     def loss(self, factors: Iterable[int] | int, name: str, scale: ArrayLike | None = None) -> Changes:
-        """These factors have this loss from now on ("": none).
+        """These factors have this loss from now on; "none", or "", takes theirs away.
 
         scale: one, or one for each, standard deviations; None: that of `certainty.DEFAULT_SCALES`.
         """
         ids = id_numbers("changes", factors)
-        if not name:
+        if isinstance(name, str) and name in ("", "none"):
             return self._add(Change("loss", ids, loss=""))
         name, usual = loss_of("changes", name)
         scales = _each("scale", usual if scale is None else scale, ids)
@@ -66,7 +66,8 @@ class Changes:
     def weigh(self, factors: Iterable[int] | int, weight: ArrayLike) -> Changes:
         """The information matrices of these factors are multiplied by this (one, or one for each)."""
         ids = id_numbers("changes", factors)
-        return self._add(Change("weigh", ids, weight=_each("weight", weight, ids)))
+        weights = all_finite("changes: weight", _each("weight", weight, ids))
+        return self._add(Change("weigh", ids, weight=weights))
 
     def fix(self, *keys: Key | Sequence[Key]) -> Changes:
         """These variables are held where they are."""
@@ -134,10 +135,7 @@ def _keys(keys: Sequence[Key | Sequence[Key]]) -> I64:
 
 
 def _each(name: str, numbers: ArrayLike, ids: I64) -> F64:
-    try:
-        given = np.array(numbers, np.float64)
-    except (TypeError, ValueError):
-        raise BadShape(f"changes: {name}", repr(numbers)[:80], "numbers") from None
+    given = as_numbers(f"changes: {name}", numbers)
     if given.shape not in ((), ids.shape):
         raise BadShape(f"changes: {name}", f"shape {given.shape}", f"one number, or {ids.size}")
     return np.broadcast_to(given, ids.shape)

@@ -6,12 +6,12 @@ Draft().se2("x1").between_se2("x0", "x1", (1.0, 0.0, 0.1), sigmas=(0.1, 0.1, 0.0
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias, TypeVar, Unpack
+from typing import TypeAlias, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorbus.client.arguments import checked_flag, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_flag, checked_keywords, of_type
 from factorbus.client.certainty import (
     Certainty,
     FeatureCertainty,
@@ -34,6 +34,13 @@ _Kind = TypeVar("_Kind")
 _Row: TypeAlias = NDArray[np.float64]
 
 
+class Held(TypedDict, total=False):
+    """What may be said of a variable besides its value: see `Draft`."""
+
+    fixed: bool
+    stamp: int | None
+
+
 class Draft:
     """Variables and factors to be inserted together or not at all.  Every method returns the draft, to be chained.
 
@@ -42,7 +49,8 @@ class Draft:
     an int (`time.time_ns()`, or any other clock); the map keeps it, and gives it back with the value.
     Every factor needs a certainty: sigmas=, standard deviations in metres and radians (also of rotations in space), or
     information=, and may have a loss= (`factorbus.client.certainty.Certainty`).
-    Raises BadSymbol, BadShape, BadStamp, BadInformation, BadLoss, BadOption, UnknownKind.
+    Raises BadSymbol, BadShape, BadStamp, BadInformation, BadLoss, BadOption, UnknownKind,
+    NotFiniteNumbers.
     """
 
     def __init__(self) -> None:
@@ -50,29 +58,25 @@ class Draft:
         self._factors: dict[tuple[str, str], tuple[list[list[int]], list[_Row], list[_Row], list[float]]] = {}
         self._linear: list[Factors] = []
 
-    def se2(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
+    def se2(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A pose in the plane: x y (metres), theta (radians)."""
-        return self.variable("se2", key, value, fixed=fixed, stamp=stamp)
+        return self.variable("se2", key, value, **held)
 
-    def se3(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
+    def se3(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A pose in space: x y z (metres), unit quaternion qx qy qz qw."""
-        return self.variable("se3", key, value, fixed=fixed, stamp=stamp)
+        return self.variable("se3", key, value, **held)
 
-    def point2(
-        self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None
-    ) -> Draft:
+    def point2(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A point in the plane: x y (metres)."""
-        return self.variable("point2", key, value, fixed=fixed, stamp=stamp)
+        return self.variable("point2", key, value, **held)
 
-    def point3(
-        self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None
-    ) -> Draft:
+    def point3(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A point in space: x y z (metres)."""
-        return self.variable("point3", key, value, fixed=fixed, stamp=stamp)
+        return self.variable("point3", key, value, **held)
 
-    def idp(self, key: Key, value: ArrayLike | None = None, *, fixed: bool = False, stamp: int | None = None) -> Draft:
+    def idp(self, key: Key, value: ArrayLike | None = None, **held: Unpack[Held]) -> Draft:
         """A feature of inverse depth: x y z of the camera that saw it first, azimuth, elevation, 1/distance."""
-        return self.variable("idp", key, value, fixed=fixed, stamp=stamp)
+        return self.variable("idp", key, value, **held)
 
     def prior_se2(self, key: Key, measured: ArrayLike, **certainty: Unpack[Certainty]) -> Draft:
         """Where a pose in the plane is in the map: x y (metres), theta (radians)."""
@@ -279,19 +283,19 @@ class Draft:
         kind: str,
         key: Key,
         value: ArrayLike | None = None,
-        *,
-        fixed: bool = False,
-        stamp: int | None = None,
+        **held: Unpack[Held],
     ) -> Draft:
         """A variable of any kind of `factorbus.proto.kinds`."""
         size = _known(VARIABLE_KINDS, kind).size
         number = key_number(key)
         where = f"{kind} {format_symbol(number)}"
         row = None if value is None else _row(where, value, size)
-        time, held = stamp_number(where, stamp), checked_flag(f"{where}: fixed", fixed)
-        keys, rows, stamps = self._variables.setdefault((kind, row is not None, held), ([], [], []))
+        checked_keywords(where, held, tuple(Held.__annotations__))
+        fixed = checked_flag(f"{where}: fixed", held.get("fixed", False))
+        keys, rows, stamps = self._variables.setdefault((kind, row is not None, fixed), ([], [], []))
+        stamp = stamp_number(where, held.get("stamp"))
         keys.append(number)
-        stamps.append(time)
+        stamps.append(stamp)
         if row is not None:
             rows.append(row)
         return self
@@ -363,16 +367,13 @@ def _lens(camera: Camera) -> list[float]:
 
 
 def _known(kinds: Mapping[str, _Kind], kind: str) -> _Kind:
-    if kind not in kinds:
-        raise UnknownKind("draft", kind, tuple(kinds))
+    if not isinstance(kind, str) or kind not in kinds:
+        raise UnknownKind("draft", str(kind), tuple(kinds))
     return kinds[kind]
 
 
 def _row(where: str, numbers: ArrayLike, size: int) -> _Row:
-    try:
-        row = np.array(numbers, np.float64)
-    except (TypeError, ValueError):
-        raise BadShape(where, repr(numbers)[:80], f"({size},) numbers") from None
+    row = as_numbers(where, numbers, f"({size},) numbers")
     if row.shape != (size,):
         raise BadShape(where, f"shape {row.shape}", f"({size},)")
-    return row
+    return all_finite(where, row)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import all_finite, as_numbers, of_type
 from factorbus.client.certainty import Certainty, full, loss_of, triangle_of
 from factorbus.pieces import MOST, as_pieces, tangent_dims
 from factorbus.proto.arrays import F64
@@ -30,12 +31,14 @@ def linear_pieces(
 ) -> list[Factors]:
     """|Σ H (x ⊟ y) + b|² by Ω as factors, in their order; see `Draft.linear`.
 
-    Raises BadShape, UnknownKind, BadInformation, BadLoss.
+    Raises BadShape, UnknownKind, BadInformation, BadLoss, BadOption, NotFiniteNumbers.
     """
     where = " ".join(["linear", *map(format_symbol, keys)])
-    y = [np.array(value, np.float64) for value in values]
+    for name, given in (("values", values), ("jacobians", jacobians), ("kinds", kinds or ())):
+        of_type(f"{where}: {name}", given, Collection, "one for each key")
+    y = [all_finite(where, as_numbers(f"{where}: values", value)) for value in values]
     names = _kinds_of(where, y) if kinds is None else list(kinds)
-    b = np.array(residual, np.float64)
+    b = all_finite(where, as_numbers(f"{where}: residual", residual))
     _check_counts(where, keys, len(y), len(jacobians), len(names))
     dims = _checked_dims(where, names, y)
     if b.ndim != 1 or not b.size:
@@ -50,7 +53,7 @@ def linear_pieces(
         return [Factors(*piece[:3], information[None], loss, np.array([scale]) if loss else None)]
     if loss:
         limit = counted(min(dims), "row") if len(keys) <= 2 else "two variables"
-        raise BadLoss(where, repr(loss), f"none: a linear factor of more than {limit} is sent in pieces")
+        raise BadLoss(where, f"the loss {loss!r}", f"none: a linear factor of more than {limit} is sent in pieces")
     root = _root(where, full(triangle, b.size))
     return [Factors(*piece) for piece in as_pieces(names, np.array(keys), y, root @ H, root @ b)]
 
@@ -90,7 +93,7 @@ def _kinds_of(where: str, y: Sequence[F64]) -> list[str]:
 
 
 def _block(where: str, given: ArrayLike, shape: tuple[int, int]) -> F64:
-    block = np.array(given, np.float64)
+    block = all_finite(where, as_numbers(where, given))
     if block.shape != shape:
         raise BadShape(where, f"shape {block.shape}", f"{shape}")
     return block

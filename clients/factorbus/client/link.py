@@ -5,6 +5,7 @@ could keep the interpreter from exiting), so what is passed in here may only han
 """
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,11 +18,12 @@ from factorbus.client.listening import heard
 from factorbus.client.replies import AnswerReply, Failure, Reply, Silence, TimedOut
 from factorbus.proto import keys, redact
 from factorbus.proto.endpoints import checked_endpoint
-from factorbus.proto.problems import BadSetting, ClosedHere, NobodyListens, Unavailable
+from factorbus.proto.problems import BadConfigurationFile, BadSetting, ClosedHere, NobodyListens, Unavailable
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.05, 0.5
 _TIMED_OUT = b"Timeout"
 _DECLARED = 64
+_VARIABLE = "ZENOH_CONFIG"  # which the command line takes for --zenoh
 
 
 class Link:
@@ -182,7 +184,7 @@ def open_session(
     settings: further zenoh configuration, path to value, such as {"transport/auth/usrpwd": {...}}.  file: path of a
     zenoh configuration file that comes before all this.  listening_s: give up after so long, not `timeout_s`, where no
     endpoint has anybody who listens.
-    Raises BadEndpoint and BadSetting at once, Unavailable (NobodyListens) when time is up.
+    Raises BadEndpoint, BadSetting and BadConfigurationFile at once, Unavailable (NobodyListens) when time is up.
     """
     config = _config(endpoints, settings, file)
     start, pause = time.monotonic(), _FIRST_PAUSE_S
@@ -210,7 +212,8 @@ def _config(endpoints: Sequence[str], settings: Mapping[str, Any], file: str) ->
     try:
         config = zenoh.Config.from_file(file) if file else zenoh.Config()
     except zenoh.ZError as error:
-        raise BadSetting(file, redact.reason(error)) from None
+        variable = _VARIABLE if os.environ.get(_VARIABLE) == file else ""
+        raise BadConfigurationFile(file, redact.reason(error), variable) from None
     for path, value in (_settings(endpoints) | dict(settings)).items():
         try:
             config.insert_json5(path, json.dumps(value))

@@ -30,7 +30,7 @@ from factorbus.proto import codec, keys
 from factorbus.proto.asking import Repaired
 from factorbus.proto.limits import REQUEST_LIMITS
 from factorbus.proto.messages import Accepted, Batch, Chi2, Estimate, Insert, MapGraph
-from factorbus.proto.problems import ClosedHere, Problem, Refused, TooLarge, Unavailable
+from factorbus.proto.problems import ClosedHere, NoMirror, Problem, Refused, TooLarge, Unavailable
 from factorbus.wording import counted
 
 SUFFIX_LENGTH = 9  # characters that joining a map adds to the name of a client
@@ -114,7 +114,7 @@ class Map:
     def estimate(self) -> Mirror:
         """The live estimate.  Raises Unavailable for a map opened with mirror=False."""
         if self._mirror is None:
-            raise Unavailable(f"the mirror of map {self.name!r}", 0.0, "open the map with mirror=True")
+            raise NoMirror(self.name)
         return self._mirror
 
     def insert(

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from factorbus.client.arguments import of_type
 from factorbus.client.draft import Draft, batch_of
 from factorbus.client.frames import (
     SPACES,
@@ -121,10 +122,12 @@ def fit_into(
     """
     if absolute not in ABSOLUTE:
         raise CannotMerge(f"absolute is {absolute!r}; wanted one of {', '.join(ABSOLUTE)}")
+    named = of_type("letters", letters or {}, Mapping, 'a mapping of letters, such as {"x": "y"}')
     given = Batch() if anchors is None else batch_of("anchors", anchors)
     size = _size_of(other.batch)
-    renamed = _renamed(other.batch, letters or {})
+    renamed = _renamed(other.batch, named)
     _check_keys(here, renamed)
+    _check_ends(given, here, renamed)
     kept, left_out = (renamed, {}) if absolute == "keep" else _relative(renamed, absolute)
     if absolute == "keep":
         T = np.array([0.0] * size if size == 3 else [0.0] * 6 + [1.0])
@@ -151,6 +154,7 @@ def _size_of(batch: Batch) -> int:
 def _renamed(batch: Batch, letters: Mapping[str, str]) -> Batch:
     """With other letters, and without ids, which are those of another map."""
     codes = {_code(old): _code(new) for old, new in letters.items()}
+    _check_letters(batch, codes)
 
     def rename(keys: I64) -> I64:
         made = keys.copy()
@@ -162,6 +166,21 @@ def _renamed(batch: Batch, letters: Mapping[str, str]) -> Batch:
         tuple(group._replace(keys=rename(group.keys)) for group in batch.variables),
         tuple(group._replace(keys=rename(group.keys), ids=None) for group in batch.factors),
     )
+
+
+def _check_letters(batch: Batch, codes: Mapping[int, int]) -> None:
+    """A letter that no variable has would be a slip that goes by unseen.  Raises CannotMerge."""
+    there = set((_keys(batch.variables) >> 56).tolist())
+    for code in codes:
+        if code not in there:
+            have = ", ".join(sorted(_called(each) for each in there))
+            raise CannotMerge(
+                f"letters renames {_called(code)}, and the other map has no such variables; it has {have}"
+            )
+
+
+def _called(code: int) -> str:
+    return repr(chr(code)) if chr(code).isalpha() else "keys without a letter"
 
 
 def _code(letter: str) -> int:
@@ -176,6 +195,15 @@ def _check_keys(here: Estimate, renamed: Batch) -> None:
     common = np.intersect1d(names, _keys(here.variables))
     if common.size:
         raise KeyCollision(common, "both maps have such variables")
+
+
+def _check_ends(anchors: Batch, here: Estimate, renamed: Batch) -> None:
+    """Every end of an anchor is in one of the maps, or comes with the anchors.  Raises NoAnchor."""
+    known = _keys((*here.variables, *renamed.variables, *anchors.variables))
+    ends = [group.keys.reshape(-1) for group in anchors.factors]
+    missing = np.setdiff1d(np.concatenate([np.empty(0, np.int64), *ends]), known)
+    if missing.size:
+        raise NoAnchor(f"the anchors name {_names(missing)}, which neither this map has nor the other as renamed")
 
 
 def _relative(batch: Batch, absolute: str) -> tuple[Batch, dict[str, int]]:

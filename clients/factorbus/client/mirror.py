@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from numbers import Integral
 from typing import Any
 
-from factorbus.client.arguments import checked_seconds, of_type
+from factorbus.client.arguments import checked_seconds, of_type, seen
 from factorbus.client.following import Following, tables_of
 from factorbus.client.key_numbers import key_number
 from factorbus.client.link import Link
@@ -21,7 +21,7 @@ from factorbus.proto.codec import decode_delta, decode_estimate, encode_keys_ask
 from factorbus.proto.fields import read_map
 from factorbus.proto.limits import ANSWER_LIMITS
 from factorbus.proto.messages import Delta
-from factorbus.proto.problems import BadSymbol, ClosedHere, NotConverged, Unavailable
+from factorbus.proto.problems import BadOption, BadSymbol, ClosedHere, NotConverged, NotHeld, NotReached, Unavailable
 from factorbus.proto.symbols import format_symbol
 
 log = logging.getLogger("factorbus.client")
@@ -64,15 +64,15 @@ class Mirror:
         self._thread = threading.Thread(target=self._run, name=f"factorbus-mirror-{map_name}", daemon=True)
 
     def __getitem__(self, key: str | int) -> F64:
-        """The value of a variable, "x12" or its number: a copy.  Raises KeyError."""
+        """The value of a variable, "x12" or its number: a copy.  Raises NotHeld, a KeyError."""
         try:
             number = key_number(key)
         except BadSymbol as bad:
-            raise KeyError(bad.message) from None
+            raise NotHeld(bad.message) from None
         with self._lock:
             value = self._following.value(number)
         if value is None:
-            raise KeyError(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
+            raise NotHeld(f"{format_symbol(number)} is not in map {self._map!r} at revision {self.revision}")
         return value
 
     def __contains__(self, key: str | int) -> bool:
@@ -117,17 +117,17 @@ class Mirror:
         return time.monotonic() - self._confirmed_at
 
     def stamp(self, key: str | int) -> int | None:
-        """When a variable was, "x12" or its number: the nanoseconds that it came with, or None.  Raises KeyError."""
+        """When a variable was, "x12" or its number: the nanoseconds that it came with, or None.  Raises NotHeld."""
         with self._lock:
             self[key]
             return self._following.stamp(key_number(key))
 
     def columns(self, kind: str) -> tuple[I64, F64]:
-        """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises KeyError."""
+        """(keys (n,), values (n, size)) of all variables of `kind`, ordered by key: copies.  Raises NotHeld."""
         with self._lock:
             columns = self._following.columns_of(kind)
         if columns is None:
-            raise KeyError(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
+            raise NotHeld(f"no variables of kind {kind!r} in map {self._map!r} at revision {self.revision}")
         return columns
 
     def snapshot(self) -> Snapshot:
@@ -136,15 +136,19 @@ class Mirror:
             return Snapshot(self.epoch, self.revision, self._following.columns(), self._following.stamps())
 
     def wait_for(self, revision: int, timeout_s: float | None = None) -> None:
-        """Until the values are of `revision` or later and not stale.  Raises Unavailable, at once on a closed map."""
+        """Until the values are of `revision` or later and not stale.
+
+        Raises Unavailable, at once on a closed map; NotReached, one of these, where only the revision is missing.
+        """
         timeout_s = checked_seconds("timeout_s", timeout_s, self._timeout_s)
         of_type("revision", revision, Integral, "a whole number")
         self._try_wait(lambda: self._there(revision), timeout_s)
         if self._there(revision):
             return
         self._check_open()
-        state = f"{'stale' if self.stale else 'up to date'} at revision {self.revision}"
-        hint = f"the mirror is {state}, {self.age_s:.1f} s after it last heard of the service"
+        if not self.stale:
+            raise NotReached(self._map, revision, self.revision, timeout_s)
+        hint = f"the mirror is stale at revision {self.revision}, {self.age_s:.1f} s after it last heard of the service"
         raise Unavailable(f"map {self._map!r}, waited for at revision {revision},", timeout_s, hint)
 
     def wait_converged(self, timeout_s: float | None = None) -> None:
@@ -168,8 +172,10 @@ class Mirror:
         """Have `callback` called with every delta after it is applied; returns what takes it off again.
 
         It runs on the mirror's thread: while it runs nothing new is applied.  After a resynchronization it gets
-        one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.
+        one delta with `previous` 0 that holds the whole estimate.  A callback that raises is logged.  Raises BadOption.
         """
+        if not callable(callback):
+            raise BadOption("callback", seen(callback), "a function of a delta")
         with self._lock:
             self._callbacks = [*self._callbacks, callback]
         return lambda: self._forget(callback)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, NamedTuple, TypeVar
 
-from factorbus.client.arguments import checked_flag, checked_seconds
+from factorbus.client.arguments import checked_flag, checked_probability, checked_seconds
 from factorbus.client.key_numbers import Key, id_numbers, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
 from factorbus.proto import codec, keys
@@ -69,7 +69,7 @@ class Questions:
     ) -> Future[Repaired]:
         """Which factors are false, and the estimate without them."""
         chosen = None if factors is None else id_numbers("repair", factors)
-        question = encode_ask_repair(AskRepair(chosen, probability, values=True))
+        question = encode_ask_repair(AskRepair(chosen, checked_probability("probability", probability), values=True))
         return self._ask("repair", question, decode_repaired, timeout_s)
 
     def _ask(self, question: str, payload: bytes, decode: Callable[[bytes], T], timeout_s: float | None) -> Future[T]:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factorbus.client.arguments import checked_seconds, of_type
+from factorbus.client.arguments import all_finite, as_numbers, checked_probability, checked_seconds, of_type
 from factorbus.client.draft import Draft
 from factorbus.client.key_numbers import Key, id_numbers, key_number, key_numbers
 from factorbus.client.request_sender import Request, RequestSender
@@ -37,7 +37,7 @@ from factorbus.proto.asking import (
 )
 from factorbus.proto.kinds import FACTOR_KINDS
 from factorbus.proto.messages import Batch, Factors
-from factorbus.proto.problems import BadShape, Unavailable
+from factorbus.proto.problems import BadMessage, BadShape
 from factorbus.wording import counted
 
 T = TypeVar("T")
@@ -62,7 +62,7 @@ class UncertaintyQuestions:
 
     def gate(self, factors: tuple[Factors, ...], probability: float, timeout_s: float | None) -> Future[Gated]:
         """Which candidates are plausible."""
-        question = asking_codec.encode_ask_gate(AskGate(factors, probability))
+        question = asking_codec.encode_ask_gate(AskGate(factors, checked_probability("probability", probability)))
         return self._ask("gate", question, asking_codec.decode_gated, timeout_s)
 
     def gain(self, factors: tuple[Factors, ...], timeout_s: float | None) -> Future[Gained]:
@@ -151,9 +151,11 @@ class Uncertainty:
 
 def paired(pairs: Sequence[tuple[Key, Key]] | tuple[Key, Key]) -> list[Key]:
     """Pairs one after the other; one pair will do.  Raises BadShape."""
+    if isinstance(pairs, str) or not isinstance(pairs, (Sequence, np.ndarray)):
+        raise BadShape("pairs", repr(pairs)[:80], 'pairs of keys, such as [("x1", "x2")]')
     alone = len(pairs) == 2 and not any(isinstance(key, (tuple, list, np.ndarray)) for key in pairs)
     each: list[Any] = [pairs] if alone else list(pairs)
-    if any(isinstance(pair, (str, int)) or len(pair) != 2 for pair in each):
+    if any(isinstance(pair, str) or not isinstance(pair, (Sequence, np.ndarray)) or len(pair) != 2 for pair in each):
         raise BadShape("pairs", repr(pairs)[:80], 'pairs of keys, such as [("x1", "x2")]')
     return [key for pair in each for key in pair]
 
@@ -174,7 +176,7 @@ def factors_of(candidates: Batch | Draft | Sequence[Factors]) -> tuple[Factors, 
 def matrix_of(answer: Covariances) -> F64:
     """The matrix of a joint or cross answer."""
     if answer.covariance is None:
-        raise Unavailable("the joint covariance", 0.0, f"the service answered with blocks {answer.blocks!r}")
+        raise BadMessage("covariance", f"an answer without a matrix, of blocks {answer.blocks!r}", "one matrix")
     return answer.covariance
 
 
@@ -182,9 +184,10 @@ def why_question(key: Key | None, factor: int | None) -> AskWhy:
     """The question.  Raises BadShape unless one of them is given."""
     if (key is None) == (factor is None):
         raise BadShape("why", "both or neither of a key and a factor", "one of them")
-    return AskWhy(
-        None if key is None else key_number(key), None if factor is None else int(id_numbers("why", factor)[0])
-    )
+    ids = None if factor is None else id_numbers("why", factor)
+    if ids is not None and ids.size != 1:
+        raise BadShape("why", counted(ids.size, "factor"), "one factor")
+    return AskWhy(None if key is None else key_number(key), None if ids is None else int(ids[0]))
 
 
 def sightings(
@@ -196,17 +199,17 @@ def sightings(
     probability: float,
 ) -> AskAssociate:
     """The question, with the information of every sighting.  Raises BadShape."""
-    known = FACTOR_KINDS.get(kind)
+    known = FACTOR_KINDS.get(kind) if isinstance(kind, str) else None
     if known is None:
         raise BadShape("kind", repr(kind), "landmark_se2, landmark_se3 or bearing_range_se2")
-    rows = np.atleast_2d(np.asarray(measured, float))
+    rows = np.atleast_2d(all_finite("measured", as_numbers("measured", measured)))
     if rows.shape[1] != known.size:
         raise BadShape("measured", " × ".join(map(str, rows.shape)), f"n × {known.size}")
-    weights: Any = np.asarray(information, float)
+    weights = as_numbers("information", information)
     if weights.shape == (known.dim, known.dim):
         weights = weights[np.triu_indices(known.dim)]
     if weights.shape not in ((known.information_size,), (len(rows), known.information_size)):
         raise BadShape("information", " × ".join(map(str, weights.shape)), f"{known.dim} × {known.dim}")
     weights = np.broadcast_to(weights, (len(rows), known.information_size))
     chosen = None if landmarks is None else key_numbers(landmarks)
-    return AskAssociate(key_number(pose), kind, rows, weights, chosen, probability)
+    return AskAssociate(key_number(pose), kind, rows, weights, chosen, checked_probability("probability", probability))

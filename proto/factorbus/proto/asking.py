@@ -9,7 +9,8 @@ from typing import Any
 
 from factorbus.proto.arrays import F64, I64
 from factorbus.proto.messages import Factors, Variables
-from factorbus.proto.symbols import parse_symbol
+from factorbus.proto.problems import NotHeld
+from factorbus.proto.symbols import format_symbol, parse_symbol
 from factorbus.proto.why_text import why_symbols, why_text
 
 BLOCKS = ("diagonal", "joint", "cross", "relative", "last")
@@ -59,12 +60,12 @@ class Covariances:
     covariance: F64 | None = None
 
     def __getitem__(self, key: int | str) -> F64:
-        """The covariance (d, d) of one variable, such as "x12", of a diagonal.  Raises KeyError."""
+        """The covariance (d, d) of one variable, such as "x12", of a diagonal.  Raises NotHeld, a KeyError."""
         key = parse_symbol(key) if isinstance(key, str) else key
         for group in self.groups:
             if group.keys.ndim == 1 and (rows := (group.keys == key).nonzero()[0]).size:
                 return group.covariance[rows[0]]
-        raise KeyError(key)
+        raise NotHeld(f"the answer has no covariance of {format_symbol(key)}; ask for it by its key")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,9 @@
     ├── BadName              bad_name             a map, client or worker name outside [A-Za-z0-9_-]{1,64}
     ├── BadEndpoint          bad_endpoint         an address on the bus that cannot be read
     ├── BadSetting           bad_setting          a setting of the connection that the bus does not take
+    ├── BadConfigurationFile bad_file             a zenoh configuration file that cannot be read (client side)
     ├── BadShape             bad_shape            numbers whose count does not fit their kind (client side)
+    ├── NotFiniteNumbers     not_finite           a NaN or an infinity among numbers for a map (client side)
     ├── BadInformation       bad_information      an asymmetric information matrix, sigmas that are not positive
     ├── BadMessage           bad_message          bytes that are not the message they should be
     │   ├── UnknownKind      unknown_kind         a kind of variable, factor or change that this version does not know
@@ -15,12 +17,15 @@
     ├── BadSequence          bad_sequence         a sequence number that skips or is too old to answer again
     ├── WrongEpoch           wrong_epoch          the map was restarted or recreated since the client joined
     ├── UnknownMap           unknown_map          no such map here
+    ├── NotHeld              unknown_variable     a mirror or an answer has no such variable (client side)
     ├── UnknownQuestion      unknown_question     no such question or operation
     ├── Busy                 busy                 the inbox is full: try again after `retry_after_s`
     ├── ShuttingDown         shutting_down        the service is stopping and takes nothing new
     ├── Unavailable          unavailable          nobody answered (client side)
     │   ├── NobodyListens    unavailable          there is nothing at that address
-    │   └── ClosedHere       unavailable          this client itself has closed the connection, or left the map
+    │   ├── ClosedHere       unavailable          this client itself has closed the connection, or left the map
+    │   ├── NoMirror         unavailable          the estimate of a map that was opened without a mirror
+    │   └── NotReached       unavailable          a revision was waited for that has not come
     ├── NotConverged         not_converged        a map was waited for in vain (client side)
     ├── BetterOptimum        better_optimum       no refusal: a notice in an answer, that the map is in a worse minimum
     ├── OtherProtocol        other_protocol       only services of another major version are there (client side)
@@ -104,10 +109,28 @@ class BadSetting(Problem):
         super().__init__(f"setting {path!r}: {reason}; wanted {wanted}", seen=path, wanted=wanted)
 
 
+class BadConfigurationFile(Problem):
+    """A zenoh configuration file.  from_environment: the variable that names it; empty: an argument or option did."""
+
+    code = "bad_file"
+
+    def __init__(self, file: str, reason: str, from_environment: str = "") -> None:
+        named = f", which {from_environment} names," if from_environment else ""
+        super().__init__(f"the zenoh configuration {file}{named} cannot be read: {reason}", path=file)
+
+
 class BadShape(Problem):
     code = "bad_shape"
 
     def __init__(self, where: str, seen: object, wanted: str) -> None:
+        super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
+
+
+class NotFiniteNumbers(Problem):
+    code = "not_finite"
+
+    def __init__(self, where: str, seen: object) -> None:
+        wanted = "finite numbers"
         super().__init__(f"{where}: {seen}; wanted {wanted}", where=where, seen=str(seen), wanted=wanted)
 
 
@@ -127,9 +150,6 @@ class BadMessage(Problem):
 
 class BadLoss(BadMessage):
     code = "bad_loss"
-
-    def __init__(self, where: str, seen: object, wanted: str) -> None:
-        super().__init__(where, f"of the loss seen {seen}", wanted)
 
 
 class BadOption(BadMessage):
@@ -187,6 +207,15 @@ class UnknownMap(Problem):
         super().__init__(f"there is no map {name!r} here; {there}", map=name, known=sorted(known))
 
 
+class NotHeld(Problem, KeyError):
+    """What is looked up in a mirror or an answer is not in it: as of any mapping of Python's, a KeyError."""
+
+    code = "unknown_variable"
+
+    def __str__(self) -> str:
+        return self.message  # a KeyError shows its quotes
+
+
 class UnknownQuestion(Problem):
     code = "unknown_question"
 
@@ -201,9 +230,10 @@ class SeveralRobots(Problem):
 
     def __init__(self, robot: str | None, robots: tuple[str, ...]) -> None:
         there = ", ".join(letter or "keys without a letter" for letter in robots) or "no pose"
+        verb = "is" if len(robots) < 2 and robots != ("",) else "are"
         asked = "none was chosen" if robot is None else f"none is {robot[:8]!r}"
         super().__init__(
-            f"a trajectory is one robot's; there are {there}, and {asked}: name one (robot, --robot)",
+            f"a trajectory is one robot's; there {verb} {there}, and {asked}: name one (robot, --robot)",
             robots=list(robots),
         )
 
@@ -247,6 +277,27 @@ class ClosedHere(Unavailable):
         """connection: all of it is closed, and not only the map."""
         closed = "this connection is closed; connect again" if connection else "it was closed here; open it again"
         Problem.__init__(self, f"{what.rstrip(',')}: {closed}", waited_s=0.0)
+
+
+class NoMirror(Unavailable):
+    """There is no local copy to read: the map was opened without."""
+
+    def __init__(self, name: str) -> None:
+        Problem.__init__(self, f"map {name!r} was opened without a mirror; open it with mirror=True", waited_s=0.0)
+
+
+class NotReached(Unavailable):
+    """The service is there, and the mirror up to date, but not at the revision that was waited for."""
+
+    def __init__(self, name: str, wanted: int, revision: int, waited_s: float) -> None:
+        Problem.__init__(
+            self,
+            f"map {name!r} is at revision {revision}, and has not reached {wanted} within {waited_s:g} s; "
+            "wait for the revision of an Accepted, or wait longer",
+            revision=revision,
+            waited_for=wanted,
+            waited_s=waited_s,
+        )
 
 
 class BetterOptimum(Problem):

@@ -3,6 +3,8 @@
 key = letter << 56 | index,   letter: 0 (none) or an ASCII letter,   0 <= index < 2^56
 """
 
+import operator
+
 from factorbus.proto.problems import BadSymbol
 
 _INDEX_BITS = 56
@@ -13,11 +15,11 @@ _MOST_SHOWN = 80
 
 def symbol(letter: str, index: int) -> int:
     """The key of `letter` and `index`: symbol("x", 12) prints as x12.  Raises BadSymbol."""
-    if len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
+    if not isinstance(letter, str) or len(letter) > 1 or (letter and not (letter.isascii() and letter.isalpha())):
         raise BadSymbol(f"{letter}{index}", "one ASCII letter")
-    if not 0 <= index <= MAX_INDEX:
+    if not hasattr(index, "__index__") or not 0 <= operator.index(index) <= MAX_INDEX:
         raise BadSymbol(f"{letter}{index}", f"an index from 0 to {MAX_INDEX}")
-    return (ord(letter) << _INDEX_BITS if letter else 0) | index
+    return (ord(letter) << _INDEX_BITS if letter else 0) | operator.index(index)
 
 
 def parse_symbol(text: str) -> int:

@@ -168,11 +168,11 @@ class NotFinite(SolverError):
 class OutOfBounds(SolverError):
     code = "out_of_bounds"
 
-    def __init__(self, where: str, seen: float, least: float, most: float) -> None:
+    def __init__(self, where: str, seen: float, least: float, most: float, advice: str) -> None:
         wanted = f"at most {most:g} in magnitude" if least <= 0.0 else f"{least:g} to {most:g}"
         super().__init__(
             f"{where} is {seen:.6g}, wanted {wanted}: beyond that its squares are lost to rounding, or overflow; "
-            "choose units and an origin near the data, or a larger sigma",
+            f"{advice}",
             where=where,
             seen=f"{seen:.6g}",
             wanted=wanted,

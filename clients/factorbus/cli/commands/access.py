@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import USAGE, Stopped, input_file
+from factorbus.cli.output.exits import USAGE, Stopped, input_file, output_file
 from factorbus.cli.process.options import file_argument, out_option
 
 
@@ -102,7 +102,7 @@ def _write(text: str, out: Path | None, secret: bool) -> None:
     if out is None:
         click.echo(text, nl=False)
         return
-    with input_file(out), os.fdopen(os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+    with output_file(out), os.fdopen(os.open(out, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         os.fchmod(file.fileno(), 0o600 if secret else 0o644)
         file.write(text)
     click.echo(f"{out} written", err=True)

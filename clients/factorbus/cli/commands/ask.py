@@ -44,10 +44,10 @@ _probability = click.option(
 @command.command("covariance")
 @asks_map
 @click.argument("keys", nargs=-1)
-@click.option("--joint", "blocks", flag_value="joint", help="Of all KEYS together, one matrix.")
-@click.option("--relative", "blocks", flag_value="relative", help="Of the second as seen from the first, pair by pair.")
-@click.option("--last", "blocks", flag_value="last", help="Of the pose that was inserted last.")
-def covariance_command(address: MapAddress, keys: tuple[str, ...], blocks: str | None, as_json: bool) -> int:
+@click.option("--joint", is_flag=True, help="Of all KEYS together, one matrix.")
+@click.option("--relative", is_flag=True, help="Of the second as seen from the first, pair by pair.")
+@click.option("--last", is_flag=True, help="Of the pose that was inserted last.")
+def covariance_command(address: MapAddress, keys: tuple[str, ...], as_json: bool, **asked: bool) -> int:
     """How certain the variables KEYS are, or all of them: standard deviations in their own frames, metres and radians.
 
     \b
@@ -59,11 +59,18 @@ def covariance_command(address: MapAddress, keys: tuple[str, ...], blocks: str |
 
     from factorbus.proto.symbols import format_symbol
 
+    chosen = [name for name in ("joint", "relative", "last") if asked[name]]
+    if len(chosen) > 1:
+        raise click.UsageError(f"{' and '.join(f'--{name}' for name in chosen)} exclude each other")
+    blocks = chosen[0] if chosen else None
+    if blocks == "last" and keys:
+        raise click.UsageError(f"--last is of the pose inserted last: it takes no KEYS, and got {' '.join(keys)}")
     if blocks in ("joint", "relative") and not keys:
         raise click.UsageError(f"--{blocks} needs KEYS")
     if blocks == "relative" and len(keys) % 2:
+        verb = "is" if len(keys) == 1 else "are"
         raise click.UsageError(
-            f"--relative wants KEYS in pairs, such as x12 x300; there is {counted(len(keys), 'key')}"
+            f"--relative wants KEYS in pairs, such as x12 x300; there {verb} {counted(len(keys), 'key')}"
         )
     with _map(address) as joined:
         found = joined.uncertainty.ask.covariance(blocks or "diagonal", keys or None, None, address.timeout_s).result()
@@ -150,9 +157,9 @@ def gain_command(address: MapAddress, candidates: Path, as_json: bool) -> int:
 @command.command("why")
 @asks_map
 @click.argument("what")
-@click.option("--variable", "only", flag_value="variable", help="WHAT is a variable: of a key without a letter, 7.")
-@click.option("--factor", "only", flag_value="factor", help="WHAT is the id of a factor.")
-def why_command(address: MapAddress, what: str, only: str | None, as_json: bool) -> int:
+@click.option("--variable", is_flag=True, help="WHAT is a variable: of a key without a letter, 7.")
+@click.option("--factor", is_flag=True, help="WHAT is the id of a factor.")
+def why_command(address: MapAddress, what: str, variable: bool, factor: bool, as_json: bool) -> int:
     """What holds the variable WHAT (x12), or what the factor with the id WHAT (17) does; why the last step was made so.
 
     Residuals and χ² are at the estimate. The leverage of a factor is the trace of its part of the hat matrix,
@@ -170,6 +177,9 @@ def why_command(address: MapAddress, what: str, only: str | None, as_json: bool)
     factorbus ask why warehouse 17 --json
     factorbus ask why warehouse 7 --variable
     """
+    if variable and factor:
+        raise click.UsageError("--variable and --factor exclude each other")
+    only = "variable" if variable else "factor" if factor else None
     if only == "factor" and not what.isdecimal():
         raise click.UsageError(f"--factor wants an id, a whole number; {what!r} is the key of a variable")
     with _map(address) as joined:
@@ -239,7 +249,8 @@ def chi2_command(address: MapAddress, batch: bool, as_json: bool) -> int:
         if found.batch is not None:
             content |= {"batch": found.batch, "start": found.start, "worker": found.worker, "seconds": found.seconds}
             content["batch_converged"] = found.batch_converged
-            content["better_optimum"] = None if found.notice is None else found.notice.message
+            content["better_optimum"] = found.notice is not None
+            content["notice"] = None if found.notice is None else found.notice.message
         document(content)
         return OK
     rows = [("χ²", f"{found.chi2:.9g}")]
@@ -279,6 +290,8 @@ def repair_command(
     """
     from factorbus.client import Changes
 
+    if loss and not applied:
+        raise click.UsageError("--loss says what --apply does with what is false; give --apply too")
     with _map(address) as joined:
         found = joined.repair(factors or None, probability=probability, timeout_s=address.timeout_s)
         if applied and found.factors.size:

@@ -17,7 +17,7 @@ ASKED = ("ask", "digest")  # a minute or two; on request
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("name", type=click.Choice([*BENCHES, *ASKED, *LONG, "all"]), default="all")
+@click.argument("name", type=click.Choice([*BENCHES, *ASKED, *LONG, "all"]))
 @click.argument("options", nargs=-1, type=click.UNPROCESSED)
 @json_option
 def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
@@ -44,7 +44,7 @@ def command(name: str, options: tuple[str, ...], as_json: bool) -> int:
     soak       a million inserts from 8 clients that are killed and come back: lost, twice, memory, p99;
                --inserts, --minutes
     digest     the account of every step and the bits of every estimate, as digests; --out FOLDER, --against FOLDER
-    all        cholesky, bus, idp, ros2 and journal
+    all        cholesky, bus, idp, ros2 and journal: some minutes
 
     The benchmarks are in the repository (tests/bench), not in the wheel: they compare with other libraries and read
     the public data sets (FACTORBUS_DATASETS). Further OPTIONS go to the benchmark: factorbus bench bus --help.

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from factorbus.cli.output.exits import output_file
 from factorbus.cli.process.options import file_argument, json_option
 from factorbus.cli.process.reading import COUNTED, IDS, read_graph, reading_options, robot_option, say
 from factorbus.wording import counted
@@ -24,13 +25,12 @@ _WRITES = (*_GRAPHS, ".tum", ".kitti")
 @click.option(
     "--ids",
     type=click.Choice(IDS),
-    default="auto",
-    show_default=True,
-    help="Of a .g2o: auto, as in SOURCE; ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...",
+    help="Of a .g2o: auto, as in SOURCE; ids, without letters; keys, as GTSAM packs symbols; counted, 0 1 2 ...  "
+    "[default: auto]",
 )
 @json_option
 def command(
-    source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str, as_json: bool
+    source: Path, target: Path, dialect: str | None, strict: bool, robot: str | None, ids: str | None, as_json: bool
 ) -> None:
     """Read SOURCE (g2o, TORO .graph, iSAM, SLAM++, PyFactorGraph .pyfg or TUM text) and write TARGET (.g2o, .pyfg, .tum
     or .kitti, by its ending).
@@ -49,15 +49,18 @@ def command(
         raise click.BadParameter(
             f"{target} does not end in {' or '.join((', '.join(_WRITES[:-1]), _WRITES[-1]))}", param_hint="TARGET"
         )
+    if ids is not None and target.suffix == ".pyfg":
+        raise click.UsageError("--ids is of a .g2o: a .pyfg has the names of the keys")
+    if ids is not None and target.suffix != ".g2o":
+        raise click.UsageError("--ids is of a .g2o: a trajectory has times instead")
     if robot is not None and target.suffix in _GRAPHS:
         raise click.UsageError(f"--robot is of trajectories: a {target.suffix} has the whole graph")
-    if ids != "auto" and target.suffix == ".pyfg":
-        raise click.UsageError("--ids is of a .g2o: a .pyfg has the names of the keys")
     from factorbus.cli.output.console import document, print_note
 
     graph = read_graph(source, dialect, strict, whole=True)
     _check_any(graph, target)
-    files, notes, counts = _written(graph, target, strict, robot, ids)
+    with output_file(target):
+        files, notes, counts = _written(graph, target, strict, robot, ids or "auto")
     say(target, notes)
     if as_json:
         about = {"source": str(source), "read": graph.account(whole=True), "files": [str(file) for file in files]}

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import require
+from factorbus.cli.output.exits import output_file, require
 from factorbus.cli.output.starts import NOT_CONVERGED, optimum_from
 from factorbus.cli.process.options import WORLDS, json_option, out_option
 from factorbus.wording import counted
@@ -138,7 +138,10 @@ def run_demo(request: DemoRequest) -> dict[str, Any]:
         f"{counted(result['poses'], 'pose')}, χ² {result['chi2']:.6g}, {_metres(result['error_m'])} from the truth"
     )
     history = history_of(reports, compared)
-    draw(request.plot, world.batches, estimate, history, f"{request.world}, as the bus saw it", subtitle, world.truth)
+    with output_file(request.plot):
+        draw(
+            request.plot, world.batches, estimate, history, f"{request.world}, as the bus saw it", subtitle, world.truth
+        )
     return result
 
 
@@ -149,7 +152,8 @@ def _write(request: DemoRequest, estimate: Any, truth: Any) -> None:
 
     for path, variables in ((request.tum, estimate), (request.truth, truth)):
         if path:
-            write_tum(path, Batch(tuple(variables)))
+            with output_file(path):
+                write_tum(path, Batch(tuple(variables)))
 
 
 def _look_on(request: DemoRequest, solver: Any, robot: Any, viewer: Any) -> None:

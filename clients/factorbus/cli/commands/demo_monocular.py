@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import require
+from factorbus.cli.output.exits import output_file, require
 from factorbus.cli.process.options import Number, json_option, out_option
 from factorbus.wording import counted
 
@@ -92,9 +92,9 @@ def run_monocular_demo(
     truth = [frame.pose[:3] for frame in world]
     result = {**verdict(seen, evaluator), "points": points, "seed": seed, "workers": workers, "plot": str(plot)}
     shares = [history.share for _, history in evaluator.ended]
-    save_monocular_drive(
-        plot, [(f.number, f.position, f.rays, f.spread) for f in seen], truth, world.points, shares, _said(result)
-    )
+    frames = [(f.number, f.position, f.rays, f.spread) for f in seen]
+    with output_file(plot):
+        save_monocular_drive(plot, frames, truth, world.points, shares, _said(result))
     return result
 
 

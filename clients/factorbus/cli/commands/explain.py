@@ -13,7 +13,10 @@ from factorbus.cli.output.exits import USAGE, Stopped
 _PAGES = Path(__file__).parents[1] / "codes.md"
 # Exceptions whose code is not their name in another spelling.
 _CODES = {
-    "apart": "not_positive_definite", "broken": "internal", "dataset_problem": "problem", "format_error": "bad_file",
+    "apart": "not_positive_definite", "bad_configuration_file": "bad_file", "broken": "internal",
+    "closed_here": "unavailable", "no_mirror": "unavailable", "not_finite_numbers": "not_finite",
+    "not_held": "unknown_variable", "not_reached": "unavailable",
+    "dataset_problem": "problem", "format_error": "bad_file",
     "map_there": "map_exists", "no_pose": "unknown_variable", "nobody_listens": "unavailable",
     "not_here": "unknown_map", "missing_variables": "unknown_variable",
     "not_in_map": "unknown_variable", "solver_error": "problem",

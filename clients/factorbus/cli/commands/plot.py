@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import click
 
-from factorbus.cli.output.exits import require
+from factorbus.cli.output.exits import output_file, require
 from factorbus.cli.process.options import ellipses_option, mode_option, out_option, zenoh_option
 from factorbus.cli.process.reading import reading_options
 from factorbus.wording import counted
@@ -68,11 +68,12 @@ def map_command(
     from factorbus.cli.driving.plot_source import graph_of, solved, spread_in, with_values
     from factorbus.viz import DriveHistory
 
-    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     drawn = solved(drawn, on_file=connect is None) if solve else with_values(drawn)
     path = drawn.file("map", out)
     spread = spread_in(drawn, connect, ellipses, zenoh) if ellipses else None
-    draw(path, [drawn.unsolved()], drawn.graph.variables, DriveHistory(), drawn.name, drawn.about, spread=spread)
+    with output_file(path):
+        draw(path, [drawn.unsolved()], drawn.graph.variables, DriveHistory(), drawn.name, drawn.about, spread=spread)
     click.echo(path)
 
 
@@ -98,7 +99,7 @@ def drive_command(
     from factorbus.cli.driving.plot_source import file_named
 
     require("service", "factorbus plot drive")
-    file = _ready(lambda: file_named(source, dialect, strict), out)
+    file = _ready(lambda: file_named(source, dialect, strict))
     from factorbus.cli.driving.drive import insert_steps
     from factorbus.cli.driving.local import LocalMap
     from factorbus.cli.driving.picture import history_of
@@ -117,7 +118,8 @@ def drive_command(
     figure = drive_figure(
         history_of(reports, target.compared()), [report["strategy"] for report in reports], name, about
     )
-    save(figure, path, name)
+    with output_file(path):
+        save(figure, path, name)
     click.echo(path)
 
 
@@ -135,12 +137,13 @@ def sparsity_command(
     from factorbus.cli.driving.plot_source import graph_of
 
     require("service", "factorbus plot sparsity")
-    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     from factorbus.cli.output.sparsity import pattern_of
     from factorbus.viz import save, sparsity_figure
 
     path = drawn.file("sparsity", out)
-    save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
+    with output_file(path):
+        save(sparsity_figure(pattern_of(drawn.graph), drawn.name), path, drawn.name)
     click.echo(path)
 
 
@@ -158,21 +161,18 @@ def tree_command(
     from factorbus.cli.driving.plot_source import graph_of
 
     require("service", "factorbus plot tree")
-    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict), out)
+    drawn = _ready(lambda: graph_of(source, connect, zenoh, dialect, strict))
     from factorbus.cli.output.sparsity import last_loop, pattern_of
     from factorbus.viz import save, tree_figure
 
     path = drawn.file("tree", out)
     pattern = pattern_of(drawn.graph)
-    save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
+    with output_file(path):
+        save(tree_figure(pattern, last_loop(drawn.graph, pattern), drawn.name), path, drawn.name)
     click.echo(path)
 
 
-def _ready(load: Callable[[], Any], out: Path | None) -> Any:
-    """What `load` gives, once it is known that a picture can be drawn where it is to go."""
+def _ready(load: Callable[[], Any]) -> Any:
+    """What `load` gives, once it is known that a picture can be drawn."""
     require("viz", "factorbus plot")
-    from factorbus.viz import checked_ending
-
-    if out is not None:
-        checked_ending(out)
     return load()

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, require
+from factorbus.cli.output.exits import REFUSED, Stopped, missing_modules, output_file, require
 from factorbus.cli.output.starts import optimum_from, ratio_to
 from factorbus.cli.process.options import (
     SECONDS,
@@ -24,6 +24,7 @@ from factorbus.cli.process.reading import COUNTED, read_graph, reading_options
 from factorbus.wording import counted
 
 _ANSWER_S, _LISTENING_S = 10.0, 1.0
+_SHOWN = 5  # of what is fixed
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class ReplayRequest:
 @click.option("--pace", type=Number(0, min_open=True), metavar="HZ", help="Inserts a second, at most.")
 @out_option("--tum", "tum", "Write the trajectory in TUM form (evo reads it).", "FILE")
 @out_option("--kitti", "kitti", "Write the trajectory in KITTI form.", "FILE")
-@out_option("--out", "out", "Write the estimate and the factors as g2o or pyfg, by the ending.", "FILE.g2o")
+@out_option("--out", "out", "Write the estimate and the factors as g2o or pyfg, by the ending.", "FILE.g2o|.pyfg")
 @out_option("--plot", "plot", "Draw odometry, estimate and loop closures.", "FILE.png")
 @reading_options
 @json_option
@@ -109,7 +110,8 @@ def command(as_json: bool, **asked: Any) -> None:
     """Drive FILE (g2o, TORO, iSAM, SLAM++, PyFactorGraph, or the name of a data set) through a map, pose by pose.
 
     Each step is one insert: a new pose, its odometry edge, and its edges to what is already there. The estimate is
-    there after every step. Without --in-process or --connect it starts a solver process and talks to it over the bus.
+    there after every step. What FILE fixes holds the map in place, or its priors; without either the pose of the lowest
+    key is held. Without --in-process or --connect it starts a solver process and talks to it over the bus.
 
     \b
     factorbus replay intel
@@ -134,8 +136,6 @@ def command(as_json: bool, **asked: Any) -> None:
         raise click.UsageError("--in-process and --connect exclude each other: the solver is here or it is there")
     if request.in_process and request.live:
         raise click.UsageError("--in-process and --live exclude each other: the page looks at a map on the bus")
-    if request.out is not None and request.out.suffix not in (".g2o", ".pyfg"):
-        raise click.BadParameter(f"{request.out} does not end in .g2o or .pyfg", param_hint="--out")
     from factorbus.cli.output import console as screen
 
     def report(result: dict[str, Any]) -> None:
@@ -155,9 +155,6 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
 
     if request.plot:
         require("viz", "--plot")
-        from factorbus.viz import checked_ending
-
-        checked_ending(request.plot)
     if request.live:
         require("gateway", "--live")
     request = replace(request, file=source_of(request.file))
@@ -174,7 +171,8 @@ def replay(request: ReplayRequest, report: Callable[[dict[str, Any]], None] = la
             last, adopted = _adopt(request, target, last)
         written = _write(request, target, graph.numbering)
         if request.plot:
-            _draw(request.plot, request.file.name, driven, target, steps)
+            with output_file(request.plot):
+                _draw(request.plot, request.file.name, driven, target, steps)
         result = _document(request, driven, target, steps, last, unsettled, before)
         result |= {"read": graph.account(), "written": [str(file) for file in written], "adopted": adopted}
         report(result)
@@ -210,6 +208,7 @@ def _document(
         "chi2": last.report["chi2"] if request.settle else unsettled,
         "chi2_unsettled": unsettled,
         "chi2_initial": _chi2_initial(steps),
+        "fixed": _fixed(steps),
         "settled": bool(request.settle and last.report["converged"]),
         "settle_iterations": last.report["iterations"] if request.settle else 0,
         "solver_cpu_s": after["solver_cpu_s"] - before["solver_cpu_s"],
@@ -302,15 +301,17 @@ def _write(request: ReplayRequest, target: Any, numbering: str) -> list[Path]:
     if request.out:
         ids = numbering if numbering != "ids" else "auto"
         graph, strict = target.graph(), request.strict
-        is_g2o = request.out.suffix == ".g2o"
-        say(
-            request.out,
-            write_g2o(request.out, graph, strict, ids) if is_g2o else write_pyfg(request.out, graph, strict),
-        )
+        with output_file(request.out):
+            if request.out.suffix == ".g2o":
+                notes = write_g2o(request.out, graph, strict, ids)
+            else:
+                notes = write_pyfg(request.out, graph, strict)
+        say(request.out, notes)
         files.append(request.out)
     for path, write in ((request.tum, write_tum), (request.kitti, write_kitti)):
         if path:
-            robots = write(path, Batch(target.estimate()))
+            with output_file(path):
+                robots = write(path, Batch(target.estimate()))
             if robots != [path]:
                 print_note(f"{path}: one file for each robot: {', '.join(map(str, robots))}")
             files += robots
@@ -324,6 +325,14 @@ def _draw(path: Path, title: str, driven: Any, target: Any, steps: Any) -> None:
     draw(path, steps, target.estimate(), history_of(reports, target.compared()), title)
 
 
+def _fixed(steps: Any) -> list[str]:
+    """The variables that the map is held by."""
+    from factorbus.proto.symbols import format_symbol
+
+    groups = [group for batch in steps for group in batch.variables if group.fixed]
+    return [format_symbol(key) for group in groups for key in group.keys.tolist()]
+
+
 def _chi2_initial(steps: Any) -> float | None:
     """χ² before any step, by the solver; None in a light client, which has none."""
     if missing_modules("service"):
@@ -331,6 +340,11 @@ def _chi2_initial(steps: Any) -> float | None:
     from factorbus.cli.driving.local import chi2_unsolved
 
     return chi2_unsolved(steps)
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
 
 
 def _size(result: dict[str, Any]) -> str:
@@ -344,6 +358,7 @@ def _rows(result: dict[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{result['seconds']:.2f} s, {result['poses_per_s']:.0f} poses/s"),
         ("solver CPU", f"{result['solver_cpu_s']:.2f} s"),
         ("step", _times(step)),
+        ("fixed", _listed(result["fixed"]) or "nothing: the file's priors hold it"),
     ]
     if bus:
         rows.append(("bus", _times(bus)))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from factorbus.cli.output.exits import REFUSED, Stopped
+from factorbus.cli.output.exits import REFUSED, Stopped, output_file
 from factorbus.cli.process.options import checked_output, connect_option, timeout_option, zenoh_option
 from factorbus.cli.process.reading import IDS
 
@@ -74,16 +74,18 @@ def _robots(joined: "Map", robot: str | None) -> list[str]:
         return there
     if robot not in there:
         told = ", ".join(letter or "keys without a letter" for letter in there) or "no pose"
-        raise Stopped("several_robots", f"map {joined.name!r} has no robot {robot!r}; there is {told}", REFUSED)
+        verb = "is" if len(there) < 2 and there != [""] else "are"
+        raise Stopped("several_robots", f"map {joined.name!r} has no robot {robot!r}; there {verb} {told}", REFUSED)
     return [robot]
 
 
 def _write(path: Path, text: str) -> None:
     """Whole or not at all.  Raises Stopped."""
     beside = path.with_name(f".{path.name}.part")
-    try:
-        beside.write_text(text, encoding="utf-8")
-        beside.replace(path)
-    except OSError as error:
-        beside.unlink(missing_ok=True)
-        raise Stopped("cannot_write", f"{path} cannot be written: {error.strerror}", path=str(path)) from error
+    with output_file(path):
+        try:
+            beside.write_text(text, encoding="utf-8")
+            beside.replace(path)
+        except OSError:
+            beside.unlink(missing_ok=True)
+            raise

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from factorbus.cli.output.exits import output_file
 from factorbus.cli.process.options import WORLDS, out_option
 from factorbus.wording import counted
 
@@ -48,10 +49,13 @@ def command(world: str, poses: int, seed: int, out: Path | None, truth: Path | N
                 show(number, "")
     if out:
         graph = merged(batches)
-        say(out, write_g2o(out, graph, ids="counted"))  # what every program reads
+        with output_file(out):
+            notes = write_g2o(out, graph, ids="counted")  # what every program reads
+        say(out, notes)
         screen.print_note(f"{out}: {counted(poses, 'pose')}, {counted(graph.factor_count, 'factor')}")
     if truth:
-        write_tum(truth, merged(truths))
+        with output_file(truth):
+            write_tum(truth, merged(truths))
         screen.print_note(f"{truth}: {counted(poses, 'pose')}, as they are")
 
 

@@ -1,9 +1,13 @@
 """`factorbus warm`: compile every kernel ahead, so that no robot waits for it."""
 
+import os
+import tempfile
+from pathlib import Path
+
 import click
 
 from factorbus.cli.output.console import print_note
-from factorbus.cli.output.exits import require
+from factorbus.cli.output.exits import Stopped, require
 
 
 @click.command()
@@ -17,7 +21,23 @@ def command() -> None:
     factorbus warm
     """
     require("service", "factorbus warm")
+    _check_cache()
     from factorbus.service.operations.warm import seconds_compiling, warm_service
 
     seconds = warm_service(lambda kernel: print_note(f"  compiling {kernel}"))
     click.echo(f"kernels ready in {seconds:.1f} s, {seconds_compiling():.1f} s of it compiling")
+
+
+def _check_cache() -> None:
+    """Kernels that cannot be kept would be compiled for nothing.  Raises Stopped."""
+    base = Path(os.environ.get("FACTORBUS_CACHE") or Path.home() / ".cache" / "factorbus").expanduser()
+    try:
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=base).close()
+    except OSError as error:
+        raise Stopped(
+            "cannot_write",
+            f"compiled kernels cannot be kept in {base}: {error.strerror}; name a folder that can be written with "
+            "FACTORBUS_CACHE, or make this one so",
+            path=str(base),
+        ) from error

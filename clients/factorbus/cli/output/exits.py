@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.installing import install_command
+from factorbus.proto.problems import Refused
 
 OK, FAILED, USAGE, BAD_FILE, UNAVAILABLE, REFUSED, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
 
@@ -20,7 +21,7 @@ EXIT_CODES = {
     USAGE: "wrong use: an option, a name or an endpoint that cannot be",
     BAD_FILE: "an input file that cannot be read, or is not what it should be",
     UNAVAILABLE: "nobody answered: on the bus, or where a data set is fetched from",
-    REFUSED: "the service or the solver refused the input",
+    REFUSED: "refused, by the service, the solver or the command: the message says what, and why",
     INTERRUPTED: "interrupted",
 }
 
@@ -36,9 +37,11 @@ EXTRAS = {
 }
 
 _USAGE_CODES = (
-    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_ros_name", "bad_setting",
+    "bad_name", "bad_symbol", "bad_config", "bad_endpoint", "bad_option", "bad_picture", "bad_ros_name", "bad_setting",
     "cannot_listen", "exposed", "port_taken",
 )  # fmt: skip
+# Of what was typed, where the command itself finds it; a service says the same of what is in a file.
+_TYPED_CODES = ("bad_information", "bad_loss", "bad_shape", "not_finite")
 _UNAVAILABLE_CODES = ("unavailable", "shutting_down", "other_protocol")
 
 
@@ -76,6 +79,15 @@ def input_file(path: Path) -> Iterator[None]:
         raise Stopped("bad_file", f"{path} cannot be read: {error.strerror}", BAD_FILE, path=str(path)) from error
 
 
+@contextmanager
+def output_file(path: Path) -> Iterator[None]:
+    """Says of what goes wrong in writing `path` which file it was, and why.  Raises Stopped."""
+    try:
+        yield
+    except OSError as error:
+        raise Stopped("cannot_write", f"{path} cannot be written: {error.strerror}", path=str(path)) from error
+
+
 def require(extra: str, what: str) -> None:
     """`what` needs the libraries of `extra`; said before the work begins, and with the command that installs them.
 
@@ -101,7 +113,7 @@ def _exit_code(error: Exception, code: str) -> int:
         return FAILED
     if code == "bad_file":
         return BAD_FILE
-    if code in _USAGE_CODES:
+    if code in _USAGE_CODES or (code in _TYPED_CODES and not isinstance(error, Refused)):
         return USAGE
     if code in _UNAVAILABLE_CODES:
         return UNAVAILABLE

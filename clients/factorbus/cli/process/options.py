@@ -17,6 +17,8 @@ USUAL_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_ENDPOINT = os.environ.get("FACTORBUS_ENDPOINT") or USUAL_ENDPOINT
 # The solver's modes; `tests/clients/test_cli.py` holds them to its own list, which this end does not import.
 MODES = ("auto", "inc-l", "inc-l-b10", "inc-l-b100", "all-batch", "bayes-tree")
+# The endings of pictures; `tests/clients/test_cli_files.py` holds them to those of `factorbus.viz`.
+PICTURES = (".png", ".svg", ".pdf")
 WORLDS = ("manhattan", "city-trees", "sphere")
 
 
@@ -131,14 +133,31 @@ def file_argument(name: str) -> Callable[[F], F]:
 
 
 def out_option(flag: str, name: str, text: str, metavar: str) -> Callable[[F], F]:
-    """An option that names a file to write; its folder must exist, which is said before the work and not after."""
-    return click.option(
-        flag, name, type=click.Path(path_type=Path), callback=checked_output, metavar=metavar, help=text
-    )
+    """An option that names a file to write; its folder must exist, which is said before the work and not after.
+
+    metavar: with an ending, FILE.g2o, or several, FILE.g2o|.pyfg, they are the file's too; of a picture any of PICTURES
+    will do.
+    """
+    named = tuple(filter(None, (Path(f"_{each}").suffix for each in metavar.split("|"))))
+    endings = PICTURES if set(named) & set(PICTURES) else named
+
+    def checked(ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None and endings and path.suffix.lower() not in endings:
+            raise click.BadParameter(f"{path} does not end in {' or '.join(endings)}", param=parameter)
+        return checked_output(ctx, parameter, path)
+
+    return click.option(flag, name, type=click.Path(path_type=Path), callback=checked, metavar=metavar, help=text)
 
 
 def checked_output(_ctx: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
     """A file that can be written, as far as that is to be known beforehand."""
+    try:
+        return _checked_output(parameter, path)
+    except OSError as error:  # such as a name that is too long
+        raise click.BadParameter(f"{path} cannot be written: {error.strerror}", param=parameter) from error
+
+
+def _checked_output(parameter: click.Parameter, path: Path | None) -> Path | None:
     if path is not None and not path.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {path.parent}; make it first", param=parameter)
     if path is not None and path.is_dir():

@@ -30,6 +30,8 @@ from factorbus.solver.kernels.model.bounds import (
 )
 from factorbus.solver.kernels.model.kinds import LINEAR, LINEAR_OF_ONE
 
+_NEAR = "choose units and an origin near the data"
+
 
 def admit(graph: FactorGraph, batch: BatchLike | Columns, whole: bool = True) -> int:
     """Append `batch` to `graph` and give values to the variables that come without; gives the id of its first factor.
@@ -101,12 +103,12 @@ def value_out_of_bounds(graph: FactorGraph, v: int) -> errors.SolverError:
     return out_of_bounds(where, graph.values[start : start + kind.size])
 
 
-def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER) -> errors.SolverError:
+def out_of_bounds(where: str, numbers: F64, most: float = MOST_NUMBER, advice: str = _NEAR) -> errors.SolverError:
     """The error for the first of `numbers` that is NaN, infinite, or beyond `most`."""
     bad = np.flatnonzero(~(np.abs(numbers) <= most))
     if not np.isfinite(numbers).all() or not bad.size:
         return errors.NotFinite(where)
-    return errors.OutOfBounds(where, float(numbers[bad[0]]), -most, most)
+    return errors.OutOfBounds(where, float(numbers[bad[0]]), -most, most, advice)
 
 
 def _find_missing(graph: FactorGraph, first: int, first_factor: int, reached: I64) -> int:
@@ -176,6 +178,7 @@ def _number_out_of_bounds(kind: FactorKind, where: str, measured: F64, informati
         if not (np.abs(numbers) <= most).all():
             return out_of_bounds(f"the measurement of {where}", numbers, most)
     if not (np.abs(information) <= MOST_INFORMATION).all():
-        return out_of_bounds(f"the information of {where}", information, MOST_INFORMATION)
+        return out_of_bounds(f"the information of {where}", information, MOST_INFORMATION, "give a larger sigma")
     least = float(information[np.cumsum([0, *range(kind.dim, 1, -1)])].min())
-    return errors.OutOfBounds(f"the diagonal of the information of {where}", least, LEAST_INFORMATION, MOST_INFORMATION)
+    where = f"the diagonal of the information of {where}"
+    return errors.OutOfBounds(where, least, LEAST_INFORMATION, MOST_INFORMATION, "give a smaller sigma")
