@@ -56,9 +56,9 @@ def import_map(file: Path, folder: Path) -> None:
 
     Raises BadFile, MapThere, JournalVersion, JournalUnreadable, NotWritten.
     """
-    _check_exported(file)
     if folder.exists():
         raise MapThere(folder)
+    _check_exported(file)
     beside = folder.with_name(f"{IMPORTING}{folder.name}")
     shutil.rmtree(beside, ignore_errors=True)
     try:

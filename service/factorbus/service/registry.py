@@ -176,10 +176,9 @@ class Maps:
 
     def fork(self, asker: Asker, fork: Fork) -> None:
         """Have a new map begin as another one is, and answer with its row: `forked` goes on.  Raises Problem."""
-        found = self.find(fork.source)
-        if found is None and not ours(self._config.maps, fork.source):
+        if not ours(self._config.maps, fork.source):
             raise NotHere(fork.source, self._config.maps)
-        if found is None:
+        if (found := self.find(fork.source)) is None:
             raise self._unopened.get(fork.source) or UnknownMap(fork.source)
         if self._answered_again(asker, fork):
             return
@@ -320,7 +319,8 @@ class Maps:
         if self._stopping:
             raise ShuttingDown
         if len(self._maps) >= self._config.limits.maps:
-            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps")
+            mend = "drop one, or raise the limit"
+            raise TooLarge("the service", len(self._maps) + 1, self._config.limits.maps, "maps", mend)
         if (full := self._memory.no_room(0)) is not None:
             raise full
 
