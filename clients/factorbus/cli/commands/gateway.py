@@ -4,7 +4,7 @@ import click
 
 from factorbus.cli.output.exits import require
 from factorbus.cli.process.children import READY
-from factorbus.cli.process.exposure import insecure_option, refuse_exposed
+from factorbus.cli.process.exposure import insecure_option, refuse_open_page
 from factorbus.cli.process.options import connect_option, zenoh_option
 
 
@@ -34,7 +34,7 @@ def command(
     curl http://127.0.0.1:8080/api/maps/warehouse/variables/x12
     """
     require("gateway", "factorbus gateway")
-    refuse_exposed(host, insecure)
+    refuse_open_page(host, insecure)
     from factorbus.cli.process.bus import open_bus
     from factorbus.cli.process.stopping import stop_on_signals, wait_until
     from factorbus.gateway import make_app

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from factorbus.cli.output.exits import require
-from factorbus.cli.process.exposure import insecure_option, refuse_exposed
+from factorbus.cli.process.exposure import insecure_option, refuse_open_page
 from factorbus.cli.process.options import (
     Number,
     connect_option,
@@ -73,7 +73,7 @@ def command(
     if viewer.save and viewer.serving:
         raise click.UsageError("--save and --serve exclude each other")
     if not viewer.save:
-        refuse_exposed(viewer.host, viewer.insecure)
+        refuse_open_page(viewer.host, viewer.insecure)
     require("watch", "factorbus watch")
     from factorbus.cli.output.console import print_note
     from factorbus.cli.process.bus import joined_when_there, open_bus

@@ -17,7 +17,7 @@ def insecure_option(command: F) -> F:
     return click.option("--insecure", is_flag=True, help=text)(command)
 
 
-def refuse_exposed(host: str, insecure: bool) -> None:
+def refuse_open_page(host: str, insecure: bool) -> None:
     """Raises Stopped where other machines could reach `host`, and nobody said that they may."""
     if not insecure and not _is_loopback(host):
         raise Stopped(
